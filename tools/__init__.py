@@ -1,0 +1,1 @@
+"""What a person runs: the `guiderail` command, training, replay, recording, studies and benchmarks."""
