@@ -1,0 +1,39 @@
+"""A triangle mesh as it is written to a Wavefront OBJ file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """Vertices (V, 3) [m] and triangles (T, 3) of vertex numbers, counter-clockwise as seen from outside."""
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+
+    @staticmethod
+    def from_quads(quads: np.ndarray) -> TriangleMesh:
+        """Splits quadrilaterals (Q, 4, 3), each counter-clockwise, in two; equal corners become one vertex."""
+        corners = np.round(np.asarray(quads, dtype=float), 9).reshape(-1, 3) + 0.0  # -0.0 and 0.0 are one corner
+        vertices, numbers = np.unique(corners, axis=0, return_inverse=True)
+        a, b, c, d = numbers.reshape(-1, 4).T
+        triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+        has_area = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+        return TriangleMesh(vertices, triangles[has_area])
+
+    def normals(self) -> np.ndarray:
+        """Unit normal of every triangle, (T, 3)."""
+        a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
+        normal = np.cross(b - a, c - a)
+        return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+    def to_obj(self) -> str:
+        """The OBJ file: nanometre vertices and one flat normal a triangle, which renderers insist on."""
+        lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in self.vertices]
+        lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in np.round(self.normals(), 4) + 0.0]
+        for number, corners in enumerate(self.triangles + 1, start=1):
+            lines.append("f " + " ".join(f"{corner}//{number}" for corner in corners))
+        return "\n".join(lines) + "\n"
