@@ -1,0 +1,24 @@
+"""Movement primitives learned from demonstrations, and the constraints and actions that modulate them."""
+
+from guiderail.models.primitives.constraints import LinearConstraints
+from guiderail.models.primitives.demonstrations import Demonstrations
+from guiderail.models.primitives.kernels import Kernel, Matern52, SquaredExponential
+from guiderail.models.primitives.lc_ns_kmp import LcNsKmp, Prediction
+from guiderail.models.primitives.least_norm import UnsolvableError
+from guiderail.models.primitives.poses import pose_demonstrations, pose_outputs, pose_rotation
+from guiderail.models.primitives.reference import ReferenceTrajectory
+
+__all__ = [
+    "Demonstrations",
+    "Kernel",
+    "LcNsKmp",
+    "LinearConstraints",
+    "Matern52",
+    "Prediction",
+    "ReferenceTrajectory",
+    "SquaredExponential",
+    "UnsolvableError",
+    "pose_demonstrations",
+    "pose_outputs",
+    "pose_rotation",
+]

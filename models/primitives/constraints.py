@@ -1,0 +1,131 @@
+"""Linear inequality constraints g_{n,f}ᵀ ζ^O ≥ c_{n,f} on what a primitive commands (thesis, equation 4.5)."""
+
+import numpy as np
+from scipy.optimize import linprog
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives.least_norm import solve_least_norm
+
+
+class LinearConstraints:
+    """G y ≥ c, the same at every step or one set a step.
+
+    Attributes:
+        G: (F, O), or (N, F, O) when it differs from step to step.
+        c: (F,) or (N, F).
+    """
+
+    def __init__(self, G: np.ndarray, c: np.ndarray):
+        """
+        Args:
+            G: (F, O) or (N, F, O), finite; row f is g_f, in 1/unit of the output times the unit of c.
+            c: (F,) or (N, F), finite.
+
+        Raises:
+            InputError: if shapes don't fit, a number is not finite, or no output satisfies all constraints of a step.
+        """
+        self.G, self.c = np.array(G, dtype=float), np.array(c, dtype=float)
+        if self.G.ndim not in (2, 3) or self.c.shape != self.G.shape[:-1]:
+            raise InputError(
+                f"constraints need G of shape (F, O) with c of shape (F,), or (N, F, O) with (N, F), "
+                f"not {self.G.shape} with {self.c.shape}"
+            )
+        if not (np.isfinite(self.G).all() and np.isfinite(self.c).all()):
+            raise InputError("constraints must be finite: leave out the rows that do not constrain anything")
+        self._refuse_contradictions()
+
+    @classmethod
+    def box(cls, lower: np.ndarray, upper: np.ndarray) -> "LinearConstraints":
+        """lower ≤ y ≤ upper, (O,) or (N, O) each; an infinite bound (at every step) is no constraint.
+
+        Raises:
+            InputError: if a lower bound exceeds its upper bound, or a bound is NaN or infinite at some steps only.
+        """
+        lower, upper = np.broadcast_arrays(np.asarray(lower, dtype=float), np.asarray(upper, dtype=float))
+        if lower.ndim not in (1, 2) or np.isnan(lower).any() or np.isnan(upper).any():
+            raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
+        num_outputs = lower.shape[-1]
+        rows, bounds = [], []
+        for o in range(num_outputs):
+            for sign, bound in ((1.0, lower[..., o]), (-1.0, -upper[..., o])):
+                if np.all(bound == -np.inf):
+                    continue
+                rows.append(sign * np.eye(num_outputs)[o])
+                bounds.append(bound)
+        G = np.reshape(rows, (len(rows), num_outputs))
+        if lower.ndim == 1:
+            return cls(G, np.reshape(bounds, len(rows)))
+        steps = lower.shape[0]
+        return cls(np.broadcast_to(G, (steps, *G.shape)), np.reshape(bounds, (len(rows), steps)).T)
+
+    @classmethod
+    def none(cls, num_outputs: int) -> "LinearConstraints":
+        """No constraint at all: F = 0."""
+        return cls(np.zeros((0, num_outputs)), np.zeros(0))
+
+    @property
+    def num_constraints(self) -> int:
+        """F."""
+        return self.G.shape[-2]
+
+    @property
+    def num_outputs(self) -> int:
+        """O."""
+        return self.G.shape[-1]
+
+    @property
+    def num_steps(self) -> int | None:
+        """N where constraints differ from step to step, else None."""
+        return self.G.shape[0] if self.G.ndim == 3 else None
+
+    def window(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """G (n, F, O) and c (n, F) at the given steps; steps past the end keep the last ones."""
+        steps = np.asarray(steps)
+        if self.G.ndim == 2:
+            return np.broadcast_to(self.G, (len(steps), *self.G.shape)), np.broadcast_to(
+                self.c, (len(steps), *self.c.shape)
+            )
+        steps = np.minimum(steps, self.G.shape[0] - 1)
+        return self.G[steps], self.c[steps]
+
+    def violation(self, output: np.ndarray, step: int = 0) -> float:
+        """max over constraints of c − G y [unit of c]: negative is slack, −inf where there is no constraint."""
+        if self.num_constraints == 0:
+            return -np.inf
+        if self.G.ndim == 2:
+            return float((self.c - self.G @ output).max())
+        step = min(step, self.G.shape[0] - 1)
+        return float((self.c[step] - self.G[step] @ output).max())
+
+    def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
+        """The output (O,) within the constraints of a step that is nearest to `output` (O,)."""
+        output = np.asarray(output, dtype=float)
+        if self.violation(output, step) <= 0:
+            return output.copy()
+        G, c = (a[0] for a in self.window(np.array([step])))
+        scale = 1 / np.where(np.linalg.norm(G, axis=1) > 0, np.linalg.norm(G, axis=1), 1)
+        move, _ = solve_least_norm(G * scale[:, None], (c - G @ output) * scale, np.full(len(c), np.inf))
+        return output + move
+
+    def _refuse_contradictions(self) -> None:
+        if self.num_constraints == 0:
+            return
+        G = self.G.reshape(-1, *self.G.shape[-2:])
+        c = self.c.reshape(-1, self.c.shape[-1])
+        flat = np.concatenate([G.reshape(len(G), -1), c], axis=1)
+        for step in np.sort(np.unique(flat, axis=0, return_index=True)[1]):
+            # Rows are scaled to unit length: the solver's tolerance is then one on the output itself.
+            size = np.linalg.norm(G[step], axis=1)
+            scale = np.where(size > 0, size, 1.0)
+            result = linprog(
+                np.zeros(self.num_outputs),
+                A_ub=-G[step] / scale[:, None],
+                b_ub=-c[step] / scale,
+                bounds=(None, None),
+            )
+            if result.status == 2:
+                where = "" if self.G.ndim == 2 else f" at step {step}"
+                raise InputError(
+                    f"the constraints{where} contradict each other: no output satisfies all {self.num_constraints} of "
+                    "them; loosen c or remove a row of G"
+                )

@@ -1,0 +1,231 @@
+"""Linearly constrained null-space kernelized movement primitives (thesis, sections 4.3 and 5.3).
+
+The law, for a window of the P last outputs and the H+1 next reference points, is the solution of problem 4.5: as close
+to the demonstrations as their covariance asks for, pulled by a null-space action at the executed point, passing
+through the history, and inside the linear constraints at every future point. Parts switched off, it is the family's
+other members: without constraints NS-KMP (equation 4.4), with β = 0 LC-KMP (4.2), with neither KMP (2.17), with a
+history sKGRL's primitive (5.1-5.3).
+"""
+
+from collections import OrderedDict
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives.constraints import LinearConstraints
+from guiderail.models.primitives.features import WindowFeatures, window_features
+from guiderail.models.primitives.kernels import Kernel, SquaredExponential
+from guiderail.models.primitives.least_norm import UnsolvableError, find_solver
+from guiderail.models.primitives.reference import ReferenceTrajectory
+from guiderail.models.primitives.step import StepFactor, Window
+
+# The bound that every command keeps, in units of the constraint (thousandths of a micrometre for metres).
+TOLERANCE = 1e-9
+
+
+class Prediction:
+    """What a primitive says at one step.
+
+    Attributes:
+        output: (O,), what to execute.
+    """
+
+    __slots__ = ("_alpha", "_factor", "_v", "_x", "output")
+
+    def __init__(
+        self,
+        output: np.ndarray,
+        factor: StepFactor,
+        x: np.ndarray,
+        v: np.ndarray | None = None,
+        alpha: np.ndarray | None = None,
+    ):
+        self.output, self._factor, self._x, self._v, self._alpha = output, factor, x, v, alpha
+
+    @property
+    def constrained(self) -> bool:
+        """True if some constraint of the window had to be enforced."""
+        return self._v is not None
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """α (H+1, F) ≥ 0, zero where a constraint is slack."""
+        if self._alpha is None:
+            return np.zeros(self._factor.multipliers_shape)
+        return self._alpha
+
+    @property
+    def trajectory(self) -> np.ndarray:
+        """The whole modified window (H+1, O); computed at each call."""
+        return self._factor.trajectory(self._x, self._v)
+
+
+class LcNsKmp:
+    """A movement primitive that follows demonstrations, null-space actions and linear constraints.
+
+    The input is the reference's clock, so that every matrix depends on the step alone: each step is factored when it
+    is first asked for, and a prediction is two small products, plus a QP where a constraint is not slack.
+
+    Attributes:
+        reference, kernel, lambda_, beta, horizon, history, history_variance, constraints: as given.
+    """
+
+    def __init__(
+        self,
+        reference: ReferenceTrajectory,
+        kernel: Kernel | None = None,
+        lambda_: float = 6.0,
+        beta: float = 6.0,
+        horizon: int = 40,
+        history: int = 0,
+        history_variance: float = 1e-6,
+        constraints: LinearConstraints | None = None,
+        solver: str = "daqp",
+        cache_bytes: int = 2**28,
+    ):
+        """
+        Args:
+            reference: means and covariances of the demonstrations, N steps of O outputs.
+            kernel: k; `SquaredExponential(inverse_length=2.0)`, the thesis's, unless given.
+            lambda_: λ, the regularization of problem 4.5, not negative.
+            beta: β, how strongly a null-space action pulls, not negative; λ + β is positive.
+            horizon: H, future points behind the executed one.
+            history: P, past outputs the motion passes through (sKGRL); 0 for none (KGRL).
+            history_variance: ρ [output²], how exactly it does, positive.
+            constraints: G y ≥ c at every future point; none unless given.
+            solver: "daqp", "piqp" or "osqp".
+            cache_bytes: how much memory factored steps may take before the oldest is forgotten.
+
+        Raises:
+            InputError: if an argument is out of range, sizes don't fit, or the problem is too badly scaled to keep a
+                bound of 1e-9.
+        """
+        for name, value in (("lambda_", lambda_), ("beta", beta)):
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"{name} must be finite and not negative, not {value}")
+        if not lambda_ + beta > 0:
+            raise InputError("lambda_ + beta must be positive: without any regularization problem 4.5 has no solution")
+        if int(horizon) != horizon or horizon < 0 or int(history) != history or history < 0:
+            raise InputError(f"horizon and history are numbers of steps, not {horizon} and {history}")
+        if history and not (np.isfinite(history_variance) and history_variance > 0):
+            raise InputError(f"history_variance must be positive, not {history_variance}")
+        constraints = constraints if constraints is not None else LinearConstraints.none(reference.num_outputs)
+        if constraints.num_outputs != reference.num_outputs:
+            raise InputError(
+                f"constraints are on {constraints.num_outputs} outputs, the reference has {reference.num_outputs}"
+            )
+        if constraints.num_steps not in (None, reference.num_steps):
+            raise InputError(
+                f"constraints are given for {constraints.num_steps} steps, the reference has {reference.num_steps}"
+            )
+        self.reference = reference
+        self.kernel: Kernel = kernel if kernel is not None else SquaredExponential()
+        self.lambda_, self.beta = float(lambda_), float(beta)
+        self.horizon, self.history, self.history_variance = int(horizon), int(history), float(history_variance)
+        self.constraints = constraints
+        self.solver = solver
+        self._solve = find_solver(solver)
+        self._cache: OrderedDict[int, StepFactor] = OrderedDict()
+        self._cache_bytes, self._cached_bytes = cache_bytes, 0
+        self._shared_features: WindowFeatures | None = None
+        self._history_shape = (self.history, reference.num_outputs)
+
+    @property
+    def num_outputs(self) -> int:
+        """O."""
+        return self.reference.num_outputs
+
+    @property
+    def num_steps(self) -> int:
+        """N; later steps are step N−1 again, so that the end is held."""
+        return self.reference.num_steps
+
+    def predict(
+        self, step: int, null_space_action: np.ndarray | None = None, history: np.ndarray | None = None
+    ) -> Prediction:
+        """The output at `step` (equations 4.21 and 5.1).
+
+        Args:
+            step: n ≥ 0; past the end, the last step.
+            null_space_action: ξ̂ (O,), in the output's units times a gain (see `gains`); zero unless given.
+            history: (P, O), the outputs at step−P … step−1, oldest first; None where P = 0.
+
+        Raises:
+            InputError: if an argument has the wrong shape or is not finite.
+            UnsolvableError: if no window within the constraints was found: keep the last safe command.
+        """
+        if step < 0:
+            raise InputError(f"step counts from 0, not {step}")
+        factor = self._cache.get(step) or self._factor(step)
+        x = self._stack(null_space_action, history)
+        output = factor.output_map @ x
+        output += factor.output_offset
+        free = factor.constraint_map @ x
+        if (free >= factor.lower).all() and (free <= factor.upper).all():
+            return Prediction(output, factor, x)
+        v, alpha = factor.correct(free, self._solve)
+        output = output + factor.correction_map @ v
+        violation = self.constraints.violation(output, step)
+        if not violation <= TOLERANCE:
+            raise UnsolvableError(f"step {step}: the solver left a violation of {violation:.1e}")
+        return Prediction(output, factor, x, v, alpha)
+
+    def linear_response(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The free output of a step, R_h h + N ξ̂ + r: R_h (O, PO), N (O, O), r (O,), where no constraint is active."""
+        factor = self._factor(step)
+        split = self.history * self.num_outputs
+        return factor.output_map[:, :split], factor.output_map[:, split:], factor.output_offset
+
+    def factor_all(self) -> int:
+        """Factors every step now rather than when first asked for; returns the bytes that takes."""
+        for step in range(self.num_steps):
+            self._factor(step)
+        return self._cached_bytes
+
+    def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
+        """x = [history, null-space action], checked."""
+        action = np.zeros(self.num_outputs) if null_space_action is None else np.asarray(null_space_action, dtype=float)
+        if action.shape != (self.num_outputs,):
+            raise InputError(f"a null-space action has shape ({self.num_outputs},), not {action.shape}")
+        if self.history == 0:
+            if history is not None and np.size(history):
+                raise InputError("this primitive has no history (P = 0): pass None")
+            x = action
+        else:
+            past = np.asarray(history, dtype=float) if history is not None else np.zeros(0)
+            if past.shape != self._history_shape:
+                raise InputError(f"the history has shape {self._history_shape}, oldest output first, not {past.shape}")
+            x = np.concatenate((past.ravel(), action))
+        # One reduction instead of isfinite().all(): a NaN or an infinity anywhere makes the product not finite.
+        if not np.isfinite(x @ x):
+            raise InputError("history and null-space action must be finite")
+        return x
+
+    def _factor(self, step: int) -> StepFactor:
+        step = min(step, self.num_steps - 1)
+        factor = self._cache.get(step)
+        if factor is None:
+            factor = StepFactor(self._window(step), self._features(step), self.lambda_, self.beta)
+            self._cache[step] = factor
+            self._cached_bytes += factor.nbytes
+            while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
+                _, oldest = self._cache.popitem(last=False)
+                self._cached_bytes -= oldest.nbytes
+        return factor
+
+    def _window(self, step: int) -> Window:
+        steps = np.arange(step, step + self.horizon + 1)
+        held = np.minimum(steps, self.num_steps - 1)
+        G, c = self.constraints.window(held)
+        return Window(self.reference.means[held], self.reference.covariances[held], G, c)
+
+    def _features(self, step: int) -> WindowFeatures:
+        if self._shared_features is not None:
+            return self._shared_features
+        past = self.reference.inputs(np.arange(step - self.history, step))
+        future = self.reference.inputs(np.arange(step, step + self.horizon + 1))
+        noise = (self.lambda_ + self.beta) * self.history_variance
+        features = window_features(self.kernel, past, future, noise)
+        if self.kernel.stationary and self.reference.uniform:
+            self._shared_features = features
+        return features

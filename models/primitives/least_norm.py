@@ -1,0 +1,118 @@
+"""The quadratic program of a constrained primitive in least-norm form, and who solves it.
+
+Of the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = ḠᵀSḠ, the Hessian is rank-deficient and badly scaled
+(largest eigenvalue 6e-6 for a connector), which costs a first-order solver the very millimetres it is there to guard.
+With S = L Lᵀ the same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄: an identity Hessian, and rows that can be scaled
+to unit length, so that a solver's tolerance is one on the output itself.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+
+Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+_UNBOUNDED = 1e29  # what the solvers take for infinity
+
+
+class UnsolvableError(RuntimeError):
+    """No solution within the solver's tolerance: the caller must fall back to its last safe command."""
+
+
+def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    import daqp
+
+    size = rows.shape[1]
+    v, _, flag, info = daqp.solve(
+        _identity(size), np.zeros(size), rows, upper, lower, np.zeros(len(rows), dtype=np.int32), primal_tol=1e-13
+    )
+    if flag < 1:
+        raise UnsolvableError(f"DAQP ended with flag {flag}")
+    return v, info["lam"]
+
+
+def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        import piqp
+    except ImportError as error:
+        raise InputError("the solver 'piqp' is not installed: pip install 'guiderail[piqp]'") from error
+    size = rows.shape[1]
+    solver = piqp.DenseSolver()
+    solver.settings.verbose = False
+    solver.settings.eps_abs = solver.settings.eps_rel = 1e-13
+    solver.setup(_identity(size), np.zeros(size), None, None, rows, lower, upper, None, None)
+    status = solver.solve()
+    if status.name not in ("PIQP_SOLVED", "PIQP_MAX_ITER_REACHED"):
+        raise UnsolvableError(f"PIQP ended with {status.name}")
+    return solver.result.x, solver.result.z_u - solver.result.z_l
+
+
+def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    import osqp
+    from scipy import sparse
+
+    size = rows.shape[1]
+    solver = osqp.OSQP()
+    solver.setup(
+        sparse.eye(size, format="csc"),
+        np.zeros(size),
+        sparse.csc_matrix(rows),
+        lower,
+        upper,
+        verbose=False,
+        eps_abs=1e-9,
+        eps_rel=1e-9,
+        polishing=True,
+        max_iter=20_000,
+    )
+    result = solver.solve()
+    if result.info.status_val not in (1, 2):
+        raise UnsolvableError(f"OSQP ended with '{result.info.status}'")
+    return result.x, result.y
+
+
+SOLVERS: dict[str, Solver] = {"daqp": _daqp, "piqp": _piqp, "osqp": _osqp}
+
+
+def find_solver(name: str) -> Solver:
+    """The solver of that name.
+
+    Raises:
+        InputError: if there is none.
+    """
+    if name not in SOLVERS:
+        raise InputError(f"there is no solver '{name}': choose one of {', '.join(SOLVERS)}")
+    return SOLVERS[name]
+
+
+def solve_least_norm(
+    rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: Solver = _daqp
+) -> tuple[np.ndarray, np.ndarray]:
+    """min ½‖v‖² subject to lower ≤ rows v ≤ upper.
+
+    Args:
+        rows: (m, r), rows of unit length (or zero).
+        lower, upper: (m,), ±inf where there is no bound; at least one of them excludes v = 0.
+        solver: one of `SOLVERS`.
+
+    Returns:
+        v (r,), and the multipliers (m,): v = −rowsᵀ multipliers, positive where `upper` is active, negative where
+        `lower` is.
+
+    Raises:
+        UnsolvableError: if the solver finds no solution.
+    """
+    # The problem is homogeneous: at unit scale the solver's absolute tolerance is a relative one.
+    scale = max(lower.max(), -upper.min())
+    v, multipliers = solver(rows, np.maximum(lower / scale, -_UNBOUNDED), np.minimum(upper / scale, _UNBOUNDED))
+    return scale * v, scale * multipliers
+
+
+_identities: dict[int, np.ndarray] = {}
+
+
+def _identity(size: int) -> np.ndarray:
+    """A shared identity: a QP of every control step needs one, and making it costs as much as solving."""
+    return _identities.setdefault(size, np.eye(size))

@@ -1,0 +1,85 @@
+"""Gaussian mixtures of demonstrations, and regression on them (thesis, sections 2.2.3 and 2.2.4).
+
+scikit-learn fits the mixture, gmr conditions it; what stands here is what neither knows: that the first column is time.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from gmr import GMM
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.mixture import GaussianMixture
+
+from guiderail.models.errors import InputError
+
+# Variance added to every component, relative to the data's own: what keeps EM alive where demonstrations coincide.
+_REGULARIZATION = 1e-6
+_MOST_COMPONENTS = 20
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A joint Gaussian mixture of (time, outputs), in units of the data's own standard deviations."""
+
+    gmm: GMM
+    center: np.ndarray
+    scale: np.ndarray
+
+
+def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, seed: int) -> Mixture:
+    """Fits C components to M demonstrations by expectation maximization, started from C equal slices of time.
+
+    Started from slices the components stay in order along the motion; started at random, a few of them share a wide
+    region and blur a narrow one.
+
+    Args:
+        times: (N,), the common clock.
+        outputs: (M, N, O).
+        components: C; the number of least Bayesian information criterion up to 20 unless given.
+        seed: of scikit-learn's generator.
+
+    Raises:
+        InputError: if there are fewer points than components need.
+    """
+    data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
+    center, deviation = data.mean(axis=0), data.std(axis=0)
+    scale = np.where(deviation > 0, deviation, 1.0)
+    data = (data - center) / scale
+    most = min(_MOST_COMPONENTS, len(times) // 2)
+    if components is not None and not 1 <= components <= len(times) // 2:
+        raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {components}")
+    candidates = [components] if components is not None else range(1, most + 1)
+    slices = np.tile(np.arange(len(times)), len(outputs)) / len(times)
+    fits = [_fit(data, slices, count, seed) for count in candidates]
+    best = min(fits, key=lambda fit: fit.bic(data)) if len(fits) > 1 else fits[0]
+    gmm = GMM(best.n_components, best.weights_, best.means_, best.covariances_, random_state=seed)
+    return Mixture(gmm, center, scale)
+
+
+def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussian mixture regression on time: means (N, O) and covariances (N, O, O) at `times` (N,)."""
+    conditionals = [mixture.gmm.condition([0], [(t - mixture.center[0]) / mixture.scale[0]]).to_mvn() for t in times]
+    scale = mixture.scale[1:]
+    means = np.array([c.mean for c in conditionals]) * scale + mixture.center[1:]
+    covariances = np.array([c.covariance for c in conditionals]) * scale[:, None] * scale
+    return means, (covariances + covariances.transpose(0, 2, 1)) / 2
+
+
+def _fit(data: np.ndarray, slices: np.ndarray, components: int, seed: int) -> GaussianMixture:
+    label = np.minimum((slices * components).astype(int), components - 1)
+    parts = [data[label == c] for c in range(components)]
+    floor = 10 * _REGULARIZATION * np.eye(data.shape[1])
+    mixture = GaussianMixture(
+        components,
+        reg_covar=_REGULARIZATION,
+        max_iter=300,
+        random_state=seed,
+        weights_init=np.full(components, 1 / components),
+        means_init=np.array([part.mean(axis=0) for part in parts]),
+        precisions_init=np.array([np.linalg.inv(np.cov(part.T) + floor) for part in parts]),
+    )
+    with warnings.catch_warnings():
+        # EM started near its optimum stops within the tolerance that matters here long before scikit-learn's.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return mixture.fit(data)

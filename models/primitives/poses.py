@@ -1,0 +1,116 @@
+"""Poses as outputs of a primitive: six numbers in a target frame, without jumps (thesis, section 4.4.2)."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives.demonstrations import Demonstrations
+
+Orientation = Literal["euler_zyx", "rotation_vector"]
+
+POSE_NAMES: dict[str, tuple[str, ...]] = {
+    "euler_zyx": ("x [m]", "y [m]", "z [m]", "psi_z [rad]", "psi_y [rad]", "psi_x [rad]"),
+    "rotation_vector": ("x [m]", "y [m]", "z [m]", "r_x [rad]", "r_y [rad]", "r_z [rad]"),
+}
+
+
+def pose_outputs(
+    positions: np.ndarray,
+    quaternions_wxyz: np.ndarray,
+    target_position: np.ndarray,
+    target_quaternion_wxyz: np.ndarray,
+    orientation: Orientation = "euler_zyx",
+    near: np.ndarray | None = None,
+) -> np.ndarray:
+    """p_TE and R_TE as (N, 6): position [m], then orientation [rad], of the end-effector E in the target frame T.
+
+    Args:
+        positions: p_WE (N, 3).
+        quaternions_wxyz: R_WE (N, 4), of any length but zero, of either sign.
+        target_position, target_quaternion_wxyz: X_WT, (3,) and (4,).
+        orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", for motions
+            that turn by about a half turn.
+        near: (3,), the orientation numbers that the first sample is continued from; those of least magnitude unless
+            given. Demonstrations of one motion must share a branch, or their mean is meaningless.
+
+    Raises:
+        InputError: if shapes don't fit, a quaternion is zero, a number is not finite, or Euler angles go singular.
+    """
+    positions, quaternions = np.asarray(positions, dtype=float), np.asarray(quaternions_wxyz, dtype=float)
+    if positions.ndim != 2 or positions.shape[1] != 3 or quaternions.shape != (len(positions), 4):
+        raise InputError(
+            f"poses need positions (N, 3) and quaternions (N, 4), not {positions.shape} and {quaternions.shape}"
+        )
+    if not (np.isfinite(positions).all() and np.isfinite(quaternions).all()):
+        raise InputError("poses contain NaN or infinity: cut those samples out")
+    if np.linalg.norm(quaternions, axis=1).min() < 1e-6 or np.linalg.norm(target_quaternion_wxyz) < 1e-6:
+        raise InputError("a quaternion of length zero is no orientation")
+    R_WT = Rotation.from_quat(target_quaternion_wxyz, scalar_first=True)
+    p_TE = R_WT.inv().apply(positions - np.asarray(target_position, dtype=float))
+    R_TE = R_WT.inv() * Rotation.from_quat(quaternions, scalar_first=True)
+    if orientation == "euler_zyx":
+        angles = R_TE.as_euler("ZYX")
+        if np.abs(np.abs(angles[:, 1]) - np.pi / 2).min() < np.deg2rad(1):
+            raise InputError("ZYX Euler angles are singular in this motion: use orientation='rotation_vector'")
+        return np.hstack([p_TE, _continued(angles, near)])
+    if orientation == "rotation_vector":
+        return np.hstack([p_TE, _continued_vectors(R_TE.as_rotvec(), near)])
+    raise InputError(f"there is no orientation '{orientation}': choose euler_zyx or rotation_vector")
+
+
+def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "euler_zyx") -> Rotation:
+    """R_TE of the last three numbers of `pose_outputs`, (3,) or (N, 3)."""
+    if orientation == "euler_zyx":
+        return Rotation.from_euler("ZYX", orientation_numbers)
+    return Rotation.from_rotvec(orientation_numbers)
+
+
+def pose_demonstrations(
+    times: Sequence[np.ndarray],
+    positions: Sequence[np.ndarray],
+    quaternions_wxyz: Sequence[np.ndarray],
+    target_position: np.ndarray | None = None,
+    target_quaternion_wxyz: np.ndarray | None = None,
+    orientation: Orientation = "euler_zyx",
+) -> Demonstrations:
+    """Recorded end-effector poses as demonstrations of six outputs.
+
+    Args:
+        times, positions, quaternions_wxyz: M × (N_m,), (N_m, 3), (N_m, 4), in any common frame W.
+        target_position, target_quaternion_wxyz: X_WT; each demonstration's own last pose unless given, as in the
+            thesis (section 4.4.2).
+        orientation: as in `pose_outputs`.
+
+    Raises:
+        InputError: as `pose_outputs` and `Demonstrations`.
+    """
+    outputs: list[np.ndarray] = []
+    for p, q in zip(positions, quaternions_wxyz, strict=True):
+        target_p = p[-1] if target_position is None else target_position
+        target_q = q[-1] if target_quaternion_wxyz is None else target_quaternion_wxyz
+        near = outputs[0][0, 3:] if outputs else None
+        outputs.append(pose_outputs(p, q, target_p, target_q, orientation, near))
+    return Demonstrations(times, outputs, POSE_NAMES[orientation])
+
+
+def _continued(angles: np.ndarray, near: np.ndarray | None) -> np.ndarray:
+    """Angles without jumps of a full turn, on the branch of `near`."""
+    angles = np.unwrap(angles, axis=0)
+    start = np.zeros(3) if near is None else near
+    return angles - 2 * np.pi * np.round((angles[0] - start) / (2 * np.pi))
+
+
+def _continued_vectors(vectors: np.ndarray, near: np.ndarray | None) -> np.ndarray:
+    """Rotation vectors without jumps: each is the equivalent r + 2πk r/‖r‖ nearest to the one before."""
+    vectors = np.array(vectors)
+    last = np.zeros(3) if near is None else near
+    for i, r in enumerate(vectors):
+        angle = np.linalg.norm(r)
+        # Near zero the axis is the previous one's: the rotation alone does not have one.
+        axis = r / angle if angle > 1e-9 else last / max(float(np.linalg.norm(last)), 1e-300)
+        turns = np.round((axis @ last - angle) / (2 * np.pi))
+        vectors[i] = last = (angle + 2 * np.pi * turns) * axis
+    return vectors

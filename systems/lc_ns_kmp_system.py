@@ -1,0 +1,155 @@
+"""A linearly constrained null-space movement primitive in a diagram (thesis, equations 4.21 and 5.1)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    ValueProducer,
+)
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import LcNsKmp, UnsolvableError
+
+
+@dataclass(frozen=True, slots=True)
+class _Command:
+    step: int
+    output: np.ndarray
+    fallback: float
+
+
+class LcNsKmpSystem(LeafSystem):
+    """Commands the output of an `LcNsKmp` at every control step: KGRL without a history, sKGRL with one.
+
+    .. pydrake_system::
+
+        name: LcNsKmpSystem
+        input_ports:
+        - null_space_action
+        - history
+        output_ports:
+        - output
+        - constraint_violation
+        - fallback
+
+    ``null_space_action`` (O,) is the policy's, in [−1, 1] per output, held for a control step; ``history`` (P*O,) is
+    row-major, oldest output first (`HistoryBuffer`), and there is no such port where P = 0. ``output`` (O,) is what to
+    command. ``constraint_violation`` (1,) is max(c − G y) of that command: negative is slack, −1e30 where there is no
+    constraint. ``fallback`` (1,) is 1 where no window within the constraints was found and the last safe command is
+    repeated.
+
+    The step is state and counts control periods since time zero; the output is a pure function of step, action and
+    history, evaluated once a control step (see CONTRIBUTING.md, "Rates and the order of events").
+    """
+
+    #: What `constraint_violation` says where there is no constraint: finite, so that it can be logged and reduced.
+    UNCONSTRAINED = -1e30
+
+    def __init__(self, primitive: LcNsKmp, gain: np.ndarray | None, period: float):
+        """
+        Args:
+            primitive: O outputs, P past outputs.
+            gain: (O,), what an action of one is worth in raw null-space units (`models.primitives.gains`); ones unless
+                given.
+            period: seconds between control steps, positive: the reference's own clock.
+
+        Raises:
+            InputError: if the gain has the wrong shape or is not finite, or the period is not positive.
+        """
+        super().__init__()
+        outputs = primitive.num_outputs
+        self._gain = np.ones(outputs) if gain is None else np.array(gain, dtype=float)
+        if self._gain.shape != (outputs,) or not np.isfinite(self._gain).all():
+            raise InputError(f"the gain must be {outputs} finite numbers, not {gain}")
+        if not period > 0:
+            raise InputError(f"the control period must be positive, not {period} s")
+        self._primitive, self._period = primitive, period
+
+        self._action_port = self.DeclareVectorInputPort("null_space_action", outputs)
+        self._history_port = (
+            self.DeclareVectorInputPort("history", primitive.history * outputs) if primitive.history else None
+        )
+        self._step = self.DeclareDiscreteState(1)
+        start = primitive.constraints.nearest(primitive.reference.means[0])
+        self._last_safe = self.DeclareDiscreteState(start)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
+
+        sources = {
+            self._action_port.ticket(),
+            self.discrete_state_ticket(self._step),
+            self.discrete_state_ticket(self._last_safe),
+        }
+        if self._history_port is not None:
+            sources.add(self._history_port.ticket())
+        self._command = self.DeclareCacheEntry(
+            "command", ValueProducer(allocate=Value[object], calc=self._calc_command), sources
+        )
+        ticket = {self._command.ticket()}
+        self._output_port = self.DeclareVectorOutputPort("output", outputs, self._calc_output, ticket)
+        self._violation_port = self.DeclareVectorOutputPort("constraint_violation", 1, self._calc_violation, ticket)
+        self._fallback_port = self.DeclareVectorOutputPort("fallback", 1, self._calc_fallback, ticket)
+
+    def get_null_space_action_input_port(self) -> InputPort:
+        """The policy's action in [−1, 1], (O,)."""
+        return self._action_port
+
+    def get_history_input_port(self) -> InputPort:
+        """The last outputs (P*O,), oldest first.
+
+        Raises:
+            InputError: if the primitive has no history.
+        """
+        if self._history_port is None:
+            raise InputError("this primitive has no history (P = 0), hence no such port")
+        return self._history_port
+
+    def get_output_output_port(self) -> OutputPort:
+        """What to command, (O,)."""
+        return self._output_port
+
+    def get_constraint_violation_output_port(self) -> OutputPort:
+        """max(c − G y) of the command, (1,)."""
+        return self._violation_port
+
+    def get_fallback_output_port(self) -> OutputPort:
+        """1 where the last safe command is repeated, (1,)."""
+        return self._fallback_port
+
+    def _advance(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        step = round(context.get_time() / self._period)
+        if step > 0:
+            command = self._command.Eval(context)
+            discrete_state.set_value(self._last_safe, command.output)
+        discrete_state.set_value(self._step, [step])
+        return EventStatus.Succeeded()
+
+    def _calc_command(self, context: Context, value: Value) -> None:
+        step = int(context.get_discrete_state(self._step).value()[0])
+        action = self._gain * self._action_port.Eval(context)
+        history = None
+        if self._history_port is not None:
+            history = self._history_port.Eval(context).reshape(self._primitive.history, self._primitive.num_outputs)
+        try:
+            output, fallback = self._primitive.predict(step, action, history).output, 0.0
+        except UnsolvableError:
+            output, fallback = np.array(context.get_discrete_state(self._last_safe).value()), 1.0
+        value.set_value(_Command(step, output, fallback))
+
+    def _calc_output(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._command.Eval(context).output)
+
+    def _calc_violation(self, context: Context, output: BasicVector) -> None:
+        command = self._command.Eval(context)
+        violation = self._primitive.constraints.violation(command.output, command.step)
+        output.SetAtIndex(0, max(violation, self.UNCONSTRAINED))
+
+    def _calc_fallback(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._command.Eval(context).fallback)
