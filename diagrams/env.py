@@ -1,0 +1,239 @@
+"""The Gymnasium environment of every task."""
+
+import re
+from typing import Any
+
+import gymnasium
+import numpy as np
+from pydrake.gym import DrakeGymEnv
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import PortDataType
+
+from guiderail.diagrams.task import TaskDiagram
+from guiderail.diagrams.trace import Trace
+from guiderail.models.errors import InputError
+from guiderail.systems.episode_monitor import TERMINATIONS
+
+_TIME_LIMIT = TERMINATIONS.index("time_limit")
+
+# What Drake says when the physics, and not the wiring, went wrong.
+_SIMULATION_FAILURE = re.compile(r"failed to converge|\bNaN\b|\bnan\b|not finite|diverg")
+
+
+class GuidedEnv(DrakeGymEnv):
+    """Runs a `TaskDiagram` as a Gymnasium environment that can be trusted with a reset.
+
+    It keeps `DrakeGymEnv`'s interface and replaces its `reset` and `step`. The diagram is built once. A reset restores
+    the context to how it was built, lets the task randomize it from `self.np_random`, writes the neutral action and
+    initializes. A step checks the action before anything moves, advances `hold` control steps by an integer count, and
+    reads every port at the end of each of them, before the events of that instant.
+
+    `info` has at every step, and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
+    `constraint_violation` and `measured_violation` (the worst of the step; negative is slack), `contact_force` (the
+    largest of the step, N), every reward term by name (summed over the step), and `control_steps` since the reset. At
+    the end of an episode it also has `ledger`, the safety ledger's row as a dict. A reset's `info` also has what the
+    task drew.
+
+    An episode that lasts as long as the task allows is truncated with `termination` "time_limit". Where the simulation
+    itself fails (a solver that doesn't converge, NaN), the episode is truncated with the last sound observation, and
+    `info["simulation_failure"]` says what Drake said; every other error is a bug and propagates.
+
+    Attributes:
+        task: the `TaskDiagram`.
+        hold: control steps for which an action is held.
+        trace: the `Trace` of the current episode.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
+
+    def __init__(self, task: TaskDiagram, *, hold: int = 1, render_mode: str | None = None):
+        """
+        Args:
+            task: what to run.
+            hold: control steps per decision, at least 1.
+            render_mode: None, "human" (Meshcat) or "rgb_array" (a camera).
+
+        Raises:
+            InputError: if `hold` is no positive integer, or the task can't be rendered that way.
+        """
+        if isinstance(hold, bool) or not isinstance(hold, int | np.integer) or hold < 1:
+            raise InputError(f"hold is the number of control steps an action lasts: give an integer from 1, not {hold}")
+        diagram = task.diagram
+        _check_render_mode(task, render_mode)
+        self.task = task
+        self.hold = int(hold)
+        # The parent class writes into whatever `metadata` it finds; this one is our own, not every environment's.
+        self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / (hold * task.control_period))}
+        super().__init__(
+            simulator=Simulator(diagram),
+            time_step=hold * task.control_period,
+            action_space=gymnasium.spaces.Box(-1.0, 1.0, (diagram.GetInputPort("action").size(),), np.float32),
+            observation_space=task.observation_space,
+            reward="reward",
+            action_port_id="action",
+            observation_port_id="observation",
+            render_rgb_port_id="rgb_image" if render_mode == "rgb_array" else None,
+        )
+        self.metadata["render_modes"] = ["human", "rgb_array"]
+        self.render_mode = render_mode
+        if render_mode == "human":
+            self.simulator.set_target_realtime_rate(1.0)
+
+        context = self.simulator.get_mutable_context()
+        self._neutral = np.zeros(self.action_space.shape)
+        self._action_value = self.action_port.FixValue(context, self._neutral)
+        self._pristine = diagram.CreateDefaultContext()
+        self._image_observation = self.observation_port.get_data_type() == PortDataType.kAbstractValued
+        self._reward_port = diagram.GetOutputPort("reward")
+        self._term_ports = [(name, diagram.GetOutputPort(name)) for name in task.reward_terms]
+        self._termination_port = diagram.GetOutputPort("termination")
+        self._commanded_violation_port = diagram.GetOutputPort("commanded_violation")
+        self._measured_violation_port = diagram.GetOutputPort("measured_violation")
+        self._force_port = diagram.GetOutputPort("contact_force")
+        self._ledger_port = diagram.GetOutputPort("ledger")
+        self._desired_pose_port = diagram.GetOutputPort("desired_pose")
+        self._pose_port = diagram.GetOutputPort("pose")
+        self.trace = Trace(task.num_steps, self._pose_port.size(), task.control_period)
+        self._control_steps = 0
+        self._running = False
+        self._observation: np.ndarray | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """Starts an episode; `options` are the task's own (see its `make_env`)."""
+        # Not the parent's reset: it initializes before the state is set, and refuses options.
+        gymnasium.Env.reset(self, seed=seed)
+        self._running = False
+        context = self.simulator.get_mutable_context()
+        context.SetTimeStateAndParametersFrom(self._pristine)
+        self._action_value.GetMutableData().set_value(self._neutral)
+        drawn = self.task.randomize(context, self.np_random, dict(options or {}))
+        self.simulator.Initialize()
+        self._control_steps = 0
+        self.trace.clear()
+        self._running = True
+        self._observation = self._observe(context)
+        info = self._info(
+            0,
+            float(self._commanded_violation_port.Eval(context)[0]),
+            float(self._measured_violation_port.Eval(context)[0]),
+            0.0,
+            dict.fromkeys(self.task.reward_terms, 0.0),
+        )
+        info.update(drawn)
+        return self._observation, info
+
+    def step(self, action):
+        """Holds `action` for `hold` control steps, or until the episode ends.
+
+        Raises:
+            InputError: if the action is not finite or of the wrong shape; finite ones outside [-1, 1] are clipped.
+        """
+        action = self._checked(action)
+        if not self._running:
+            raise gymnasium.error.ResetNeeded("the episode is over, or none has begun: call reset() first")
+        simulator = self.simulator
+        context = simulator.get_context()
+        self._action_value.GetMutableData().set_value(action)
+
+        total = peak_force = 0.0
+        commanded_violation = measured_violation = -np.inf
+        terms = dict.fromkeys(self.task.reward_terms, 0.0)
+        termination = 0
+        failure = None
+        for _ in range(self.hold):
+            try:
+                # By an integer count: a sum of periods would drift across the plant's steps.
+                simulator.AdvanceTo((self._control_steps + 1) * self.task.control_period)
+                pose = self._pose_port.Eval(context)
+                if not np.isfinite(pose).all():
+                    failure = "the measured pose is not finite"
+            except RuntimeError as error:
+                if not _SIMULATION_FAILURE.search(str(error)):
+                    raise
+                failure = str(error)
+            if failure is not None:
+                break
+            self._control_steps += 1
+            reward = float(self._reward_port.Eval(context)[0])
+            force = float(self._force_port.Eval(context)[0])
+            total += reward
+            peak_force = max(peak_force, force)
+            commanded_violation = max(commanded_violation, float(self._commanded_violation_port.Eval(context)[0]))
+            measured_violation = max(measured_violation, float(self._measured_violation_port.Eval(context)[0]))
+            for name, port in self._term_ports:
+                terms[name] += float(port.Eval(context)[0])
+            self.trace.append(self._desired_pose_port.Eval(context), pose, force, reward)
+            termination = int(self._termination_port.Eval(context)[0])
+            if termination or self._control_steps == self.task.num_steps:
+                break
+
+        terminated = termination != 0
+        truncated = not terminated and (failure is not None or self._control_steps >= self.task.num_steps)
+        if truncated and failure is None:
+            termination = _TIME_LIMIT
+        info = self._info(termination, commanded_violation, measured_violation, peak_force, terms)
+        if failure is not None:
+            info["simulation_failure"] = failure
+        else:
+            self._observation = self._observe(context)
+            if terminated or truncated:
+                info["ledger"] = dict(
+                    zip(self.task.ledger_fields, self._ledger_port.Eval(context).tolist(), strict=True)
+                )
+        self._running = not (terminated or truncated)
+        return self._observation, total, terminated, truncated, info
+
+    def render(self):
+        """An (h, w, 3) image of uint8 for "rgb_array"; publishes to Meshcat for "human"."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("nothing to render: make the environment with render_mode='human' or 'rgb_array'")
+            return None
+        if self.render_mode == "rgb_array":
+            return self.render_rgb_port.Eval(self.simulator.get_context()).data[:, :, :3].copy()
+        self.simulator.get_system().ForcedPublish(self.simulator.get_context())
+        return None
+
+    def push(self, displacement) -> None:
+        """Moves the robot by `displacement` (O,), as a person would who pushes it between two control steps."""
+        if self.task.push is None:
+            raise InputError("this task has no robot that can be pushed")
+        displacement = np.asarray(displacement, dtype=float)
+        if displacement.shape != (self._pose_port.size(),) or not np.isfinite(displacement).all():
+            raise InputError(f"a push is {self._pose_port.size()} finite numbers, not {displacement}")
+        self.task.push(self.simulator.get_mutable_context(), displacement)
+
+    def _checked(self, action) -> np.ndarray:
+        try:
+            action = np.asarray(action, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"an action is {self._neutral.size} numbers in [-1, 1], not {action!r}") from None
+        if action.shape != self._neutral.shape:
+            raise InputError(f"an action is an array of shape {self._neutral.shape}, not {action.shape}")
+        if not np.isfinite(action).all():
+            raise InputError(f"an action must be finite, not {action}: the robot was not moved")
+        return np.clip(action, -1.0, 1.0)
+
+    def _observe(self, context) -> np.ndarray:
+        if self._image_observation:
+            return self.observation_port.Eval(context).data[:, :, :3].copy()
+        return self.observation_port.Eval(context).astype(self.observation_space.dtype)
+
+    def _info(self, termination, commanded_violation, measured_violation, force, terms) -> dict[str, Any]:
+        return {
+            "is_success": TERMINATIONS[termination] == "success",
+            "termination": TERMINATIONS[termination],
+            "constraint_violation": commanded_violation,
+            "measured_violation": measured_violation,
+            "contact_force": force,
+            "control_steps": self._control_steps,
+            **terms,
+        }
+
+
+def _check_render_mode(task: TaskDiagram, render_mode: str | None) -> None:
+    if render_mode not in (None, "human", "rgb_array"):
+        raise InputError(f"there is no render mode '{render_mode}': use None, 'human' or 'rgb_array'")
+    if render_mode == "human" and task.meshcat is None:
+        raise InputError("this environment has no Meshcat: make it with render_mode='human'")
+    if render_mode == "rgb_array" and not task.diagram.HasOutputPort("rgb_image"):
+        raise InputError("this environment has no camera: make it with render_mode='rgb_array'")
