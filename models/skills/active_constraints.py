@@ -1,0 +1,298 @@
+"""Active constraints: projections of the end effector's pose onto what is allowed (thesis, equation 2.21).
+
+Each is idempotent: what is allowed stays where it is. A state's constraints are applied in the order of the file, so
+those on orientation that depend on the position come after those on the position.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from guiderail.models.skills.geometry import (
+    WORLD,
+    Frames,
+    about,
+    angle_about,
+    angle_between,
+    position_in,
+    rotation_deg,
+    tilt_axis,
+    with_position_in,
+)
+from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, interpolate, register, require
+
+UNBOUNDED = 1e3  # [m] farther than any robot of ours reaches
+
+
+class ActiveConstraint(ABC):
+    """project_q of equation 2.21 for one constraint."""
+
+    @abstractmethod
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
+        """The allowed pose for X_WE; X_WE itself where that is allowed."""
+
+    def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
+        """How far X_WE is from its projection: the larger of metres and radians; zero where it is allowed."""
+        X_WP = self.project(X_WE, frames)
+        return max(
+            float(np.linalg.norm(X_WP.translation() - X_WE.translation())),
+            angle_between(X_WP.rotation(), X_WE.rotation()),
+        )
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """The objects' frames it needs."""
+        frame = getattr(self, "frame", WORLD)
+        return () if frame == WORLD else (frame,)
+
+
+class PositionConstraint(ActiveConstraint):
+    """A constraint on p_FE alone; the orientation is kept."""
+
+    frame: str
+
+    @abstractmethod
+    def project_position(self, p_FE: np.ndarray) -> np.ndarray:
+        """The allowed position for p_FE [m]; a new array or the very same one where it is allowed."""
+
+    def project(self, X_WE, frames):
+        p_FE = position_in(self.frame, X_WE, frames)
+        p_FP = self.project_position(p_FE)
+        # An allowed pose is returned untouched: the way through the frame and back would cost the last digits.
+        return X_WE if p_FP is p_FE else with_position_in(self.frame, p_FP, X_WE, frames)
+
+
+@register(ACTIVE_CONSTRAINTS, "half_space")
+@dataclass(frozen=True)
+class HalfSpace(PositionConstraint):
+    """normal · p_FE ≥ offset_m."""
+
+    normal: tuple[float, ...]
+    offset_m: float
+    frame: str = WORLD
+
+    def __post_init__(self):
+        require(len(self.normal) == 3 and np.any(self.normal), f"normal must be three numbers, not {self.normal}.")
+
+    def project_position(self, p_FE):
+        normal = np.array(self.normal) / np.linalg.norm(self.normal)
+        short = self.offset_m - normal @ p_FE
+        return p_FE if short <= 0 else p_FE + short * normal
+
+
+@register(ACTIVE_CONSTRAINTS, "box")
+@dataclass(frozen=True)
+class Box(PositionConstraint):
+    """lower_m ≤ p_FE ≤ upper_m, axis by axis."""
+
+    lower_m: tuple[float, ...]
+    upper_m: tuple[float, ...]
+    frame: str = WORLD
+
+    def __post_init__(self):
+        require(len(self.lower_m) == len(self.upper_m) == 3, "lower_m and upper_m must be three numbers each.")
+        require(bool(np.all(np.less_equal(self.lower_m, self.upper_m))), "lower_m must not exceed upper_m.")
+
+    def project_position(self, p_FE):
+        p_FP = np.clip(p_FE, self.lower_m, self.upper_m)
+        return p_FE if np.array_equal(p_FP, p_FE) else p_FP
+
+
+@register(ACTIVE_CONSTRAINTS, "cylinder")
+@dataclass(frozen=True)
+class Cylinder(PositionConstraint):
+    """The distance from F's z axis is between min_radius_m and max_radius_m; z is free.
+
+    With a min_radius_m the axis is kept out, with a max_radius_m the end effector is kept in.
+    """
+
+    frame: str
+    min_radius_m: float = 0.0
+    max_radius_m: float = UNBOUNDED
+
+    def __post_init__(self):
+        require(0 <= self.min_radius_m <= self.max_radius_m, "radii must satisfy 0 ≤ min_radius_m ≤ max_radius_m.")
+
+    def project_position(self, p_FE):
+        radius = float(np.hypot(p_FE[0], p_FE[1]))
+        if self.min_radius_m <= radius <= self.max_radius_m:
+            return p_FE
+        wanted = self.min_radius_m if radius < self.min_radius_m else self.max_radius_m
+        direction = p_FE[:2] / radius if radius > 0 else np.array([-1.0, 0.0])
+        return np.array([*settled(wanted, direction, self.min_radius_m, self.max_radius_m), p_FE[2]])
+
+
+def settled(wanted: float, direction: np.ndarray, least: float, most: float) -> np.ndarray:
+    """wanted · direction, a rounding error inside [least, most] rather than outside, so that projecting is idempotent."""
+    nudge = min(1e-12, 0.25 * (most - least))
+    return (wanted + (nudge if wanted == least else -nudge)) * direction
+
+
+@register(ACTIVE_CONSTRAINTS, "keep_above")
+@dataclass(frozen=True)
+class KeepAbove(ActiveConstraint):
+    """Points that are fixed to the end effector stay at or above height_m in F; it is lifted along F's z.
+
+    Without points_m, the end effector's own origin is the point.
+    """
+
+    height_m: float
+    frame: str = WORLD
+    points_m: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0),)  # p_EP
+
+    def __post_init__(self):
+        require(len(self.points_m) > 0 and all(len(p) == 3 for p in self.points_m), "points_m are (x, y, z) each.")
+
+    def project(self, X_WE, frames):
+        p_WP = X_WE.rotation().matrix() @ np.array(self.points_m).T + X_WE.translation()[:, np.newaxis]
+        if self.frame == WORLD:
+            up_W, origin = np.array([0.0, 0.0, 1.0]), 0.0
+        else:
+            up_W = frames[self.frame].rotation().matrix()[:, 2]
+            origin = float(up_W @ frames[self.frame].translation())
+        short = self.height_m - (float(np.min(up_W @ p_WP)) - origin)
+        return X_WE if short <= 0 else RigidTransform(X_WE.rotation(), X_WE.translation() + short * up_W)
+
+
+@register(ACTIVE_CONSTRAINTS, "funnel")
+@dataclass(frozen=True)
+class Funnel(PositionConstraint):
+    """p_FE stays under a cone: z ≤ height_m + slope · (radius − radius_m), so that going in leads down."""
+
+    frame: str
+    radius_m: float
+    height_m: float  # at radius_m and inside of it
+    slope: float  # rise over run
+
+    def __post_init__(self):
+        require(self.radius_m >= 0 and self.slope >= 0, "radius_m and slope must not be negative.")
+
+    def project_position(self, p_FE):
+        radius = float(np.hypot(p_FE[0], p_FE[1]))
+        ceiling = self.height_m + self.slope * max(0.0, radius - self.radius_m)
+        return p_FE if p_FE[2] <= ceiling else np.array([p_FE[0], p_FE[1], ceiling])
+
+
+@register(ACTIVE_CONSTRAINTS, "fixed_orientation")
+@dataclass(frozen=True)
+class FixedOrientation(ActiveConstraint):
+    """R_FE is one given rotation."""
+
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    frame: str = WORLD
+
+    def __post_init__(self):
+        require(len(self.rpy_deg) == 3, f"rpy_deg must be three angles, not {len(self.rpy_deg)}.")
+
+    def project(self, X_WE, frames):
+        R_FE = rotation_deg(self.rpy_deg)
+        R_WE = R_FE if self.frame == WORLD else frames[self.frame].rotation().multiply(R_FE)
+        return RigidTransform(R_WE, X_WE.translation())
+
+
+class TiltConstraint(ActiveConstraint):
+    """The orientation is `rpy_deg` at rest, tilted towards F's z axis by an angle from an interval.
+
+    The interval may depend on the distance to F's origin. The nearest such rotation is taken.
+    """
+
+    frame: str
+    rpy_deg: tuple[float, ...]
+
+    @abstractmethod
+    def limits_deg(self, distance_m: float) -> tuple[float, float]:
+        """The least and the greatest tilt [deg] at this distance."""
+
+    def tilt(self, X_WE: RigidTransform, frames: Frames) -> float:
+        """The tilt [rad] of the nearest rotation that is tilted towards F's axis and nothing else."""
+        p_FE = position_in(self.frame, X_WE, frames)
+        R_FE = axes(self.frame, frames).InvertAndCompose(X_WE.rotation())
+        return angle_about(tilt_axis(p_FE), R_FE.multiply(rotation_deg(self.rpy_deg).inverse()).matrix())
+
+    def project(self, X_WE, frames):
+        p_FE = position_in(self.frame, X_WE, frames)
+        least, most = np.deg2rad(self.limits_deg(float(np.linalg.norm(p_FE))))
+        angle = float(np.clip(nearest_turn(self.tilt(X_WE, frames), 0.5 * (least + most)), least, most))
+        R_FE = about(tilt_axis(p_FE), angle).multiply(rotation_deg(self.rpy_deg))
+        return RigidTransform(axes(self.frame, frames).multiply(R_FE), X_WE.translation())
+
+
+def axes(frame: str, frames: Frames) -> RotationMatrix:
+    """R_WF."""
+    return RotationMatrix() if frame == WORLD else frames[frame].rotation()
+
+
+def nearest_turn(angle: float, centre: float) -> float:
+    """The same angle, a whole number of turns away, within half a turn of `centre`."""
+    return angle - 2 * np.pi * np.round((angle - centre) / (2 * np.pi))
+
+
+@register(ACTIVE_CONSTRAINTS, "tilt_limits")
+@dataclass(frozen=True)
+class TiltLimits(TiltConstraint):
+    """Tilted towards F's axis by min_deg to max_deg, wherever it is."""
+
+    frame: str
+    min_deg: float
+    max_deg: float
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
+
+    def __post_init__(self):
+        require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
+
+    def limits_deg(self, distance_m):
+        return self.min_deg, self.max_deg
+
+
+@register(ACTIVE_CONSTRAINTS, "tilt_by_distance")
+@dataclass(frozen=True)
+class TiltByDistance(TiltConstraint):
+    """Tilted towards F's axis by an angle that is a function of the distance to F's origin."""
+
+    frame: str
+    distance_m: tuple[float, ...]  # increasing
+    tilt_deg: tuple[float, ...]  # one for each distance, linear in between, constant beyond
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
+
+    def __post_init__(self):
+        require(
+            len(self.distance_m) == len(self.tilt_deg) >= 1 and bool(np.all(np.diff(self.distance_m) > 0)),
+            "distance_m must increase, with one tilt_deg for each distance.",
+        )
+        require(-180 <= min(self.tilt_deg) and max(self.tilt_deg) <= 180, "tilt_deg must be between −180 and 180.")
+
+    def limits_deg(self, distance_m):
+        tilt = interpolate(distance_m, self.distance_m, self.tilt_deg)
+        return tilt, tilt
+
+
+@register(ACTIVE_CONSTRAINTS, "arc")
+@dataclass(frozen=True)
+class Arc(ActiveConstraint):
+    """On a circle about F's z axis, the orientation turning along with it: a door handle.
+
+    At angle 0 the end effector is on F's x axis with R_FE = rpy_deg.
+    """
+
+    frame: str
+    radius_m: float
+    height_m: float = 0.0
+    min_deg: float = -180.0
+    max_deg: float = 180.0
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
+        require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
+
+    def project(self, X_WE, frames):
+        p_FE = position_in(self.frame, X_WE, frames)
+        least, most = np.deg2rad([self.min_deg, self.max_deg])
+        angle = float(np.arctan2(p_FE[1], p_FE[0]))
+        angle = float(np.clip(nearest_turn(angle, 0.5 * (least + most)), least, most))
+        p_FP = np.array([self.radius_m * np.cos(angle), self.radius_m * np.sin(angle), self.height_m])
+        R_FP = about(np.array([0.0, 0.0, 1.0]), angle).multiply(rotation_deg(self.rpy_deg))
+        X_FP = RigidTransform(R_FP, p_FP)
+        return X_FP if self.frame == WORLD else frames[self.frame].multiply(X_FP)

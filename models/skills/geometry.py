@@ -1,0 +1,77 @@
+"""Tilt, bearing and interpolation of poses: the geometry that mappings and constraints share.
+
+Frames: W world, E the end effector (or the tip of what it holds), F an object. A tilt is a rotation about the
+horizontal axis that is perpendicular to the bearing, the horizontal direction from E to the object.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+Frames = Mapping[str, RigidTransform]
+WORLD = "world"
+
+NEAR_AXIS = 1e-9  # [m] closer to the axis than this, there is no bearing
+
+
+def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
+    """The rotation with these roll, pitch and yaw angles (x, y, z, about fixed axes) in degrees."""
+    return RotationMatrix(RollPitchYaw(*np.deg2rad(rpy_deg)))
+
+
+def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
+    """p_FE [m]: where the end effector's origin is in the frame F called `frame`."""
+    if frame == WORLD:
+        return X_WE.translation().copy()
+    X_WF = frames[frame]
+    return X_WF.rotation().matrix().T @ (X_WE.translation() - X_WF.translation())
+
+
+def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
+    """X_WE moved so that its origin is at p_FE [m] in the frame F; the orientation is kept."""
+    return RigidTransform(X_WE.rotation(), p_FE if frame == WORLD else frames[frame].multiply(p_FE))
+
+
+def bearing(p_FE: np.ndarray) -> np.ndarray:
+    """The horizontal unit vector in F from E to F's origin; +x where E is on F's z axis."""
+    horizontal = np.hypot(p_FE[0], p_FE[1])
+    if horizontal < NEAR_AXIS:
+        return np.array([1.0, 0.0, 0.0])
+    return np.array([-p_FE[0] / horizontal, -p_FE[1] / horizontal, 0.0])
+
+
+def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
+    """The axis in F about which a positive angle tips an upright thing towards F's origin: z × bearing."""
+    towards = bearing(p_FE)
+    return np.array([-towards[1], towards[0], 0.0])
+
+
+def angle_about(axis: np.ndarray, R: np.ndarray) -> float:
+    """The angle [rad] of the rotation about `axis` that is nearest to R (in the Frobenius norm)."""
+    vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.arctan2(axis @ vee, np.trace(R) - axis @ R @ axis))
+
+
+def about(axis: np.ndarray, angle: float) -> RotationMatrix:
+    """The rotation by `angle` [rad] about the unit vector `axis`."""
+    return RotationMatrix(AngleAxis(angle, axis))
+
+
+def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
+    """The angle [rad] of the rotation from A to B, accurate for small angles too."""
+    # ‖A − B‖ = 2√2 sin(θ/2) in the Frobenius norm; a trace loses half of the digits near zero.
+    difference = R_WA.matrix() - R_WB.matrix()
+    chord = np.sqrt(np.einsum("ij,ij->", difference, difference))
+    return 2.0 * float(np.arcsin(min(1.0, chord / (2.0 * np.sqrt(2.0)))))
+
+
+def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> RigidTransform:
+    """The pose a fraction of the way from A to B: straight in position, about one axis in orientation."""
+    p = X_WA.translation() + fraction * (X_WB.translation() - X_WA.translation())
+    if fraction in (0.0, 1.0):
+        return RigidTransform(X_WB.rotation() if fraction == 1.0 else X_WA.rotation(), p)
+    R_AB = X_WA.rotation().InvertAndCompose(X_WB.rotation()).ToAngleAxis()
+    R_AX = RotationMatrix(AngleAxis(fraction * R_AB.angle(), R_AB.axis()))
+    return RigidTransform(X_WA.rotation().multiply(R_AX), p)

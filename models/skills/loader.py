@@ -1,0 +1,243 @@
+"""Reads a skill from a YAML file, and says in one sentence what is wrong with one."""
+
+import ast
+import math
+import operator
+from collections.abc import Callable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from guiderail.models.errors import InputError
+from guiderail.models.skills import active_constraints, input_mappings, transition_distances
+from guiderail.models.skills.geometry import WORLD
+from guiderail.models.skills.kinds import (
+    ACTIVE_CONSTRAINTS,
+    INPUT_MAPPINGS,
+    TRANSITION_DISTANCES,
+    build,
+    did_you_mean,
+)
+from guiderail.models.skills.skill import Skill, SkillState, Transition
+
+# Importing them is what registers the kinds.
+KINDS = (active_constraints, input_mappings, transition_distances)
+
+OPERATORS: dict[type, Callable[..., float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.USub: operator.neg,
+}
+SKILL_FIELDS = {
+    "name",
+    "inputs",
+    "frames",
+    "parameters",
+    "initial_state",
+    "max_speed_m_per_s",
+    "max_speed_rad_per_s",
+    "states",
+}
+
+
+def load_skill(source: str | Path, **parameters: float) -> Skill:
+    """Reads a skill.
+
+    Args:
+        source: a file, or the name of one of guiderail's own skills (`pouring`).
+        **parameters: sizes of the objects at hand, in place of the file's own values under `parameters`.
+
+    Raises:
+        InputError: if the file cannot be read, or what it says is not a skill.
+    """
+    path = Path(source)
+    if path.suffix not in (".yaml", ".yml"):
+        known = resources.files("guiderail.models.skills")
+        path = Path(str(known / f"{source}.yaml"))
+        if not path.is_file():
+            names = [Path(str(f)).stem for f in known.iterdir() if str(f).endswith(".yaml")]
+            raise InputError(f"There is no skill {str(source)!r}; {did_you_mean(str(source), names)}")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"The skill {path} can't be read ({error}); check the path.") from error
+    return parse_skill(text, path.name, **parameters)
+
+
+def parse_skill(text: str, where: str = "skill", **parameters: float) -> Skill:
+    """Like load_skill, from the YAML text itself; `where` names it in messages."""
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise InputError(f"{where} is not YAML: {' '.join(str(error).split())}.") from error
+    data = _mapping(data, where, SKILL_FIELDS, required=SKILL_FIELDS - {"frames", "parameters", "initial_state"})
+    number = _Numbers(_parameters(data.get("parameters", {}), parameters, where))
+
+    frames = data.get("frames", [])
+    if not isinstance(frames, list) or not all(isinstance(f, str) for f in frames) or len({*frames}) < len(frames):
+        raise InputError(f"{where}: frames must be a list of different names, not {frames!r}.")
+    inputs = data["inputs"]
+    if not isinstance(inputs, int) or not 1 <= inputs <= 6:
+        raise InputError(f"{where}: inputs must be a whole number from 1 to 6, not {inputs!r}.")
+    states = data["states"]
+    if not isinstance(states, dict) or not states:
+        raise InputError(f"{where}: states must be a mapping from names to states, with at least one.")
+    initial = data.get("initial_state", next(iter(states)))
+    if initial not in states:
+        raise InputError(f"{where}: initial_state {initial!r} is not a state; {did_you_mean(str(initial), states)}")
+
+    speeds = {key: number(data[key], f"{where}, {key}") for key in ("max_speed_m_per_s", "max_speed_rad_per_s")}
+    for key, speed in speeds.items():
+        if not speed > 0:
+            raise InputError(f"{where}: {key} must be positive, not {speed}.")
+    built = tuple(_state(name, state, f"{where}, state {name}", number) for name, state in states.items())
+    skill = Skill(
+        name=str(data["name"]),
+        inputs=inputs,
+        frames=tuple(frames),
+        states=built,
+        initial_state=list(states).index(initial),
+        parameters=dict(number.names),
+        **speeds,
+    )
+    _check_names(skill, where)
+    return skill
+
+
+class _Numbers:
+    """Turns an entry of the file into a number: a literal, or arithmetic on the names of parameters."""
+
+    def __init__(self, names: Mapping[str, float]):
+        self.names = names
+
+    def __call__(self, entry: Any, where: str) -> float:
+        if isinstance(entry, str):
+            try:
+                value = self._evaluate(ast.parse(entry, mode="eval").body, where)
+            except (SyntaxError, ZeroDivisionError) as error:
+                raise InputError(f"{where}: {entry!r} is not arithmetic on the parameters; mend it.") from error
+        elif isinstance(entry, int | float) and not isinstance(entry, bool):
+            value = float(entry)
+        else:
+            raise InputError(f"{where} must be a number, not {entry!r}.")
+        if not math.isfinite(value):
+            raise InputError(f"{where} must be a finite number, not {entry!r}.")
+        return value
+
+    def _evaluate(self, node: ast.expr, where: str) -> float:
+        if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+            return float(node.value)
+        if isinstance(node, ast.Name):
+            if node.id not in self.names:
+                raise InputError(f"{where}: there is no parameter {node.id!r}; {did_you_mean(node.id, self.names)}")
+            return self.names[node.id]
+        if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
+            return OPERATORS[type(node.op)](self._evaluate(node.left, where), self._evaluate(node.right, where))
+        if isinstance(node, ast.UnaryOp) and type(node.op) in OPERATORS:
+            return OPERATORS[type(node.op)](self._evaluate(node.operand, where))
+        raise InputError(f"{where}: {ast.unparse(node)!r} is not a number; use parameters with + − * / only.")
+
+
+def _mapping(data: Any, where: str, known: set[str], required: set[str]) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise InputError(f"{where} must be a mapping with {', '.join(sorted(required))}, not {data!r}.")
+    for key in data:
+        if key not in known:
+            raise InputError(f"{where}: unknown field {key!r}; {did_you_mean(str(key), known)}")
+    for key in sorted(required):
+        if key not in data:
+            raise InputError(f"{where}: {key} is missing; give it a value.")
+    return data
+
+
+def _parameters(defaults: Any, given: Mapping[str, float], where: str) -> dict[str, float]:
+    if not isinstance(defaults, dict):
+        raise InputError(f"{where}: parameters must be a mapping from names to numbers, not {defaults!r}.")
+    plain = _Numbers({})
+    values = {str(name): plain(value, f"{where}, parameter {name}") for name, value in defaults.items()}
+    for name, value in given.items():
+        if name not in values:
+            raise InputError(f"{where} has no parameter {name!r}; {did_you_mean(name, values)}")
+        values[name] = plain(float(value), f"{where}, parameter {name}")
+    return values
+
+
+def _state(name: str, data: Any, where: str, number: _Numbers) -> SkillState:
+    if not isinstance(data, dict) or "transition_distance" not in data:
+        raise InputError(f"{where} must be a mapping with input_mapping, active_constraints and transition_distance.")
+    distance = build(TRANSITION_DISTANCES, data["transition_distance"], f"{where}, transition_distance", number)
+    unit = distance.unit
+    start, end, weight = f"starts_at_{unit}", f"ends_at_{unit}", f"weight_per_{unit}"
+    required = {"input_mapping", "active_constraints", "transition_distance", start}
+    if not data.get("transitions"):
+        required = required | {end}
+    data = _mapping(data, where, required | {end, weight, "transitions"}, required)
+    si = math.pi / 180 if unit == "deg" else 1.0
+
+    def quantity(key: str) -> float:
+        return si * number(data[key], f"{where}, {key}")
+
+    transitions = tuple(
+        _transition(entry, unit, si, f"{where}, transition {i + 1}", number)
+        for i, entry in enumerate(_list(data, "transitions", where))
+    )
+    state = SkillState(
+        name=str(name),
+        input_mapping=tuple(
+            build(INPUT_MAPPINGS, entry, f"{where}, input_mapping {i + 1}", number)
+            for i, entry in enumerate(_list(data, "input_mapping", where))
+        ),
+        active_constraints=tuple(
+            build(ACTIVE_CONSTRAINTS, entry, f"{where}, active_constraint {i + 1}", number)
+            for i, entry in enumerate(_list(data, "active_constraints", where))
+        ),
+        transition_distance=distance,
+        starts_at=quantity(start),
+        ends_at=quantity(end) if end in data else transitions[0].below,
+        weight=number(data[weight], f"{where}, {weight}") / si if weight in data else 1.0,
+        transitions=transitions,
+    )
+    if not state.starts_at > state.ends_at:
+        raise InputError(f"{where}: {start} must be greater than where the phase ends; distances decrease.")
+    if not state.weight > 0:
+        raise InputError(f"{where}: {weight} must be positive.")
+    return state
+
+
+def _list(data: Mapping[str, Any], key: str, where: str) -> list:
+    entries = data.get(key, [])
+    if not isinstance(entries, list):
+        raise InputError(f"{where}: {key} must be a list, not {entries!r}.")
+    return entries
+
+
+def _transition(data: Any, unit: str, si: float, where: str, number: _Numbers) -> Transition:
+    below, hysteresis = f"below_{unit}", f"hysteresis_{unit}"
+    data = _mapping(data, where, {"to", below, hysteresis}, {"to", below})
+    margin = si * number(data[hysteresis], f"{where}, {hysteresis}") if hysteresis in data else None
+    if margin is not None and not margin > 0:
+        raise InputError(f"{where}: {hysteresis} must be positive, or left out where there is no way back.")
+    return Transition(str(data["to"]), si * number(data[below], f"{where}, {below}"), margin)
+
+
+def _check_names(skill: Skill, where: str) -> None:
+    """Refuses states, frames and inputs that are named but not there."""
+    states = [state.name for state in skill.states]
+    for state in skill.states:
+        place = f"{where}, state {state.name}"
+        for transition in state.transitions:
+            if transition.to not in states:
+                raise InputError(f"{place}: there is no state {transition.to!r}; {did_you_mean(transition.to, states)}")
+        for part in (*state.input_mapping, *state.active_constraints, state.transition_distance):
+            for frame in part.frame_names:
+                if frame not in skill.frames:
+                    known = (*skill.frames, WORLD)
+                    raise InputError(f"{place}: there is no frame {frame!r}; {did_you_mean(frame, known)}")
+        for mapping in state.input_mapping:
+            for used in mapping.used_inputs:
+                if not 0 <= used < skill.inputs:
+                    raise InputError(f"{place}: there is no input {used}; they are 0 to {skill.inputs - 1}.")

@@ -1,0 +1,178 @@
+"""A shared control template: its data, and its laws as functions of a state and a pose (thesis, section 2.3)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from guiderail.models.errors import InputError
+from guiderail.models.skills.active_constraints import ActiveConstraint
+from guiderail.models.skills.geometry import Frames, angle_between, between
+from guiderail.models.skills.input_mappings import InputMapping
+from guiderail.models.skills.kinds import did_you_mean
+from guiderail.models.skills.transition_distances import TransitionDistance
+
+INSIDE = 1e-9  # [m or rad] a pose that violates by no more than this is inside the constraints
+BACKTRACKS = 8  # shortenings of a displacement before the command stays where it is
+
+
+@dataclass(frozen=True)
+class Transition:
+    """Leaves a state when its distance falls below a threshold, and comes back with hysteresis."""
+
+    to: str
+    below: float  # [m] or [rad], in the unit of the state's distance
+    hysteresis: float | None = None  # back when the distance exceeds below + hysteresis; None: there is no way back
+
+
+@dataclass(frozen=True)
+class SkillState:
+    """One phase: what inputs do, where the end effector may be, and how far it is to the next phase."""
+
+    name: str
+    input_mapping: tuple[InputMapping, ...]
+    active_constraints: tuple[ActiveConstraint, ...]  # applied in this order
+    transition_distance: TransitionDistance
+    starts_at: float  # [m] or [rad] distance at which the phase typically begins: the zero of its progress
+    ends_at: float  # [m] or [rad] distance at which the phase is done
+    weight: float = 1.0  # [1/m] or [1/rad] how much progress one unit of distance is
+    transitions: tuple[Transition, ...] = ()
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the constraints made of a request."""
+
+    X_WE: RigidTransform
+    fraction: float  # how much of the requested displacement was possible: 1 all of it, 0 the command stays
+
+
+@dataclass(frozen=True)
+class Skill:
+    """What is known about a task, written down once; a person and a policy act through it alike.
+
+    States are numbered in the order of the file. `frames` are the names of the objects' frames; wherever a method
+    takes `frames`, it is their poses X_WF by name.
+    """
+
+    name: str
+    inputs: int
+    frames: tuple[str, ...]
+    states: tuple[SkillState, ...]
+    initial_state: int
+    max_speed_m_per_s: float
+    max_speed_rad_per_s: float
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    def index(self, state: str) -> int:
+        """The number of the state called `state`."""
+        for number, candidate in enumerate(self.states):
+            if candidate.name == state:
+                return number
+        raise InputError(f"{self.name} has no state {state!r}; {did_you_mean(state, [s.name for s in self.states])}")
+
+    def map(self, state: int, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float):
+        """map_q, equation 2.19: the displacement ΔH that the inputs, each clipped to [−1, 1], ask for in one period."""
+        inputs = np.clip(inputs, -1.0, 1.0)
+        total = RigidTransform()
+        for mapping in self.states[state].input_mapping:
+            part = mapping.displacement(inputs, X_WE, frames, period_s)
+            total = RigidTransform(part.rotation().multiply(total.rotation()), part.translation() + total.translation())
+        return total
+
+    @staticmethod
+    def displace(X_WE: RigidTransform, displacement: RigidTransform) -> RigidTransform:
+        """displace_q, equation 2.20: H^im, translated in the world and rotated about the end effector's origin."""
+        return RigidTransform(
+            displacement.rotation().multiply(X_WE.rotation()), X_WE.translation() + displacement.translation()
+        )
+
+    def project(self, state: int, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
+        """project_q, equation 2.21: H^ac, the state's active constraints applied in their order."""
+        for constraint in self.states[state].active_constraints:
+            X_WE = constraint.project(X_WE, frames)
+        return X_WE
+
+    def violation(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
+        """How far X_WE is outside of the worst active constraint, the larger of [m] and [rad]; 0 inside."""
+        return max((c.violation(X_WE, frames) for c in self.states[state].active_constraints), default=0.0)
+
+    def command(
+        self, state: int, X_WLast: RigidTransform, X_WRequest: RigidTransform, frames: Frames, period_s: float
+    ) -> Command:
+        """The pose nearest to a request that the constraints allow and that one period can reach from the last command.
+
+        A constraint may ask for more than it seems: an orientation that depends on the position turns quickly where
+        the position is near the object. Where the projected request is too far away for the skill's greatest speeds,
+        it is the displacement that is scaled down, so that the orientation never lags behind the position.
+        A last command that is outside (the state has just changed) is led inside at the greatest speed.
+        """
+        fraction = 1.0
+        for _ in range(BACKTRACKS):
+            X_WE = self.project(state, between(X_WLast, X_WRequest, fraction), frames)
+            load = self._load(X_WLast, X_WE, period_s)
+            if load <= 1.0:
+                return Command(X_WE, fraction)
+            fraction *= 0.98 / load if load < np.inf else 0.0
+        X_WE = self.project(state, X_WLast, frames)
+        load = self._load(X_WLast, X_WE, period_s)
+        return Command(X_WE if load <= 1.0 else between(X_WLast, X_WE, 1.0 / load), 0.0)
+
+    def _load(self, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
+        """The share of the greatest speeds that the way between two commands needs."""
+        difference = X_WE.translation() - X_WLast.translation()
+        return max(
+            float(np.sqrt(difference @ difference)) / (self.max_speed_m_per_s * period_s),
+            angle_between(X_WLast.rotation(), X_WE.rotation()) / (self.max_speed_rad_per_s * period_s),
+        )
+
+    @cached_property
+    def _ways(self) -> tuple[tuple[tuple[int, float, int, float], ...], ...]:
+        """For each state, (state of the distance, sign, next state, threshold), forward transitions first."""
+        forward: list[list] = [[] for _ in self.states]
+        back: list[list] = [[] for _ in self.states]
+        for number, state in enumerate(self.states):
+            for transition in state.transitions:
+                target = self.index(transition.to)
+                forward[number].append((number, 1.0, target, transition.below))
+                if transition.hysteresis is not None:
+                    back[target].append((number, -1.0, number, transition.below + transition.hysteresis))
+        return tuple(tuple(f + b) for f, b in zip(forward, back, strict=True))
+
+    def next_state(self, state: int, X_WE: RigidTransform, frames: Frames) -> int:
+        """The state after `state`, at most one transition away."""
+        for source, sign, target, threshold in self._ways[state]:
+            distance = self.states[source].transition_distance.value(X_WE, frames)
+            if sign * distance < sign * threshold:
+                return target
+        return state
+
+    def distance(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
+        """The transition distance d_t of a state, [m] or [rad]."""
+        return self.states[state].transition_distance.value(X_WE, frames)
+
+    @cached_property
+    def _done_before(self) -> tuple[float, ...]:
+        """The progress with which each state begins: what the states on the way to it are worth."""
+        done = [0.0] * len(self.states)
+        number, seen = self.initial_state, {self.initial_state}
+        while self.states[number].transitions:
+            state = self.states[number]
+            target = self.index(state.transitions[0].to)
+            if target in seen:
+                break
+            done[target] = done[number] + state.weight * (state.starts_at - state.ends_at)
+            seen.add(target)
+            number = target
+        return tuple(done)
+
+    def progress(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
+        """How much of the task is done: the phases before, and what this one's distance has lost, weighted.
+
+        An increase of progress is d_{t−1} − d_t of equation 3.2, for all phases on one scale. It is continuous across
+        a transition where the next phase's distance is its starts_at there.
+        """
+        phase = self.states[state]
+        return self._done_before[state] + phase.weight * (phase.starts_at - self.distance(state, X_WE, frames))
