@@ -14,6 +14,7 @@ compliant primitives. A soft pad on the barrel stands for the gasket: it pushes 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -110,7 +111,7 @@ def slot_columns(dimensions: BncDimensions, num_entry: int = 6, num_ramp: int = 
     path = np.concatenate(
         [
             start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start)
-            for start, end in zip(knots, knots[1:], strict=False)
+            for start, end in itertools.pairwise(knots)
         ]
     )
     last = knots[-1, 0]
@@ -199,7 +200,7 @@ def bore_mesh(dimensions: BncDimensions, num_sides: int = 24) -> TriangleMesh:
     ]
     angles = 2.0 * np.pi * (np.arange(num_sides + 1) + 0.5) / num_sides
     circles = [_cylindrical(radius, angles, height) for radius, height in profile]
-    quads = [_strip(first, second) for first, second in zip(circles, circles[1:], strict=False)]
+    quads = [_strip(first, second) for first, second in itertools.pairwise(circles)]
     return TriangleMesh.from_quads(np.concatenate(quads))
 
 

@@ -33,18 +33,15 @@ PLUG_MASS = 0.03  # [kg]
 
 
 def _proximity(material: ContactMaterial) -> str:
-    compliance = (
-        "<drake:rigid_hydroelastic/>"
-        if material.modulus is None
-        else f"<drake:compliant_hydroelastic/><drake:hydroelastic_modulus>{material.modulus:g}</drake:hydroelastic_modulus>"
-    )
-    hint = (
-        ""
-        if material.resolution is None
-        else f"<drake:mesh_resolution_hint>{material.resolution:g}</drake:mesh_resolution_hint>"
-    )
+    if material.modulus is None:
+        compliance = "<drake:rigid_hydroelastic/>"
+    else:
+        modulus = f"<drake:hydroelastic_modulus>{material.modulus:g}</drake:hydroelastic_modulus>"
+        compliance = f"<drake:compliant_hydroelastic/>{modulus}"
+    if material.resolution is not None:
+        compliance += f"<drake:mesh_resolution_hint>{material.resolution:g}</drake:mesh_resolution_hint>"
     return f"""<drake:proximity_properties>
-          {compliance}{hint}
+          {compliance}
           <drake:hunt_crossley_dissipation>{material.dissipation:g}</drake:hunt_crossley_dissipation>
           <drake:mu_dynamic>{material.friction:g}</drake:mu_dynamic>
           <drake:mu_static>{material.friction:g}</drake:mu_static>

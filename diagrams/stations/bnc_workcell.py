@@ -1,0 +1,103 @@
+"""The BNC connector's workcell: a jack in the world, a plug in the tool, and offsets of both that a reset can draw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
+from pydrake.systems.framework import Context
+
+from guiderail.models.objects.bnc_connector import JACK_SDF, PLUG_SDF, BncDimensions
+
+# The pairs that never meet in a connector of these dimensions, or whose part of the contact another surface carries.
+FILTERED_PAIRS = [
+    (("lug_0", "lug_1", "pad"), ("bore",)),
+    (("barrel", "pad"), ("slots",)),
+    (("lug_0", "lug_1", "barrel"), ("seat",)),
+]
+
+
+@dataclass(frozen=True)
+class BncWorkcell:
+    """A jack in front of the robot's base, turned so that the target frame's axes are the world's.
+
+    Args:
+        dimensions: of the connector; the files that are loaded were written from the default.
+        p_WJ: where the jack stands, (3,) [m].
+    """
+
+    dimensions: BncDimensions = field(default_factory=BncDimensions)
+    p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)
+
+    @property
+    def X_WJ(self) -> RigidTransform:
+        """The nominal jack."""
+        return RigidTransform(RotationMatrix.MakeZRotation(self.dimensions.detent_angle), np.array(self.p_WJ))
+
+    @property
+    def X_JT(self) -> RigidTransform:
+        """The locked plug on the jack."""
+        return RigidTransform(
+            RotationMatrix.MakeZRotation(-self.dimensions.detent_angle), [0.0, 0.0, self.dimensions.locked_height]
+        )
+
+    @property
+    def X_WT(self) -> RigidTransform:
+        """The target: the plug locked on the nominal jack."""
+        return self.X_WJ @ self.X_JT
+
+    def add_fixture(self, plant: MultibodyPlant) -> None:
+        """Adds the jack, on a frame that `set_jack_offset` moves."""
+        (model,) = Parser(plant).AddModels(str(JACK_SDF))
+        mount = plant.AddFrame(FixedOffsetFrame("jack_mount", plant.world_frame(), self.X_WJ))
+        plant.WeldFrames(mount, plant.GetFrameByName("jack", model))
+
+    def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
+        """Adds the plug, on a frame that `set_grasp_offset` moves."""
+        (model,) = Parser(plant).AddModels(str(PLUG_SDF))
+        grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
+        plug = plant.GetBodyByName("plug", model)
+        plant.WeldFrames(grasp, plug.body_frame())
+        return plug
+
+    def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+        """Leaves the barrel to the bore, the lugs to the slots and the pad to the seat."""
+        jack, plug = (self._geometries(plant, scene_graph, name) for name in ("jack", "plug"))
+        manager = scene_graph.collision_filter_manager()
+        for of_jack, of_plug in FILTERED_PAIRS:
+            manager.Apply(
+                CollisionFilterDeclaration().ExcludeBetween(
+                    GeometrySet([jack[name] for name in of_jack]), GeometrySet([plug[name] for name in of_plug])
+                )
+            )
+
+    def set_jack_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
+        """Moves the jack so that the plug locks at X_TTactual instead of at the target."""
+        X_WJ = self.X_WT @ X_TTactual @ self.X_JT.inverse()
+        _frame(plant, "jack_mount").SetPoseInParentFrame(plant_context, X_WJ)
+
+    def set_grasp_offset(self, plant: MultibodyPlant, plant_context: Context, X_PPlug: RigidTransform) -> None:
+        """Moves the plug in the tool."""
+        _frame(plant, "grasp").SetPoseInParentFrame(plant_context, X_PPlug)
+
+    def plug_in_locked_frame(self, plant: MultibodyPlant, plant_context: Context) -> RigidTransform:
+        """Where the plug is as seen from where it locks, offsets included: the identity when it is locked."""
+        X_JPlug = plant.GetFrameByName("plug").CalcPose(plant_context, plant.GetFrameByName("jack"))
+        return self.X_JT.inverse() @ X_JPlug
+
+    @staticmethod
+    def _geometries(plant: MultibodyPlant, scene_graph: SceneGraph, body: str) -> dict[str, GeometryId]:
+        inspector = scene_graph.model_inspector()
+        ids = plant.GetCollisionGeometriesForBody(plant.GetBodyByName(body))
+        return {inspector.GetName(geometry).split("::")[-1]: geometry for geometry in ids}
+
+
+def _frame(plant: MultibodyPlant, name: str) -> FixedOffsetFrame:
+    frame = plant.GetFrameByName(name)
+    assert isinstance(frame, FixedOffsetFrame)
+    return frame

@@ -1,0 +1,136 @@
+"""The tool centre on six rails: a Cartesian impedance without an arm, for learning at several times real time."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    Frame,
+    JointActuator,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    RevoluteJoint,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.primitives import MatrixGain
+
+from guiderail.diagrams.stations.station import POSE_SIZE, Impedance, Station, add_contact_plant
+from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.wrench_sensor import WrenchSensor
+
+RAILS = (
+    ("x", PrismaticJoint, [1.0, 0.0, 0.0]),
+    ("y", PrismaticJoint, [0.0, 1.0, 0.0]),
+    ("z", PrismaticJoint, [0.0, 0.0, 1.0]),
+    ("Rz", RevoluteJoint, [0.0, 0.0, 1.0]),
+    ("Ry", RevoluteJoint, [0.0, 1.0, 0.0]),
+    ("Rx", RevoluteJoint, [1.0, 0.0, 0.0]),
+)
+CARRIAGE_MASS = 1.5  # [kg], of all that moves: what an arm feels like at its tool when its controller shapes its inertia
+CARRIAGE_INERTIA = 2e-3  # [kg m²]
+# A link between two rails weighs next to nothing; without any inertia the plant's mass matrix would be singular.
+LINK_MASS, LINK_RADIUS = 1e-3, 0.01
+
+
+class RailsStation(Station):
+    """Joints x, y, z, Rz, Ry, Rx from the target frame to the tool centre, each with a spring, a damper and a limit.
+
+    Their positions are the pose itself. Springs and dampers are the plant's own actuator gains, solved implicitly with
+    the contact: stable at any stiffness and time step. Weight is compensated by leaving it out.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
+        time_step: float = 0.005,
+        wrench_time_constant: float = 0.01,
+    ):
+        """
+        Args:
+            workcell: what stands in the world and what is held.
+            impedance: of the rails.
+            time_step: of the plant [s].
+            wrench_time_constant: of the wrench sensor's low-pass filter [s].
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        self.plant, self.scene_graph = plant, _ = add_contact_plant(builder, time_step)
+        workcell.add_fixture(plant)
+        self.rails, tool_centre = _add_rails(plant, workcell, impedance)
+        self.workpiece = workcell.add_workpiece(plant, tool_centre)
+        for model in (self.rails, self.workpiece.model_instance()):
+            plant.set_gravity_enabled(model, False)
+        plant.Finalize()
+        workcell.filter_contacts(plant, self.scene_graph)
+
+        # The desired pose is the desired state's first half; the desired velocity is zero, so that damping damps.
+        desired_state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
+        pose = builder.AddNamedSystem("pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)))
+        monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
+        sensor = builder.AddNamedSystem(
+            "wrench_sensor",
+            WrenchSensor(
+                plant,
+                _weld_of(plant, self.workpiece),
+                [self.workpiece],
+                self.workpiece.body_frame(),
+                workcell.X_WT.rotation(),
+                time_step,
+                wrench_time_constant,
+            ),
+        )
+        sensor.connect(builder, plant)
+        builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(self.rails))
+        builder.Connect(plant.get_state_output_port(self.rails), pose.get_input_port())
+        builder.Connect(plant.get_net_actuation_output_port(self.rails), monitor.get_impedance_wrench_input_port())
+        builder.ExportInput(desired_state.get_input_port(), "desired_pose")
+        builder.ExportOutput(pose.get_output_port(), "pose")
+        builder.ExportOutput(sensor.get_wrench_output_port(), "wrench")
+        builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
+        builder.ExportOutput(monitor.get_saturation_output_port(), "saturation")
+        builder.BuildInto(self)
+
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Puts the carriage at rest at `pose`, (6,), in this station's context."""
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        self.plant.SetPositions(plant_context, self.rails, pose)
+        self.plant.SetVelocities(plant_context, self.rails, np.zeros(POSE_SIZE))
+
+
+def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) -> tuple[ModelInstanceIndex, Frame]:
+    model = plant.AddModelInstance("rails")
+    parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
+    masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
+    dampings = 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
+    for (name, joint_type, axis), stiffness, damping, limit in zip(
+        RAILS, impedance.stiffness, dampings, impedance.limits, strict=True
+    ):
+        is_carriage = name == RAILS[-1][0]
+        link = plant.AddRigidBody("tool_centre" if is_carriage else f"{name}_link", model, _inertia(is_carriage))
+        joint = plant.AddJoint(joint_type(name, parent, link.body_frame(), axis))
+        actuator: JointActuator = plant.AddJointActuator(f"{name}_motor", joint, limit)
+        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
+        parent = link.body_frame()
+    return model, parent
+
+
+def _inertia(is_carriage: bool) -> SpatialInertia:
+    if not is_carriage:
+        return SpatialInertia.SolidSphereWithMass(LINK_MASS, LINK_RADIUS)
+    return SpatialInertia(CARRIAGE_MASS, np.zeros(3), UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS)))
+
+
+def _weld_of(plant: MultibodyPlant, body: RigidBody):
+    (weld,) = (
+        plant.get_joint(index)
+        for index in plant.GetJointIndices()
+        if plant.get_joint(index).child_body().index() == body.index()
+    )
+    return weld

@@ -1,0 +1,99 @@
+"""What every station has in common: its ports, its numbers, and how it is placed at a reset.
+
+A *station* is a diagram with the robot, its controller and the objects of a task. Whatever the robot, it has
+
+=================  =====  ==========================================================================================
+input              size   meaning
+=================  =====  ==========================================================================================
+`desired_pose`     6      where the tool centre P shall be: X_TP as [x y z Rz Ry Rx], metres and radians
+`command_time`     1      optional: when `desired_pose` was given [s]; where it stops, the last safe pose is held
+=================  =====  ==========================================================================================
+
+=================  =====  ==========================================================================================
+output             size   meaning
+=================  =====  ==========================================================================================
+`pose`             6      where P is: X_TP, in the same coordinates
+`wrench`           6      of the surroundings on the tool, at P, in the axes of T: [fx fy fz tx ty tz], N and Nm,
+                          without the tool's own weight and inertia, low-pass filtered
+`contact_force`    1      size of the force with which the impedance pushes [N]: what a collision is judged by
+`saturation`       1      1 while the controller is at a limit of force or torque, otherwise 0
+=================  =====  ==========================================================================================
+
+The orientation of X_TP is Rz(a) Ry(b) Rx(c), T being the target frame of the workcell: the pose is all zeros when the
+task is done. T lies still in the world, where the *nominal* fixture wants it: a station does not know of offsets.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+from guiderail.models.errors import InputError
+
+POSE_SIZE = 6
+
+
+@dataclass(frozen=True)
+class Impedance:
+    """How the tool centre gives way, along and about the axes of T: [x y z Rz Ry Rx]."""
+
+    stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)  # [N/m], [Nm/rad]
+    damping_ratio: float = 1.0
+    limits: tuple[float, ...] = (40.0, 40.0, 40.0, 3.0, 3.0, 3.0)  # [N], [Nm]
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "limits"):
+            value = np.asarray(getattr(self, name), dtype=float)
+            if value.shape != (POSE_SIZE,) or not (np.isfinite(value) & (value > 0.0)).all():
+                raise InputError(f"the impedance's {name} need six positive numbers, not {getattr(self, name)}")
+        if not (np.isfinite(self.damping_ratio) and self.damping_ratio > 0.0):
+            raise InputError(f"the impedance's damping_ratio must be positive, not {self.damping_ratio}")
+
+
+class Station(Diagram):
+    """A diagram with the ports above."""
+
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+
+    def get_desired_pose_input_port(self):
+        """Where the tool centre shall be, (6,)."""
+        return self.GetInputPort("desired_pose")
+
+    def get_pose_output_port(self):
+        """Where the tool centre is, (6,)."""
+        return self.GetOutputPort("pose")
+
+    def get_wrench_output_port(self):
+        """The wrench of the surroundings on the tool, (6,)."""
+        return self.GetOutputPort("wrench")
+
+    def get_contact_force_output_port(self):
+        """The force with which the impedance pushes, (1,) [N]."""
+        return self.GetOutputPort("contact_force")
+
+    def get_saturation_output_port(self):
+        """1 while the controller is at a limit, (1,)."""
+        return self.GetOutputPort("saturation")
+
+    @abstractmethod
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Puts the robot at rest with its tool centre at `pose`, (6,), in this station's context."""
+
+
+def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:
+    """A plant whose contact is that of the connector's files: polygons on compliant primitives, quietly regularized."""
+    if not time_step > 0.0:
+        raise InputError(f"the plant's time step must be positive, not {time_step} s")
+    config = MultibodyPlantConfig(
+        time_step=time_step,
+        contact_model="hydroelastic_with_fallback",
+        discrete_contact_approximation="lagged",
+        contact_surface_representation="polygon",
+    )
+    return AddMultibodyPlant(config, builder)

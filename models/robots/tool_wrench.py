@@ -1,0 +1,29 @@
+"""The wrench of the surroundings on a tool, from what a wrist feels and how the tool moves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def external_wrench(
+    F_reaction: np.ndarray, M: np.ndarray, V: np.ndarray, A: np.ndarray, gravity: np.ndarray
+) -> np.ndarray:
+    """Newton and Euler for a rigid tool: F_external = M A + bias(V) − M [0, g] − F_reaction.
+
+    All spatial vectors are [rotational, translational] (6,), about one point P of the tool and in the axes of one
+    frame, which may be any; M is the tool's spatial inertia (6, 6) about P in those axes.
+
+    Args:
+        F_reaction: of the wrist on the tool.
+        M: mass [kg] and inertia.
+        V, A: spatial velocity and acceleration of the tool at P, in an inertial frame.
+        gravity: (3,) [m/s²].
+
+    Returns:
+        The wrench of the surroundings on the tool, [torque, force] (6,).
+    """
+    angular = V[:3]
+    momentum_of_mass = M[3:, :3] @ angular  # m ω × p_PCom, by the inertia's own coupling block
+    bias = np.concatenate([np.cross(angular, M[:3, :3] @ angular), np.cross(angular, momentum_of_mass)])
+    free_fall = np.concatenate([np.zeros(3), gravity])
+    return M @ (A - free_fall) + bias - F_reaction

@@ -1,0 +1,127 @@
+"""A wrist wrench sensor that reports only what the surroundings do to the tool."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RotationMatrix
+from pydrake.multibody.math import SpatialAcceleration, SpatialForce, SpatialVelocity
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame, Joint, RigidBody
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+
+from guiderail.models.errors import InputError
+from guiderail.models.robots.tool_wrench import external_wrench
+
+
+class WrenchSensor(LeafSystem):
+    """The wrench of the surroundings on a tool at its centre of compliance, low-pass filtered.
+
+    Behind a wrist (a joint) hangs a rigid tool. What the wrist feels contains the tool's weight and inertia; the sensor
+    removes them (Newton and Euler, `models.robots.tool_wrench`), moves the rest to the centre of compliance P, turns it
+    into the axes of a frame that is fixed in the world, and filters it by y' = (u − y)/τ, sampled at `period`.
+
+    .. pydrake_system::
+
+        name: WrenchSensor
+        input_ports:
+        - reaction_forces
+        - body_poses
+        - body_spatial_velocities
+        - body_spatial_accelerations
+        output_ports:
+        - wrench
+
+    The inputs are the plant's output ports of those names. `wrench` is (6,), [fx fy fz tx ty tz] in N and Nm. It is
+    state: one sample old, zero after a reset, and never feeds through.
+    """
+
+    def __init__(
+        self,
+        plant: MultibodyPlant,
+        wrist: Joint,
+        tool: list[RigidBody],
+        centre: Frame,
+        R_WAxes: RotationMatrix,
+        period: float,
+        time_constant: float,
+    ):
+        """
+        Args:
+            plant: finalized; its output ports feed this system.
+            wrist: whose reaction is measured; its child is the first of `tool`.
+            tool: the bodies that hang behind the wrist, welded together.
+            centre: the centre of compliance P, fixed to the first of `tool`.
+            R_WAxes: the axes in which the wrench is reported.
+            period: of the sampling [s], positive; the plant's time step loses nothing.
+            time_constant: τ of the filter [s]; 0 does not filter.
+
+        Raises:
+            InputError: if an argument is out of range or the first of `tool` doesn't hang on the wrist.
+        """
+        super().__init__()
+        if not period > 0.0:
+            raise InputError(f"a wrench sensor's period must be positive, not {period} s")
+        if not 0.0 <= time_constant < np.inf:
+            raise InputError(f"a wrench sensor's time constant must not be negative, not {time_constant} s")
+        if not tool or wrist.child_body().index() != tool[0].index():
+            raise InputError(f"the first body of a wrench sensor's tool must be the child of {wrist.name()}")
+        nominal = plant.CreateDefaultContext()
+        self._wrist = int(wrist.index())
+        self._tool = int(tool[0].index())
+        self._X_ToolP = centre.CalcPose(nominal, tool[0].body_frame())
+        self._X_ToolWrist = wrist.frame_on_child().CalcPose(nominal, tool[0].body_frame())
+        self._M_ToolP_P = plant.CalcSpatialInertia(nominal, centre, [body.index() for body in tool]).CopyToFullMatrix6()
+        self._R_AxesW = R_WAxes.inverse()
+        has_weight = plant.is_gravity_enabled(tool[0].model_instance())
+        self._gravity_W = plant.gravity_field().gravity_vector() if has_weight else np.zeros(3)
+        self._kept = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
+
+        self._reactions = self.DeclareAbstractInputPort("reaction_forces", Value([SpatialForce()]))
+        poses = plant.get_body_poses_output_port()
+        self._poses = self.DeclareAbstractInputPort("body_poses", poses.Allocate())
+        self._velocities = self.DeclareAbstractInputPort("body_spatial_velocities", Value([SpatialVelocity()]))
+        self._accelerations = self.DeclareAbstractInputPort("body_spatial_accelerations", Value([SpatialAcceleration()]))
+        self._state = self.DeclareDiscreteState(6)
+        self._wrench = self.DeclareStateOutputPort("wrench", self._state)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+
+    def connect(self, builder, plant: MultibodyPlant) -> None:
+        """Feeds this sensor from the plant's own output ports."""
+        builder.Connect(plant.get_reaction_forces_output_port(), self._reactions)
+        builder.Connect(plant.get_body_poses_output_port(), self._poses)
+        builder.Connect(plant.get_body_spatial_velocities_output_port(), self._velocities)
+        builder.Connect(plant.get_body_spatial_accelerations_output_port(), self._accelerations)
+
+    def get_wrench_output_port(self):
+        """The filtered wrench of the surroundings on the tool, (6,), force first."""
+        return self._wrench
+
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        newest = self._measure(context)
+        last = context.get_discrete_state(self._state).value()
+        discrete_state.set_value(newest + self._kept * (last - newest))
+        return EventStatus.Succeeded()
+
+    def _measure(self, context: Context) -> np.ndarray:
+        F_WristChild_Wrist = self._reactions.Eval(context)[self._wrist]
+        R_WTool = self._poses.Eval(context)[self._tool].rotation()
+        V_WTool = self._velocities.Eval(context)[self._tool]
+        A_WTool = self._accelerations.Eval(context)[self._tool]
+
+        R_PTool = self._X_ToolP.rotation().inverse()
+        R_PW = R_PTool @ R_WTool.inverse()
+        p_ToolP_W = R_WTool @ self._X_ToolP.translation()
+        p_WristP_Tool = self._X_ToolP.translation() - self._X_ToolWrist.translation()
+        V_WP = V_WTool.Shift(p_ToolP_W)
+        A_WP = A_WTool.Shift(p_ToolP_W, V_WTool.rotational())
+        F_reaction = F_WristChild_Wrist.Rotate(self._X_ToolWrist.rotation()).Shift(p_WristP_Tool).Rotate(R_PTool)
+        torque_force_P = external_wrench(
+            F_reaction.get_coeffs(),
+            self._M_ToolP_P,
+            V_WP.Rotate(R_PW).get_coeffs(),
+            A_WP.Rotate(R_PW).get_coeffs(),
+            R_PW @ self._gravity_W,
+        )
+        R_AxesP = (self._R_AxesW @ R_PW.inverse()).matrix()
+        return np.concatenate([R_AxesP @ torque_force_P[3:], R_AxesP @ torque_force_P[:3]])
