@@ -32,7 +32,9 @@ RAILS = (
     ("Ry", RevoluteJoint, [0.0, 1.0, 0.0]),
     ("Rx", RevoluteJoint, [1.0, 0.0, 0.0]),
 )
-CARRIAGE_MASS = 1.5  # [kg], of all that moves: what an arm feels like at its tool when its controller shapes its inertia
+CARRIAGE_MASS = (
+    1.5  # [kg], of all that moves: what an arm feels like at its tool when its controller shapes its inertia
+)
 CARRIAGE_INERTIA = 2e-3  # [kg m²]
 # A link between two rails weighs next to nothing; without any inertia the plant's mass matrix would be singular.
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
@@ -98,7 +100,7 @@ class RailsStation(Station):
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the carriage at rest at `pose`, (6,), in this station's context."""
+        """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositions(plant_context, self.rails, pose)
         self.plant.SetVelocities(plant_context, self.rails, np.zeros(POSE_SIZE))

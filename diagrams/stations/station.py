@@ -83,7 +83,7 @@ class Station(Diagram):
 
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the robot at rest with its tool centre at `pose`, (6,), in this station's context."""
+        """Puts the robot at rest with its tool centre at `pose`, (6,); `context` is the root context."""
 
 
 def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:

@@ -109,10 +109,7 @@ def slot_columns(dimensions: BncDimensions, num_entry: int = 6, num_ramp: int = 
         ]
     ) * [radius, 1.0]
     path = np.concatenate(
-        [
-            start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start)
-            for start, end in itertools.pairwise(knots)
-        ]
+        [start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start) for start, end in itertools.pairwise(knots)]
     )
     last = knots[-1, 0]
     arcs = np.concatenate(

@@ -1,0 +1,86 @@
+"""A station that is driven along a given motion and recorded: for demonstrations, benchmarks and tests of physics."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
+from pydrake.trajectories import PiecewisePolynomial
+
+from guiderail.diagrams.stations.station import POSE_SIZE, Station
+from guiderail.diagrams.task import exact_period
+from guiderail.systems.recorder import Recorder, Recording
+
+CONTROL_PERIOD = exact_period(0.02)
+SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_force": 1, "saturation": 1}
+
+
+class DrivenStation:
+    """A station whose commands come from anything with a (6,) output, held for a control period and recorded."""
+
+    def __init__(self, station: Station, source, num_samples: int, add_to_builder=None):
+        """
+        Args:
+            station: what is driven; it becomes part of this diagram.
+            source: a system whose first output is the desired pose: a trajectory, a person's input device, a policy.
+            num_samples: how many control periods the recorder has room for.
+            add_to_builder: called with the builder and the station before the diagram is built, to add a camera or a
+                visualizer.
+        """
+        builder = DiagramBuilder()
+        self.station = builder.AddNamedSystem("station", station)
+        builder.AddNamedSystem("source", source)
+        hold = builder.AddNamedSystem("hold", ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE))
+        self.recorder = builder.AddNamedSystem("recorder", Recorder(SIGNALS, num_samples, CONTROL_PERIOD))
+        builder.Connect(source.get_output_port(0), hold.get_input_port())
+        builder.Connect(hold.get_output_port(), station.get_desired_pose_input_port())
+        builder.Connect(hold.get_output_port(), self.recorder.get_signal_input_port("desired_pose"))
+        for name in list(SIGNALS)[1:]:
+            builder.Connect(station.GetOutputPort(name), self.recorder.get_signal_input_port(name))
+        if add_to_builder is not None:
+            add_to_builder(builder, station)
+        self.diagram: Diagram = builder.Build()
+        self.simulator = Simulator(self.diagram)
+        self._num_samples = num_samples
+
+    @property
+    def context(self) -> Context:
+        """The root context."""
+        return self.simulator.get_mutable_context()
+
+    @property
+    def plant_context(self) -> Context:
+        """The plant's context."""
+        return self.station.plant.GetMyMutableContextFromRoot(self.context)
+
+    def start(self, pose: np.ndarray) -> None:
+        """Puts the tool centre at rest at `pose`, (6,); call it before `run`."""
+        self.station.set_pose(self.context, pose)
+        self.simulator.Initialize()
+
+    def run(self, num_steps: int | None = None) -> Recording:
+        """Advances by control periods, all there is room for unless given, and returns what was recorded."""
+        recorder_context = self.recorder.GetMyContextFromRoot(self.context)
+        done = int(self.recorder.get_num_recorded_output_port().Eval(recorder_context)[0])
+        last = self._num_samples if num_steps is None else done + num_steps
+        self.simulator.AdvanceTo(last * CONTROL_PERIOD)
+        self.simulator.AdvancePendingEvents()
+        return self.recorder.recording(recorder_context)
+
+
+def along(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
+    """Straight lines between `poses` (N, 6) at `times` (N,), and at rest thereafter."""
+    return TrajectorySource(PiecewisePolynomial.FirstOrderHold(np.asarray(times), np.asarray(poses).T))
+
+
+def drive_along(
+    station: Station, times: np.ndarray, poses: np.ndarray, prepare=None
+) -> tuple[DrivenStation, Recording]:
+    """Drives a station from the first pose to the last; `prepare` is called with the plant and its context before."""
+    times, poses = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)
+    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    if prepare is not None:
+        prepare(station.plant, driven.plant_context)
+    driven.start(poses[0])
+    return driven, driven.run()

@@ -1,0 +1,163 @@
+"""The connector's physics, by pushing, turning and pulling it."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.recording import drive_along
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.rails import RailsStation
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.models.objects.bnc_motion import CLEAR, MM, insert_and_lock, poses
+
+STIFFNESS = 1500.0
+WORKCELL = BncWorkcell()
+# Heights of the mouth in the locked frame: on top of the lugs,
+LUG_TOP = (WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height) / MM
+# and with the lugs at the bottom of the straight entries.
+ENTRY_BOTTOM = (
+    WORKCELL.dimensions.lug_height - WORKCELL.dimensions.entry_height - WORKCELL.dimensions.locked_height
+) / MM
+
+
+def run(times, z_mm, yaw_deg, *, time_step=0.005, impedance=None, prepare=None):
+    station = RailsStation(WORKCELL, impedance or Impedance(), time_step)
+    motion = poses(np.array(z_mm) * MM, np.deg2rad(yaw_deg))
+    return drive_along(station, times, motion, prepare)
+
+
+def after_locking(times, z_mm, yaw_deg, **options):
+    """Goes on from the locked pose; returns the recording from there on."""
+    lock_times, lock_poses = insert_and_lock()
+    t = np.concatenate([lock_times, lock_times[-1] + np.array(times)])
+    z = np.concatenate([lock_poses[:, 2] / MM, z_mm])
+    yaw = np.concatenate([np.rad2deg(lock_poses[:, 3]), yaw_deg])
+    driven, recording = run(t, z, yaw, **options)
+    start = round(lock_times[-1] / 0.02)
+    return driven, {name: signal[start:] for name, signal in recording.signals.items()}
+
+
+@pytest.fixture(scope="module")
+def locked():
+    times, motion = insert_and_lock()
+    return drive_along(RailsStation(WORKCELL), times, motion)
+
+
+def test_known_pose_inserts_and_locks(locked):
+    _, recording = locked
+    final = recording["pose"][-1]
+    assert np.abs(final[:3]).max() < 0.3 * MM
+    assert np.abs(np.rad2deg(final[3:])).max() < 1.0
+    assert recording["contact_force"].max() < 15.0
+    assert not recording["saturation"].any()
+
+
+def test_the_sensor_feels_what_the_impedance_pushes_with(locked):
+    """At rest on the seat, and while turning slowly, the two are one force."""
+    _, recording = locked
+    turning = slice(250, 330)
+    np.testing.assert_allclose(
+        np.linalg.norm(recording["wrench"][turning, :3], axis=1), recording["contact_force"][turning, 0], atol=0.6
+    )
+
+
+def test_rotating_before_insertion_is_blocked_by_the_lugs():
+    """Turned by 45°, the mouth's face sits on the lugs, 30 N of push or not."""
+    depth = LUG_TOP - 30.0 / STIFFNESS / MM
+    _, recording = run([0, 1.5, 2.5, 3.5], [CLEAR / MM, LUG_TOP + 1, depth, depth], [45, 45, 45, 45])
+    assert recording["wrench"][-1, 2] == pytest.approx(30.0, abs=1.5)
+    assert recording["pose"][-1, 2] == pytest.approx(LUG_TOP * MM, abs=0.1 * MM)
+
+
+@pytest.mark.parametrize("lug_depth_in_slot", [1.5, 2.4])
+def test_rotation_is_blocked_in_the_entry_slot(lug_depth_in_slot):
+    """With the lugs between the entry's walls, a quarter turn commanded leaves a few degrees of play."""
+    z = WORKCELL.dimensions.lug_height / MM - WORKCELL.dimensions.locked_height / MM - lug_depth_in_slot
+    _, recording = run([0, 1.5, 3.0, 3.5], [CLEAR / MM, z, z, z], [90, 90, 0, 0])
+    assert np.rad2deg(recording["pose"][-1, 3]) > 80.0
+    assert abs(recording["wrench"][-1, 5]) > 1.0
+
+
+def test_pulling_after_locking_holds():
+    pull = 40.0 / STIFFNESS / MM + 5.0  # beyond the effort limit, which is what pulls
+    _, recording = after_locking([1.0, 2.0], [pull, pull], [0, 0])
+    assert recording["saturation"][-1, 0] == 1.0
+    assert recording["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
+    assert recording["pose"][-1, 2] < 0.5 * MM
+
+
+def test_the_detent_has_a_break_out_torque():
+    """Turning back without a push is resisted by the ramp's apex, and possible with enough torque."""
+    _, recording = after_locking([2.0, 2.2], [0, 0], [80, 80])
+    resistance = np.abs(recording["wrench"][:, 5])
+    in_detent = np.rad2deg(recording["pose"][:, 3]) < 8.0
+    assert 0.02 < resistance[in_detent].max() < 2.0
+    assert np.rad2deg(recording["pose"][-1, 3]) > 40.0
+
+
+@pytest.mark.parametrize(("z_mm", "yaw_deg"), [(-40.0, 45.0), (-40.0, 90.0)])
+def test_the_plug_does_not_tunnel_when_pushed_at_the_effort_limit(z_mm, yaw_deg):
+    """On the lugs or on the seat, with all the force there is."""
+    _, recording = run([0, 1.0, 2.0, 3.0], [CLEAR / MM, 9.0, z_mm, z_mm], [yaw_deg] * 4)
+    floor = (
+        LUG_TOP
+        if yaw_deg == 45.0
+        else WORKCELL.dimensions.lug_height / MM - 3.4 - WORKCELL.dimensions.locked_height / MM
+    )
+    assert recording["wrench"][-1, 2] == pytest.approx(40.0, abs=0.5)
+    assert recording["pose"][-1, 2] > (floor - 0.6) * MM
+
+
+def test_the_lugs_do_not_tunnel_when_turned_at_the_effort_limit():
+    _, recording = run([0, 1.0, 2.5, 3.5], [CLEAR / MM, 3.0, 3.0, 3.0], [90, 90, -90, -90])
+    assert recording["saturation"][-1, 0] == 1.0
+    assert np.rad2deg(recording["pose"][-1, 3]) > 80.0
+
+
+def test_halving_the_plant_step_changes_the_locked_pose_little(locked):
+    times, motion = insert_and_lock()
+    _, recording = drive_along(RailsStation(WORKCELL, time_step=0.0025), times, motion)
+    difference = recording["pose"][-1] - locked[1]["pose"][-1]
+    assert np.abs(difference[:3]).max() < 0.1 * MM
+    assert np.abs(np.rad2deg(difference[3:])).max() < 0.5
+
+
+def test_a_jack_that_was_moved_in_the_context_is_locked_where_it_is():
+    X_TTactual = RigidTransform([3.0 * MM, -2.0 * MM, 1.0 * MM])
+    times, motion = insert_and_lock()
+    shifted = motion + np.array([*X_TTactual.translation(), 0, 0, 0])
+
+    def move(plant, context):
+        WORKCELL.set_jack_offset(plant, context, X_TTactual)
+
+    driven, recording = drive_along(RailsStation(WORKCELL), times, shifted, move)
+    X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
+    assert np.abs(X.translation()).max() < 0.3 * MM
+    np.testing.assert_allclose(recording["pose"][-1, :3], X_TTactual.translation(), atol=0.3 * MM)
+
+
+def test_a_plug_that_was_held_askew_is_what_has_to_hit_the_jack():
+    offset = np.array([1.5 * MM, 0.0, 0.0])
+    times, motion = insert_and_lock()
+
+    def grasp(plant, context):
+        WORKCELL.set_grasp_offset(plant, context, RigidTransform(offset))
+
+    # The offset turns with the tool: the tool centre has to go around, and not straight from corner to corner.
+    fine = np.linspace(0.0, times[-1], 401)
+    dense = np.stack([np.interp(fine, times, column) for column in motion.T], axis=1)
+    dense[:, 0] -= offset[0] * np.cos(dense[:, 3])
+    dense[:, 1] -= offset[0] * np.sin(dense[:, 3])
+    driven, _ = drive_along(RailsStation(WORKCELL), fine, dense, grasp)
+    X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
+    assert np.abs(X.translation()).max() < 0.3 * MM
+
+
+def test_without_correction_an_offset_of_one_and_a_half_millimetres_jams():
+    def move(plant, context):
+        WORKCELL.set_jack_offset(plant, context, RigidTransform([1.5 * MM, 0.0, 0.0]))
+
+    times, motion = insert_and_lock()
+    _, recording = drive_along(RailsStation(WORKCELL), times, motion, move)
+    assert recording["pose"][-1, 2] > ENTRY_BOTTOM * MM + 2.0 * MM
+    assert recording["contact_force"].max() > 15.0
