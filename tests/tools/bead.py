@@ -1,0 +1,56 @@
+"""A bead on a wire with a goal and a wall: the smallest environment that reports what guiderail's own report."""
+
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from guiderail.diagrams.trace import Trace
+from guiderail.models.errors import InputError
+
+
+class Bead(gymnasium.Env):
+    def __init__(self, guidance="skgrl", reward="shaped", observation="state", hold=1, render_mode=None):
+        if guidance not in ("kmp", "skgrl"):
+            raise InputError(f"Bead has no guidance {guidance!r}: choose kmp or skgrl")
+        self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
+        self.hold, self.render_mode = hold, render_mode
+        self.task = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1)
+        self.trace = Trace(12, 2, 0.1)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.trace.clear()
+        start = 0.3 if (options or {}).get("held_out") else -0.3
+        self.x = np.array([start, 0.0]) + 0.1 * self.np_random.standard_normal(2)
+        return self._observation(), self._info("", 0.0)
+
+    def _observation(self):
+        return np.append(self.x, len(self.trace) / 12).astype(np.float32)
+
+    def _info(self, termination, reward):
+        info = {"is_success": termination == "success", "termination": termination, "goal_distance": reward}
+        violation = float(self.x[0] - 1.0)
+        return info | {"constraint_violation": violation, "measured_violation": violation, "contact_force": 1.0}
+
+    def step(self, action):
+        total = 0.0
+        for _ in range(self.hold):
+            self.x = np.minimum(self.x + 0.1 * np.asarray(action, float), 1.0)
+            reward = -float(np.linalg.norm(self.x - [0.5, 0.5]))
+            self.trace.append(self.x, self.x, 1.0, reward)
+            total += reward
+            if done := reward > -0.2 or len(self.trace) == 12:
+                break
+        termination = ("success" if reward > -0.2 else "time_limit") if done else ""
+        info = self._info(termination, total)
+        if done:
+            info["ledger"] = {"collisions": 0.0, "fallbacks": 0.0}
+        return self._observation(), total, termination == "success", termination == "time_limit", info
+
+
+def register():
+    if "guiderail/Bead-v0" not in gymnasium.registry:
+        gymnasium.register("guiderail/Bead-v0", entry_point=Bead)

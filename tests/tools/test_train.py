@@ -1,0 +1,111 @@
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from guiderail.models.errors import InputError
+from guiderail.tools.run_folder import RunFolder
+from guiderail.tools.train import train
+from guiderail.tools.training import run
+
+# Trains like the fixture's run, and says after each episode that it is over; then the parent pulls the plug.
+CHILD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import bead
+bead.register()
+from guiderail.tools.run_folder import RunFolder
+from guiderail.tools.train import train
+from guiderail.tools.training import configure
+settings = dict(units="16", batch_size=16, learning_starts=10, gradient_steps=4)
+train(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
+      report=lambda row: print(row["episode"], flush=True))
+"""
+
+
+def without_clock(rows):
+    return [{key: value for key, value in row.items() if key != "wall_time"} for row in rows]
+
+
+def assert_same_run(first, second):
+    assert without_clock(first.episodes()) == without_clock(second.episodes())
+    a, b = load_file(first.path / "policy.safetensors"), load_file(second.path / "policy.safetensors")
+    assert a.keys() == b.keys()
+    for key in a:
+        np.testing.assert_array_equal(a[key], b[key])
+
+
+def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+    undisturbed, killed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "killed")
+    train(undisturbed, bead_config)
+    code = CHILD.format(tests=str(Path(__file__).parent), out=str(killed.path))
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        for line in child.stdout:
+            if int(line) == 4:
+                os.kill(child.pid, signal.SIGKILL)
+                break
+    assert child.returncode == -signal.SIGKILL
+    assert not (killed.path / "policy.safetensors").exists()
+    train(killed, bead_config, resume=True)
+    assert_same_run(undisturbed, killed)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_another(bead_config, tmp_path):
+    folders = [RunFolder(tmp_path / name) for name in "abc"]
+    for folder, seed in zip(folders, (5, 5, 6), strict=True):
+        train(folder, replace(bead_config, seed=seed))
+    assert_same_run(folders[0], folders[1])
+    assert without_clock(folders[0].episodes()) != without_clock(folders[2].episodes())
+
+
+def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
+    long, extended = RunFolder(tmp_path / "long"), RunFolder(tmp_path / "extended")
+    train(long, bead_config)
+    train(extended, replace(bead_config, episodes=3))
+    train(extended, bead_config, resume=True)
+    assert_same_run(long, extended)
+    assert extended.config() == bead_config
+
+
+def test_a_run_never_replaces_another(bead_config, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="already exists"):
+        train(RunFolder(tmp_path), bead_config)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:-1000]),
+        lambda folder: folder.checkpoint.unlink(),
+        lambda folder: (folder.path / "episodes.csv").write_text("episode,success\n0,1\n"),
+        lambda folder: (folder.path / "config.yaml").write_text("task: [Bead\n"),
+        lambda folder: (folder.path / "config.yaml").write_text("task: Bead\nepisodes: many\n"),
+    ],
+    ids=["truncated checkpoint", "no checkpoint", "short table", "broken yaml", "incomplete yaml"],
+)
+def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, replace(bead_config, episodes=2))
+    damage(folder)
+    before = {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError):
+        run(None, folder.path, environment={}, episodes=4, resume=True)
+    assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+
+
+def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
+    train(RunFolder(tmp_path / "run"), replace(bead_config, episodes=2))
+    with pytest.raises(InputError, match="seed 5, not 7"):
+        run(None, tmp_path / "run", environment={}, seed=7, resume=True)
+    with pytest.raises(InputError, match="other learner settings"):
+        run(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)

@@ -1,0 +1,49 @@
+"""A run's learning curve: what was learned, and what it cost on the way."""
+
+from pathlib import Path
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+from guiderail.tools.pictures import COLOURS, new_figure, rolling, save_figure
+from guiderail.tools.run_folder import RunFolder, converged_after
+
+
+def plot_run(run: Path) -> Path:
+    """Draws `learning_curve.png` from `episodes.csv`: success, return, violations and force over the episodes.
+
+    Raises:
+        InputError: if there is no run, or no finished episode in it.
+    """
+    folder = RunFolder(run)
+    config, rows = folder.config(), folder.episodes()
+    if not rows:
+        raise InputError(f"{run} has no finished episode yet: let it train, then plot it")
+    column = {key: np.array([row[key] for row in rows], float) for key in rows[0] if key != "termination"}
+    episodes = np.arange(1, len(rows) + 1)
+    guidance = config.environment.get("guidance", "")
+    colour = COLOURS.get(guidance, "C0")
+
+    figure, axes = new_figure(2, 2, (9, 6))
+    success, returns, violation, force = axes.flat
+    success.plot(episodes, rolling(column["success"]), color=colour)
+    success.scatter(episodes, column["success"], s=6, color=colour, alpha=0.4)
+    success.set(ylabel="success (mean of 10)", ylim=(-0.05, 1.05))
+    converged = converged_after(column["success"] > 0.5)
+    if converged is not None:
+        success.axvline(converged + 0.5, color="0.6", linestyle=":")
+        success.set_title(f"ten in a row succeed after episode {converged}", fontsize=9)
+    returns.plot(episodes, column["return"], color=colour, alpha=0.3)
+    returns.plot(episodes, rolling(column["return"]), color=colour)
+    returns.set(ylabel="return")
+    violation.plot(episodes, column["worst_violation"], color=colour, label="commanded")
+    violation.plot(episodes, column["worst_measured_violation"], color="0.5", linewidth=1, label="measured")
+    violation.axhline(0, color="firebrick", linewidth=0.8)
+    violation.set(ylabel="worst constraint violation\n(negative is slack)", xlabel="episode")
+    violation.legend(frameon=False, fontsize=8)
+    force.plot(episodes, column["peak_force"], color=colour, label="peak")
+    force.plot(episodes, column["mean_force"], color="0.5", linewidth=1, label="mean")
+    force.set(ylabel="contact force [N]", xlabel="episode")
+    force.legend(frameon=False, fontsize=8)
+    figure.suptitle(f"{config.task} · {guidance} · {config.learner.algorithm.upper()} · seed {config.seed}")
+    return save_figure(figure, folder.path / "learning_curve.png")
