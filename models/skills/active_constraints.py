@@ -4,6 +4,7 @@ Each is idempotent: what is allowed stays where it is. A state's constraints are
 those on orientation that depend on the position come after those on the position.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -36,6 +37,8 @@ class ActiveConstraint(ABC):
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
         """How far X_WE is from its projection: the larger of metres and radians; zero where it is allowed."""
         X_WP = self.project(X_WE, frames)
+        if X_WP is X_WE:
+            return 0.0
         return max(
             float(np.linalg.norm(X_WP.translation() - X_WE.translation())),
             angle_between(X_WP.rotation(), X_WE.rotation()),
@@ -93,7 +96,7 @@ class Box(PositionConstraint):
 
     def __post_init__(self):
         require(len(self.lower_m) == len(self.upper_m) == 3, "lower_m and upper_m must be three numbers each.")
-        require(bool(np.all(np.less_equal(self.lower_m, self.upper_m))), "lower_m must not exceed upper_m.")
+        require(np.all(np.less_equal(self.lower_m, self.upper_m)), "lower_m must not exceed upper_m.")
 
     def project_position(self, p_FE):
         p_FP = np.clip(p_FE, self.lower_m, self.upper_m)
@@ -116,7 +119,7 @@ class Cylinder(PositionConstraint):
         require(0 <= self.min_radius_m <= self.max_radius_m, "radii must satisfy 0 ≤ min_radius_m ≤ max_radius_m.")
 
     def project_position(self, p_FE):
-        radius = float(np.hypot(p_FE[0], p_FE[1]))
+        radius = math.hypot(p_FE[0], p_FE[1])
         if self.min_radius_m <= radius <= self.max_radius_m:
             return p_FE
         wanted = self.min_radius_m if radius < self.min_radius_m else self.max_radius_m
@@ -125,7 +128,7 @@ class Cylinder(PositionConstraint):
 
 
 def settled(wanted: float, direction: np.ndarray, least: float, most: float) -> np.ndarray:
-    """wanted · direction, a rounding error inside [least, most] rather than outside, so that projecting is idempotent."""
+    """wanted · direction, a rounding error inside [least, most], so that projecting is idempotent."""
     nudge = min(1e-12, 0.25 * (most - least))
     return (wanted + (nudge if wanted == least else -nudge)) * direction
 
@@ -170,7 +173,7 @@ class Funnel(PositionConstraint):
         require(self.radius_m >= 0 and self.slope >= 0, "radius_m and slope must not be negative.")
 
     def project_position(self, p_FE):
-        radius = float(np.hypot(p_FE[0], p_FE[1]))
+        radius = math.hypot(p_FE[0], p_FE[1])
         ceiling = self.height_m + self.slope * max(0.0, radius - self.radius_m)
         return p_FE if p_FE[2] <= ceiling else np.array([p_FE[0], p_FE[1], ceiling])
 
@@ -207,14 +210,16 @@ class TiltConstraint(ActiveConstraint):
 
     def tilt(self, X_WE: RigidTransform, frames: Frames) -> float:
         """The tilt [rad] of the nearest rotation that is tilted towards F's axis and nothing else."""
-        p_FE = position_in(self.frame, X_WE, frames)
+        return self._tilt(position_in(self.frame, X_WE, frames), X_WE, frames)
+
+    def _tilt(self, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> float:
         R_FE = axes(self.frame, frames).InvertAndCompose(X_WE.rotation())
         return angle_about(tilt_axis(p_FE), R_FE.multiply(rotation_deg(self.rpy_deg).inverse()).matrix())
 
     def project(self, X_WE, frames):
         p_FE = position_in(self.frame, X_WE, frames)
-        least, most = np.deg2rad(self.limits_deg(float(np.linalg.norm(p_FE))))
-        angle = float(np.clip(nearest_turn(self.tilt(X_WE, frames), 0.5 * (least + most)), least, most))
+        least, most = (math.radians(limit) for limit in self.limits_deg(math.sqrt(p_FE @ p_FE)))
+        angle = min(max(nearest_turn(self._tilt(p_FE, X_WE, frames), 0.5 * (least + most)), least), most)
         R_FE = about(tilt_axis(p_FE), angle).multiply(rotation_deg(self.rpy_deg))
         return RigidTransform(axes(self.frame, frames).multiply(R_FE), X_WE.translation())
 
@@ -226,7 +231,7 @@ def axes(frame: str, frames: Frames) -> RotationMatrix:
 
 def nearest_turn(angle: float, centre: float) -> float:
     """The same angle, a whole number of turns away, within half a turn of `centre`."""
-    return angle - 2 * np.pi * np.round((angle - centre) / (2 * np.pi))
+    return angle - math.tau * round((angle - centre) / math.tau)
 
 
 @register(ACTIVE_CONSTRAINTS, "tilt_limits")
@@ -258,10 +263,10 @@ class TiltByDistance(TiltConstraint):
 
     def __post_init__(self):
         require(
-            len(self.distance_m) == len(self.tilt_deg) >= 1 and bool(np.all(np.diff(self.distance_m) > 0)),
+            len(self.distance_m) == len(self.tilt_deg) >= 1 and np.all(np.diff(self.distance_m) > 0),
             "distance_m must increase, with one tilt_deg for each distance.",
         )
-        require(-180 <= min(self.tilt_deg) and max(self.tilt_deg) <= 180, "tilt_deg must be between −180 and 180.")
+        require(min(self.tilt_deg) >= -180 and max(self.tilt_deg) <= 180, "tilt_deg must be between −180 and 180.")
 
     def limits_deg(self, distance_m):
         tilt = interpolate(distance_m, self.distance_m, self.tilt_deg)

@@ -4,7 +4,10 @@ Frames: W world, E the end effector (or the tip of what it holds), F an object. 
 horizontal axis that is perpendicular to the bearing, the horizontal direction from E to the object.
 """
 
+import math
 from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
@@ -16,6 +19,17 @@ WORLD = "world"
 NEAR_AXIS = 1e-9  # [m] closer to the axis than this, there is no bearing
 
 
+def pose_from_vector(vector: np.ndarray) -> RigidTransform:
+    """The pose with the coordinates [x y z Rz Ry Rx] of every station, metres and radians."""
+    return RigidTransform(RotationMatrix(RollPitchYaw(vector[5], vector[4], vector[3])), vector[:3])
+
+
+def vector_from_pose(X: RigidTransform) -> np.ndarray:
+    """The coordinates [x y z Rz Ry Rx] of a pose."""
+    return np.concatenate([X.translation(), RollPitchYaw(X.rotation()).vector()[::-1]])
+
+
+@lru_cache(maxsize=64)
 def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
     """The rotation with these roll, pitch and yaw angles (x, y, z, about fixed axes) in degrees."""
     return RotationMatrix(RollPitchYaw(*np.deg2rad(rpy_deg)))
@@ -24,19 +38,22 @@ def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
 def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
     """p_FE [m]: where the end effector's origin is in the frame F called `frame`."""
     if frame == WORLD:
-        return X_WE.translation().copy()
+        return X_WE.translation()
     X_WF = frames[frame]
     return X_WF.rotation().matrix().T @ (X_WE.translation() - X_WF.translation())
 
 
 def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
     """X_WE moved so that its origin is at p_FE [m] in the frame F; the orientation is kept."""
-    return RigidTransform(X_WE.rotation(), p_FE if frame == WORLD else frames[frame].multiply(p_FE))
+    if frame == WORLD:
+        return RigidTransform(X_WE.rotation(), p_FE)
+    X_WF = frames[frame]
+    return RigidTransform(X_WE.rotation(), X_WF.translation() + X_WF.rotation().matrix() @ p_FE)
 
 
 def bearing(p_FE: np.ndarray) -> np.ndarray:
     """The horizontal unit vector in F from E to F's origin; +x where E is on F's z axis."""
-    horizontal = np.hypot(p_FE[0], p_FE[1])
+    horizontal = math.hypot(p_FE[0], p_FE[1])
     if horizontal < NEAR_AXIS:
         return np.array([1.0, 0.0, 0.0])
     return np.array([-p_FE[0] / horizontal, -p_FE[1] / horizontal, 0.0])
@@ -50,11 +67,11 @@ def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
 
 def angle_about(axis: np.ndarray, R: np.ndarray) -> float:
     """The angle [rad] of the rotation about `axis` that is nearest to R (in the Frobenius norm)."""
-    vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.arctan2(axis @ vee, np.trace(R) - axis @ R @ axis))
+    vee = axis[0] * (R[2, 1] - R[1, 2]) + axis[1] * (R[0, 2] - R[2, 0]) + axis[2] * (R[1, 0] - R[0, 1])
+    return math.atan2(vee, R[0, 0] + R[1, 1] + R[2, 2] - axis @ R @ axis)
 
 
-def about(axis: np.ndarray, angle: float) -> RotationMatrix:
+def about(axis: Any, angle: float) -> RotationMatrix:
     """The rotation by `angle` [rad] about the unit vector `axis`."""
     return RotationMatrix(AngleAxis(angle, axis))
 
@@ -63,15 +80,16 @@ def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
     """The angle [rad] of the rotation from A to B, accurate for small angles too."""
     # ‖A − B‖ = 2√2 sin(θ/2) in the Frobenius norm; a trace loses half of the digits near zero.
     difference = R_WA.matrix() - R_WB.matrix()
-    chord = np.sqrt(np.einsum("ij,ij->", difference, difference))
-    return 2.0 * float(np.arcsin(min(1.0, chord / (2.0 * np.sqrt(2.0)))))
+    chord = math.sqrt(float(np.vdot(difference, difference)))
+    return 2.0 * math.asin(min(1.0, chord / math.sqrt(8.0)))
 
 
 def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> RigidTransform:
     """The pose a fraction of the way from A to B: straight in position, about one axis in orientation."""
-    p = X_WA.translation() + fraction * (X_WB.translation() - X_WA.translation())
+    p_WA, p_WB = X_WA.translation(), X_WB.translation()
+    p_WX = p_WA + fraction * (p_WB - p_WA)
     if fraction in (0.0, 1.0):
-        return RigidTransform(X_WB.rotation() if fraction == 1.0 else X_WA.rotation(), p)
+        return RigidTransform(X_WB.rotation() if fraction == 1.0 else X_WA.rotation(), p_WX)
     R_AB = X_WA.rotation().InvertAndCompose(X_WB.rotation()).ToAngleAxis()
     R_AX = RotationMatrix(AngleAxis(fraction * R_AB.angle(), R_AB.axis()))
-    return RigidTransform(X_WA.rotation().multiply(R_AX), p)
+    return RigidTransform(X_WA.rotation().multiply(R_AX), p_WX)

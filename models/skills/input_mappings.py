@@ -68,7 +68,7 @@ class Translation(InputMapping):
 
     def displacement(self, inputs, X_WE, frames, period_s):
         v_FE = self.speed_m_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
-        return RigidTransform(axes_in_world(self.frame, X_WE, frames) @ v_FE * period_s)
+        return RigidTransform(RotationMatrix(), axes_in_world(self.frame, X_WE, frames) @ v_FE * period_s)
 
 
 @register(INPUT_MAPPINGS, "rotation")
@@ -135,7 +135,7 @@ class Scaled(InputMapping):
             len(self.distance_m) == len(self.factor) >= 1 and np.all(np.diff(self.distance_m) > 0),
             "distance_m must increase, with one factor for each distance.",
         )
-        require(0 <= min(self.factor) and max(self.factor) <= 1, "every factor must be between 0 and 1.")
+        require(min(self.factor) >= 0 and max(self.factor) <= 1, "every factor must be between 0 and 1.")
 
     @property
     def used_inputs(self) -> tuple[int, ...]:

@@ -114,7 +114,7 @@ def convert(
     return build(registry, value, where, number)  # a kind inside a kind, such as `scaled`
 
 
-def require(condition: bool, sentence: str) -> None:
+def require(condition: Any, sentence: str) -> None:
     """Refuses a field of a kind with a sentence that names the remedy."""
     if not condition:
         raise InputError(sentence)

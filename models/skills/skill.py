@@ -1,7 +1,8 @@
 """A shared control template: its data, and its laws as functions of a state and a pose (thesis, section 2.3)."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -73,13 +74,19 @@ class Skill:
                 return number
         raise InputError(f"{self.name} has no state {state!r}; {did_you_mean(state, [s.name for s in self.states])}")
 
-    def map(self, state: int, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float):
+    def without_active_constraints(self) -> "Skill":
+        """The same skill with its input mappings, states and distances, and nothing that holds anyone back."""
+        return replace(self, states=tuple(replace(state, active_constraints=()) for state in self.states))
+
+    def map(
+        self, state: int, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float
+    ) -> RigidTransform:
         """map_q, equation 2.19: the displacement ΔH that the inputs, each clipped to [−1, 1], ask for in one period."""
         inputs = np.clip(inputs, -1.0, 1.0)
+        parts = [m.displacement(inputs, X_WE, frames, period_s) for m in self.states[state].input_mapping]
         total = RigidTransform()
-        for mapping in self.states[state].input_mapping:
-            part = mapping.displacement(inputs, X_WE, frames, period_s)
-            total = RigidTransform(part.rotation().multiply(total.rotation()), part.translation() + total.translation())
+        for part in parts:
+            total = self.displace(total, part)
         return total
 
     @staticmethod
@@ -124,7 +131,7 @@ class Skill:
         """The share of the greatest speeds that the way between two commands needs."""
         difference = X_WE.translation() - X_WLast.translation()
         return max(
-            float(np.sqrt(difference @ difference)) / (self.max_speed_m_per_s * period_s),
+            math.sqrt(difference @ difference) / (self.max_speed_m_per_s * period_s),
             angle_between(X_WLast.rotation(), X_WE.rotation()) / (self.max_speed_rad_per_s * period_s),
         )
 

@@ -1,5 +1,6 @@
 """Transition distances: how far it is to the end of a state (thesis, section 2.3)."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -36,7 +37,8 @@ class Distance(TransitionDistance):
     point_m: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def value(self, X_WE, frames):
-        return float(np.linalg.norm(position_in(self.frame, X_WE, frames) - self.point_m))
+        p_PE = position_in(self.frame, X_WE, frames) - self.point_m
+        return math.sqrt(p_PE @ p_PE)
 
 
 @register(TRANSITION_DISTANCES, "height")

@@ -1,0 +1,155 @@
+"""Guidance by a shared control template: a person's or a policy's few inputs in, a safe pose out."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOrderHold
+
+from guiderail.models.skills import Skill
+from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
+from guiderail.systems.sct_input_mapping import SctInputMapping
+from guiderail.systems.sct_state_machine import SctStateMachine
+
+WRENCH_SIZE = 6
+
+
+class ActiveConstraintFilter(Diagram):
+    """The active constraints and the state machine of a skill, behind anything that requests a pose.
+
+    .. pydrake_system::
+
+        name: ActiveConstraintFilter
+        input_ports:
+        - requested_pose
+        - pose
+        output_ports:
+        - desired_pose
+        - fallback
+        - last_desired_pose
+        - state
+        - transition_distance
+        - progress
+        - commanded_violation
+        - measured_violation
+    """
+
+    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float, leash: float = np.inf):
+        """
+        Args:
+            skill: the template.
+            frames: the poses X_WF of its objects by name; W is the frame that all poses are given in.
+            period: seconds between control steps.
+            leash: [m] how far the robot may be from its command before that waits.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        self._projector = ActiveConstraintProjector(skill, frames, period, leash)
+        builder.AddNamedSystem("projector", self._projector)
+        self._machine = SctStateMachine(skill, frames, period)
+        builder.AddNamedSystem("state_machine", self._machine)
+        # The state follows the command, not the measured pose: so the command is always inside the constraints of the
+        # state that it is made for, and a transition doesn't depend on how well the robot tracks.
+        builder.Connect(self._projector.get_desired_pose_output_port(), self._machine.get_pose_input_port())
+        builder.Connect(self._machine.get_state_output_port(), self._projector.get_state_input_port())
+        builder.ExportInput(self._projector.get_requested_pose_input_port(), "requested_pose")
+        builder.ExportInput(self._projector.get_pose_input_port(), "pose")
+        for system, names in (
+            (self._projector, ("desired_pose", "fallback", "last_desired_pose")),
+            (self._machine, ("state", "transition_distance", "progress")),
+            (self._projector, ("commanded_violation", "measured_violation")),
+        ):
+            for name in names:
+                builder.ExportOutput(system.GetOutputPort(name), name)
+        builder.BuildInto(self)
+
+    def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
+        """Moves objects; those that aren't named stay. The context is the root diagram's."""
+        for system in (self._projector, self._machine):
+            system.frames.set(system.GetMyMutableContextFromRoot(root_context), frames)
+
+
+class SctGuidance(Diagram):
+    """Shared control: input mapping, then active constraints, in the state that the state machine is in.
+
+    .. pydrake_system::
+
+        name: SctGuidance
+        input_ports:
+        - action
+        - pose
+        - wrench
+        output_ports:
+        - desired_pose
+        - fallback
+        - state
+        - transition_distance
+        - progress
+        - commanded_violation
+        - measured_violation
+
+    ``action`` is (n,) in [−1, 1], whoever gives it: a policy, or a person's device. It is held for a control period.
+    """
+
+    def __init__(
+        self,
+        skill: Skill,
+        frames: Mapping[str, RigidTransform],
+        period: float,
+        *,
+        input_mapping: Skill | None = None,
+        active_constraints: bool = True,
+        leash: float = np.inf,
+    ):
+        """
+        Args:
+            skill: the template.
+            frames: the poses X_WF of its objects by name; W is the frame that all poses are given in.
+            period: seconds between control steps.
+            input_mapping: a skill whose initial state maps the inputs, instead of the template's own mappings: so its
+                active constraints are a safety filter behind, for one, a plain end-effector velocity.
+            active_constraints: False leaves the constraints out, and what was requested is commanded.
+            leash: [m] how far the robot may be from its command before that waits.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, (input_mapping or skill).inputs))
+        self._mapping = SctInputMapping(input_mapping or skill, frames, period)
+        builder.AddNamedSystem("input_mapping", self._mapping)
+        constrained = skill if active_constraints else skill.without_active_constraints()
+        self._filter = ActiveConstraintFilter(constrained, frames, period, leash)
+        builder.AddNamedSystem("active_constraints", self._filter)
+        if input_mapping is None:
+            state = self._filter.GetOutputPort("state")
+        else:
+            free = np.array([float(input_mapping.initial_state)])
+            source = builder.AddNamedSystem("state", ConstantVectorSource(free))
+            state = source.get_output_port()
+        builder.Connect(hold.get_output_port(), self._mapping.get_action_input_port())
+        builder.Connect(state, self._mapping.get_state_input_port())
+        builder.Connect(self._filter.GetOutputPort("last_desired_pose"), self._mapping.get_pose_input_port())
+        builder.Connect(self._mapping.get_requested_pose_output_port(), self._filter.GetInputPort("requested_pose"))
+
+        builder.ExportInput(hold.get_input_port(), "action")
+        builder.ExportInput(self._filter.GetInputPort("pose"), "pose")
+        # No template of ours listens to forces yet; the port is there because all guidance has the same ports.
+        wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
+        builder.ExportInput(wrench.get_input_port(), "wrench")
+        for name in (
+            "desired_pose",
+            "fallback",
+            "state",
+            "transition_distance",
+            "progress",
+            "commanded_violation",
+            "measured_violation",
+        ):
+            builder.ExportOutput(self._filter.GetOutputPort(name), name)
+        builder.BuildInto(self)
+
+    def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
+        """Moves objects; those that aren't named stay. The context is the root diagram's."""
+        self._filter.set_frames(root_context, frames)
+        known = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
+        self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), known)

@@ -1,0 +1,172 @@
+"""Keeps what is commanded inside the active constraints (thesis, equation 2.21)."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+
+from guiderail.models.skills.geometry import pose_from_vector, vector_from_pose
+from guiderail.models.skills.skill import Skill
+from guiderail.systems.caching import declare_array_cache
+from guiderail.systems.skill_frames import SkillFrames
+
+
+class ActiveConstraintProjector(LeafSystem):
+    """The active constraints of the state that a shared control template is in, applied to whatever is requested.
+
+        H^ac = project_q(H^im), reachable in one period from the last command
+
+    (`Skill.command`). The last command is state: it starts at the measured pose, projected. Between two control
+    instants the output is a pure function of it and of the request. The last safe command is repeated, and `fallback`
+    is 1, while a request is not finite, or while the robot is farther than the leash from its command and the request
+    leads no nearer to it: a robot that is held back is waited for.
+
+    .. pydrake_system::
+
+        name: ActiveConstraintProjector
+        input_ports:
+        - requested_pose
+        - pose
+        - state
+        output_ports:
+        - desired_pose
+        - last_desired_pose
+        - fallback
+        - commanded_violation
+        - measured_violation
+
+    All poses are (6,), [x y z Rz Ry Rx] in metres and radians; the other ports are (1,). ``state`` is the number of the
+    skill's state. Violations are the larger of metres and radians from the projection, 0 inside.
+    """
+
+    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float, leash: float = np.inf):
+        """
+        Args:
+            skill: the template.
+            frames: the poses of its objects by name, in the frame that poses are given in.
+            period: seconds between control steps, positive.
+            leash: [m] how far the robot may be from its command before that waits, positive.
+
+        Raises:
+            ValueError: if an argument is out of range, or a frame is missing.
+        """
+        super().__init__()
+        if not period > 0 or not leash > 0:
+            raise ValueError(f"the control period and the leash must be positive, not {period} s and {leash} m")
+        self._skill = skill
+        self._period = period
+        self._leash = leash
+        self.frames = SkillFrames(self, skill, frames)
+        self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
+        self._pose_port = self.DeclareVectorInputPort("pose", 6)
+        self._state_port = self.DeclareVectorInputPort("state", 1)
+
+        # The last command, and the pose that was measured when it was given.
+        self._last = self.DeclareDiscreteState(12)
+        last = self.discrete_state_ticket(self._last)
+        here = {last, self._state_port.ticket(), self.frames.ticket}
+        self._next = declare_array_cache(
+            self, "command", self._calc_command, here | {self._requested_pose_port.ticket()}
+        )
+        now = {self._next.ticket()}
+        self._desired_pose_port = self.DeclareVectorOutputPort(
+            "desired_pose",
+            6,
+            lambda context, output: output.SetFromVector(self._next.Eval(context)[:6]),
+            prerequisites_of_calc=now,
+        )
+        self._last_desired_pose_port = self.DeclareVectorOutputPort(
+            "last_desired_pose",
+            6,
+            lambda context, output: output.SetFromVector(context.get_discrete_state(self._last).value()[:6]),
+            prerequisites_of_calc={last},
+        )
+        self._fallback_port = self.DeclareVectorOutputPort(
+            "fallback",
+            1,
+            lambda context, output: output.SetAtIndex(0, self._next.Eval(context)[6]),
+            prerequisites_of_calc=now,
+        )
+        self._commanded_violation_port = self.DeclareVectorOutputPort(
+            "commanded_violation",
+            1,
+            lambda context, output: output.SetAtIndex(0, self._violation(context, self._next.Eval(context)[:6])),
+            prerequisites_of_calc=now | here,
+        )
+        self._measured_violation_port = self.DeclareVectorOutputPort(
+            "measured_violation",
+            1,
+            lambda context, output: output.SetAtIndex(0, self._violation(context, self._pose_port.Eval(context))),
+            prerequisites_of_calc={self._pose_port.ticket(), self._state_port.ticket(), self.frames.ticket},
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def get_requested_pose_input_port(self) -> InputPort:
+        """What somebody wants, (6,)."""
+        return self._requested_pose_port
+
+    def get_pose_input_port(self) -> InputPort:
+        """The measured pose, (6,)."""
+        return self._pose_port
+
+    def get_state_input_port(self) -> InputPort:
+        """The number of the skill's state, (1,)."""
+        return self._state_port
+
+    def get_desired_pose_output_port(self) -> OutputPort:
+        """The command, (6,), inside the active constraints."""
+        return self._desired_pose_port
+
+    def get_last_desired_pose_output_port(self) -> OutputPort:
+        """The command before this one, (6,): what an input displaces. It is state and never feeds through."""
+        return self._last_desired_pose_port
+
+    def get_fallback_output_port(self) -> OutputPort:
+        """1 while the last safe command is repeated, (1,)."""
+        return self._fallback_port
+
+    def get_commanded_violation_output_port(self) -> OutputPort:
+        """How far the command is outside of the constraints, (1,)."""
+        return self._commanded_violation_port
+
+    def get_measured_violation_output_port(self) -> OutputPort:
+        """How far the measured pose is outside of the constraints, (1,)."""
+        return self._measured_violation_port
+
+    def _violation(self, context: Context, pose: np.ndarray) -> float:
+        state = int(self._state_port.Eval(context)[0])
+        return self._skill.violation(state, pose_from_vector(pose), self.frames.eval(context))
+
+    def _calc_command(self, context: Context) -> np.ndarray:
+        """The command (6,), and whether it is the last safe one."""
+        last, measured = np.split(context.get_discrete_state(self._last).value(), 2)
+        requested = self._requested_pose_port.Eval(context)
+        if not np.isfinite(requested).all():
+            return np.append(last, 1.0)
+        command = self._skill.command(
+            int(self._state_port.Eval(context)[0]),
+            pose_from_vector(last),
+            pose_from_vector(requested),
+            self.frames.eval(context),
+            self._period,
+        )
+        desired = vector_from_pose(command.X_WE)
+        lag = np.linalg.norm(last[:3] - measured[:3])
+        if lag > self._leash and np.linalg.norm(desired[:3] - measured[:3]) >= lag:
+            return np.append(last, 1.0)
+        return np.append(desired, 0.0)
+
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        measured = self._pose_port.Eval(context)
+        state = int(self._state_port.Eval(context)[0])
+        X_WE = self._skill.project(state, pose_from_vector(measured), self.frames.eval(context))
+        discrete_state.set_value(np.concatenate([vector_from_pose(X_WE), measured]))
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
+        if context.get_time() > 0:
+            discrete_state.set_value(np.concatenate([self._next.Eval(context)[:6], self._pose_port.Eval(context)]))
+        return EventStatus.Succeeded()

@@ -1,0 +1,90 @@
+"""A few inputs, mapped to the pose they ask for (thesis, equations 2.19 and 2.20)."""
+
+from collections.abc import Mapping
+
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
+
+from guiderail.models.skills.geometry import pose_from_vector, vector_from_pose
+from guiderail.models.skills.skill import Skill
+from guiderail.systems.skill_frames import SkillFrames
+
+
+class SctInputMapping(LeafSystem):
+    """The input mapping of the state that a shared control template is in.
+
+        H^im = displace_q(H, map_q(u))
+
+    during one period, from the pose H that `pose` brings. Inputs are clipped to [−1, 1].
+
+    .. pydrake_system::
+
+        name: SctInputMapping
+        input_ports:
+        - action
+        - pose
+        - state
+        output_ports:
+        - requested_pose
+
+    ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians;
+    ``state`` is (1,), the number of the skill's state.
+    """
+
+    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float):
+        """
+        Args:
+            skill: the template.
+            frames: the poses of its objects by name, in the frame that poses are given in.
+            period: seconds for which an input moves, positive.
+
+        Raises:
+            ValueError: if the period is not positive, or a frame is missing.
+        """
+        super().__init__()
+        if not period > 0:
+            raise ValueError(f"the control period must be positive, not {period} s")
+        self._skill = skill
+        self._period = period
+        self.frames = SkillFrames(self, skill, frames)
+        self._action_port = self.DeclareVectorInputPort("action", skill.inputs)
+        self._pose_port = self.DeclareVectorInputPort("pose", 6)
+        self._state_port = self.DeclareVectorInputPort("state", 1)
+        self._requested_pose_port = self.DeclareVectorOutputPort(
+            "requested_pose",
+            6,
+            self._calc_requested_pose,
+            prerequisites_of_calc={
+                self._action_port.ticket(),
+                self._pose_port.ticket(),
+                self._state_port.ticket(),
+                self.frames.ticket,
+            },
+        )
+
+    def get_action_input_port(self) -> InputPort:
+        """The inputs of a person or a policy, (n,), in [−1, 1]."""
+        return self._action_port
+
+    def get_pose_input_port(self) -> InputPort:
+        """The pose to displace, (6,)."""
+        return self._pose_port
+
+    def get_state_input_port(self) -> InputPort:
+        """The number of the skill's state, (1,)."""
+        return self._state_port
+
+    def get_requested_pose_output_port(self) -> OutputPort:
+        """The displaced pose H^im, (6,), not yet constrained."""
+        return self._requested_pose_port
+
+    def _calc_requested_pose(self, context: Context, output) -> None:
+        X_WE = pose_from_vector(self._pose_port.Eval(context))
+        displacement = self._skill.map(
+            int(self._state_port.Eval(context)[0]),
+            self._action_port.Eval(context),
+            X_WE,
+            self.frames.eval(context),
+            self._period,
+        )
+        output.SetFromVector(vector_from_pose(self._skill.displace(X_WE, displacement)))

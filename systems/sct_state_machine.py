@@ -1,0 +1,97 @@
+"""Which state a shared control template is in, and how far it is to the next one (thesis, section 2.3)."""
+
+from collections.abc import Mapping
+
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+
+from guiderail.models.skills.geometry import pose_from_vector
+from guiderail.models.skills.skill import Skill
+from guiderail.systems.skill_frames import SkillFrames
+
+
+class SctStateMachine(LeafSystem):
+    """The finite state machine of a shared control template.
+
+    At every control instant it makes at most one transition, on the pose from just before: forward where the state's
+    transition distance has fallen below its threshold, back where that of the state before exceeds it again by the
+    hysteresis. An episode begins in the skill's initial state.
+
+    .. pydrake_system::
+
+        name: SctStateMachine
+        input_ports:
+        - pose
+        output_ports:
+        - state
+        - transition_distance
+        - progress
+
+    ``pose`` is (6,), [x y z Rz Ry Rx] in metres and radians. ``state`` is (1,), the number of the state, and never
+    feeds through. ``transition_distance`` is (1,), d_t of the current state in metres or radians. ``progress`` is (1,)
+    and rises as the distances fall, over all states on one scale: its increase is d_{t−1} − d_t of equation 3.2.
+    """
+
+    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float):
+        """
+        Args:
+            skill: the template.
+            frames: the poses of its objects by name, in the frame that poses are given in.
+            period: seconds between control steps, positive.
+
+        Raises:
+            ValueError: if the period is not positive, or a frame is missing.
+        """
+        super().__init__()
+        if not period > 0:
+            raise ValueError(f"the control period must be positive, not {period} s")
+        self._skill = skill
+        self.frames = SkillFrames(self, skill, frames)
+        self._pose_port = self.DeclareVectorInputPort("pose", 6)
+        self._state = self.DeclareDiscreteState([float(skill.initial_state)])
+        self._state_port = self.DeclareStateOutputPort("state", self._state)
+        everything = {self._pose_port.ticket(), self.discrete_state_ticket(self._state), self.frames.ticket}
+        self._transition_distance_port = self.DeclareVectorOutputPort(
+            "transition_distance",
+            1,
+            lambda context, output: output.SetAtIndex(0, self._skill.distance(*self._where(context))),
+            prerequisites_of_calc=everything,
+        )
+        self._progress_port = self.DeclareVectorOutputPort(
+            "progress",
+            1,
+            lambda context, output: output.SetAtIndex(0, self._skill.progress(*self._where(context))),
+            prerequisites_of_calc=everything,
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def get_pose_input_port(self) -> InputPort:
+        """The pose whose distances count, (6,)."""
+        return self._pose_port
+
+    def get_state_output_port(self) -> OutputPort:
+        """The number of the skill's state, (1,)."""
+        return self._state_port
+
+    def get_transition_distance_output_port(self) -> OutputPort:
+        """How far it is to the end of this state, (1,), [m] or [rad]."""
+        return self._transition_distance_port
+
+    def get_progress_output_port(self) -> OutputPort:
+        """How much of the task is done, (1,)."""
+        return self._progress_port
+
+    def _where(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:
+        state = int(context.get_discrete_state(self._state).value()[0])
+        return state, pose_from_vector(self._pose_port.Eval(context)), self.frames.eval(context)
+
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value([float(self._skill.initial_state)])
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
+        if context.get_time() > 0:
+            discrete_state.set_value([float(self._skill.next_state(*self._where(context)))])
+        return EventStatus.Succeeded()

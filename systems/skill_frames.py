@@ -1,0 +1,70 @@
+"""The poses of a skill's objects, as parameters that a reset can set."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
+
+from guiderail.models.skills.geometry import pose_from_vector, vector_from_pose
+from guiderail.models.skills.skill import Skill
+
+
+class SkillFrames:
+    """Declares the frames of a skill as numeric parameters of a LeafSystem, and gives them back as poses.
+
+    They are parameters and not inputs because they hold for an episode: a guidance diagram keeps the ports that all
+    guidance has, and a reset moves an object by `set`.
+    """
+
+    def __init__(self, system: LeafSystem, skill: Skill, frames: Mapping[str, RigidTransform]):
+        """
+        Args:
+            system: the system that has the parameters; its outputs depend on `ticket`.
+            skill: whose frames they are.
+            frames: their poses by default, one for each name.
+
+        Raises:
+            ValueError: if a frame of the skill is missing.
+        """
+        missing = [name for name in skill.frames if name not in frames]
+        if missing:
+            raise ValueError(f"the skill {skill.name} needs the frame {missing[0]}")
+        self._names = skill.frames
+        self._indices = [
+            system.DeclareNumericParameter(BasicVector(vector_from_pose(frames[name]))) for name in skill.frames
+        ]
+        self._cache = system.DeclareCacheEntry(
+            "skill_frames",
+            ValueProducer(
+                allocate=lambda: Value[object]({}), calc=lambda context, value: value.set_value(self._calc(context))
+            ),
+            {system.all_parameters_ticket()},
+        )
+
+    @property
+    def ticket(self):
+        """What depends on the frames depends on this."""
+        return self._cache.ticket()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the frames."""
+        return self._names
+
+    def eval(self, context: Context) -> dict[str, RigidTransform]:
+        """The poses by name."""
+        return self._cache.Eval(context)
+
+    def set(self, context: Context, frames: Mapping[str, RigidTransform]) -> None:
+        """Moves frames in the system's context; the others stay where they are."""
+        for name, X_WF in frames.items():
+            index = self._indices[self._names.index(name)]
+            context.get_mutable_numeric_parameter(index).SetFromVector(vector_from_pose(X_WF))
+
+    def _calc(self, context: Context) -> dict[str, RigidTransform]:
+        return {
+            name: pose_from_vector(np.asarray(context.get_numeric_parameter(index).CopyToVector()))
+            for name, index in zip(self._names, self._indices, strict=True)
+        }
