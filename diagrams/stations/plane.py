@@ -3,8 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import Box, Cylinder, GeometryInstance, MakePhongIllustrationProperties, ProximityProperties
-from pydrake.geometry import SceneGraph, Sphere
+from pydrake.geometry import (
+    Box,
+    Cylinder,
+    ProximityProperties,
+    SceneGraph,
+    Sphere,
+)
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import ModelInstanceIndex, PrismaticJoint, SpatialInertia
@@ -62,3 +67,134 @@ class PlaneConfig:
         """
         inertia = self.mass + self.damping * self.plant_period
         return (1 - np.sqrt(self.mass / inertia)) ** 2 * inertia / self.plant_period**2
+
+
+class PlaneStation(Diagram):
+    """The plane, its walls, and the robot.
+
+    .. pydrake_system::
+
+        name: PlaneStation
+        input_ports:
+        - desired_pose
+        output_ports:
+        - pose
+        - contact_force
+        - contact_force_magnitude
+        - saturation
+        - query
+
+    ``desired_pose`` and ``pose`` are (x, y) of the robot's centre, m. ``contact_force`` (2,) is what the walls did to
+    the robot, averaged over the control step, N, and ``contact_force_magnitude`` (1,) its norm. ``saturation`` (2,) is
+    the force, N, that was asked of each rail beyond its limit. ``query`` is the scene graph's, for cameras.
+    """
+
+    def __init__(self, world: NarrowPassage, config: PlaneConfig, builder: DiagramBuilder | None = None):
+        """
+        Args:
+            world: what is where.
+            config: the robot.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        self.world, self.config = world, config
+        plant_config = MultibodyPlantConfig(
+            time_step=config.plant_period, discrete_contact_approximation="lagged", contact_model="point"
+        )
+        self.plant: MultibodyPlant
+        self.scene_graph: SceneGraph
+        self.plant, self.scene_graph = AddMultibodyPlant(plant_config, builder)
+        self.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
+        self._robot = _add_robot(self.plant, world, config)
+        _add_walls(self.plant, world, config)
+        _add_markings(self.plant, world)
+        self.plant.Finalize()
+
+        # F = clip(k (x_d - x), ±F_max), against the rails' viscous friction.
+        negative = builder.AddNamedSystem("negative_pose", Gain(-1.0, 2))
+        error = builder.AddNamedSystem("position_error", Adder(2, 2))
+        gain = builder.AddNamedSystem("position_gain", Gain(config.position_gain, 2))
+        limit = np.full(2, config.max_force)
+        saturation = builder.AddNamedSystem("force_limit", Saturation(-limit, limit))
+        pose = builder.AddNamedSystem("pose", LinearSystem(D=np.eye(2, 4)))
+        builder.Connect(self.plant.get_state_output_port(self._robot), pose.get_input_port())
+        builder.Connect(pose.get_output_port(), negative.get_input_port())
+        builder.Connect(negative.get_output_port(), error.get_input_port(1))
+        builder.Connect(error.get_output_port(), gain.get_input_port())
+        builder.Connect(gain.get_output_port(), saturation.get_input_port())
+        builder.Connect(saturation.get_output_port(), self.plant.get_actuation_input_port(self._robot))
+
+        applied = builder.AddNamedSystem("negative_force", Gain(-1.0, 2))
+        excess = builder.AddNamedSystem("excess_force", Adder(2, 2))
+        builder.Connect(saturation.get_output_port(), applied.get_input_port())
+        builder.Connect(gain.get_output_port(), excess.get_input_port(0))
+        builder.Connect(applied.get_output_port(), excess.get_input_port(1))
+
+        one = np.eye(2)
+        force_sum = builder.AddNamedSystem("force_sum", LinearSystem(one, one, one, one, config.plant_period))
+        mean_force = builder.AddNamedSystem("mean_force", MeanForce(2, config.substeps, config.control_period))
+        builder.Connect(self.plant.get_generalized_contact_forces_output_port(self._robot), force_sum.get_input_port())
+        builder.Connect(force_sum.get_output_port(), mean_force.get_force_sum_input_port())
+
+        builder.ExportInput(error.get_input_port(0), "desired_pose")
+        builder.ExportOutput(pose.get_output_port(), "pose")
+        builder.ExportOutput(mean_force.get_force_output_port(), "contact_force")
+        builder.ExportOutput(mean_force.get_magnitude_output_port(), "contact_force_magnitude")
+        builder.ExportOutput(excess.get_output_port(), "saturation")
+        builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
+        builder.BuildInto(self)
+
+    def set_pose(self, root_context: Context, pose: np.ndarray) -> None:
+        """Puts the robot's centre at (x, y), at rest."""
+        context = self.plant.GetMyMutableContextFromRoot(root_context)
+        self.plant.SetPositionsAndVelocities(context, self._robot, np.concatenate([pose, np.zeros(2)]))
+
+    def get_pose(self, root_context: Context) -> np.ndarray:
+        """Where the robot's centre is, (x, y)."""
+        return self.plant.GetPositions(self.plant.GetMyContextFromRoot(root_context), self._robot)
+
+
+def _add_robot(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig) -> ModelInstanceIndex:
+    robot = plant.AddModelInstance("robot")
+    # The carriage between the rails is nearly massless: both axes move the same mass.
+    carriage = plant.AddRigidBody("carriage", robot, SpatialInertia.SolidSphereWithMass(1e-3 * config.mass, 0.01))
+    ball = plant.AddRigidBody("ball", robot, SpatialInertia.SolidSphereWithMass(config.mass, world.robot_radius))
+    x = PrismaticJoint("x", plant.world_frame(), carriage.body_frame(), [1, 0, 0], damping=config.damping)
+    y = PrismaticJoint("y", carriage.body_frame(), ball.body_frame(), [0, 1, 0], damping=config.damping)
+    for joint in (plant.AddJoint(x), plant.AddJoint(y)):
+        plant.AddJointActuator(joint.name(), joint, config.max_force)
+    shape = Sphere(world.robot_radius)
+    plant.RegisterCollisionGeometry(ball, RigidTransform(), shape, "ball", _contact(config))
+    plant.RegisterVisualGeometry(ball, RigidTransform(), shape, "ball_visual", np.array([0.1, 0.35, 0.8, 1.0]))
+    return robot
+
+
+def _add_walls(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig) -> None:
+    # The centre's walls, less the robot's radius.
+    for name, lower, upper in zip(("left_wall", "right_wall"), *world.walls, strict=True):
+        size = upper - lower - 2 * world.robot_radius
+        X_WG = RigidTransform([*(lower + upper) / 2, 0.0])
+        shape = Box(*size, 0.1)
+        plant.RegisterCollisionGeometry(plant.world_body(), X_WG, shape, name, _contact(config))
+        plant.RegisterVisualGeometry(plant.world_body(), X_WG, shape, f"{name}_visual", np.array([0.4, 0.4, 0.42, 1.0]))
+
+
+def _add_markings(plant: MultibodyPlant, world: NarrowPassage) -> None:
+    """What is only there to be seen: the floor, the restricted zone, the obstacle and the goal."""
+    body = plant.world_body()
+
+    def mark(name, shape, x, y, z, color):
+        plant.RegisterVisualGeometry(body, RigidTransform([x, y, z]), shape, name, np.array(color))
+
+    mark("floor", Box(3.0, 3.0, 0.001), 0.4, 0.5, -0.06, [0.97, 0.97, 0.95, 1.0])
+    mark("zone", Box(1.0, 3.0, 0.001), world.zone_x + 0.5, 0.5, -0.055, [0.95, 0.72, 0.70, 1.0])
+    mark("goal", Cylinder(world.goal_radius, 0.001), *world.goal, -0.05, [0.55, 0.80, 0.55, 1.0])
+    mark("obstacle", Cylinder(world.obstacle_radius, 0.03), *world.obstacle, -0.035, [0.75, 0.25, 0.15, 1.0])
+
+
+def _contact(config: PlaneConfig) -> ProximityProperties:
+    properties = ProximityProperties()
+    properties.AddProperty("material", "coulomb_friction", CoulombFriction(config.friction, config.friction))
+    properties.AddProperty("material", "point_contact_stiffness", config.stiffness)
+    properties.AddProperty("material", "hunt_crossley_dissipation", 0.0)
+    return properties

@@ -1,0 +1,132 @@
+"""Guidance by a movement primitive: the demonstrations alone, KGRL, sKGRL, and the residual baselines."""
+
+import numpy as np
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain, PassThrough, ZeroOrderHold
+
+from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.safety_filter import SafetyFilter
+
+
+class PrimitiveGuidance(Diagram):
+    """What all guidance made of a movement primitive shares: its ports.
+
+    .. pydrake_system::
+
+        name: PrimitiveGuidance
+        input_ports:
+        - action
+        - pose
+        - wrench
+        output_ports:
+        - desired_pose
+        - fallback
+
+    ``action`` (A,) is the policy's in [−1, 1], one entry per explored output, held for a control period. ``pose`` (O,)
+    and ``wrench`` are measured; whoever has no use for one still has the port. ``desired_pose`` (O,) is what to
+    command, ``fallback`` (1,) is 1 where something safe was commanded instead of what was asked for.
+    """
+
+    def _export_inputs(self, builder: DiagramBuilder, skill: PrimitiveSkill) -> tuple[OutputPort, OutputPort]:
+        """Exports the inputs and returns where the held action, spread over all outputs (O,), and the pose come out."""
+        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(skill.control_period, skill.num_actions))
+        spread = builder.AddNamedSystem("explored_outputs", MatrixGain(D=skill.selection))
+        pose = builder.AddNamedSystem("pose", PassThrough(skill.num_outputs))
+        wrench = builder.AddNamedSystem("wrench", PassThrough(skill.wrench_size))
+        builder.Connect(hold.get_output_port(), spread.get_input_port())
+        builder.ExportInput(hold.get_input_port(), "action")
+        builder.ExportInput(pose.get_input_port(), "pose")
+        builder.ExportInput(wrench.get_input_port(), "wrench")
+        return spread.get_output_port(), pose.get_output_port()
+
+    def _finish(self, builder: DiagramBuilder, desired_pose: OutputPort, fallback: OutputPort) -> None:
+        builder.ExportOutput(desired_pose, "desired_pose")
+        builder.ExportOutput(fallback, "fallback")
+        builder.BuildInto(self)
+
+
+def _add_demonstration(builder: DiagramBuilder, skill: PrimitiveSkill) -> LcNsKmpSystem:
+    """The primitive that nothing pulls at: neither actions nor constraints nor a history."""
+    primitive = skill.primitive(history=False, constrained=False)
+    kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, skill.control_period))
+    nothing = builder.AddNamedSystem("no_action", ConstantVectorSource(np.zeros(skill.num_outputs)))
+    builder.Connect(nothing.get_output_port(), kmp.get_null_space_action_input_port())
+    return kmp
+
+
+class KmpGuidance(PrimitiveGuidance):
+    """The demonstrations alone (thesis, section 2.2.7): the action changes nothing."""
+
+    def __init__(self, skill: PrimitiveSkill):
+        super().__init__()
+        builder = DiagramBuilder()
+        self._export_inputs(builder, skill)
+        kmp = _add_demonstration(builder, skill)
+        self._finish(builder, kmp.get_output_output_port(), kmp.get_fallback_output_port())
+
+
+class ResidualGuidance(PrimitiveGuidance):
+    """Residual learning (section 4.4.1): p̂_t = p_t^kmp + Δp_t, as far in every direction and at any time."""
+
+    def __init__(self, skill: PrimitiveSkill, *, safe: bool = False):
+        """
+        Args:
+            skill: the demonstrations; with `safe`, also what to keep away from.
+            safe: True puts hand-made active constraints behind the sum; ``fallback`` is then 1 where a wall was in
+                the way.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        action, pose = self._export_inputs(builder, skill)
+        kmp = _add_demonstration(builder, skill)
+        gain = builder.AddNamedSystem("residual", MatrixGain(D=np.diag(skill.residual_gains())))
+        total = builder.AddNamedSystem("sum", Adder(2, skill.num_outputs))
+        builder.Connect(action, gain.get_input_port())
+        builder.Connect(kmp.get_output_output_port(), total.get_input_port(0))
+        builder.Connect(gain.get_output_port(), total.get_input_port(1))
+        if not safe:
+            self._finish(builder, total.get_output_port(), kmp.get_fallback_output_port())
+            return
+        assert skill.keep_out is not None
+        safety = builder.AddNamedSystem("safety_filter", SafetyFilter(skill.keep_out, skill.control_period))
+        builder.Connect(total.get_output_port(), safety.get_desired_pose_input_port())
+        builder.Connect(pose, safety.get_pose_input_port())
+        self._finish(builder, safety.get_safe_pose_output_port(), safety.get_intervention_output_port())
+
+
+class KgrlGuidance(PrimitiveGuidance):
+    """KGRL (equation 4.21): null-space actions on a primitive that keeps the constraints."""
+
+    def __init__(self, skill: PrimitiveSkill):
+        super().__init__()
+        builder = DiagramBuilder()
+        action, _ = self._export_inputs(builder, skill)
+        primitive = skill.primitive(history=False)
+        gains = skill.null_space_gains(primitive)
+        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, skill.control_period))
+        builder.Connect(action, kmp.get_null_space_action_input_port())
+        self._finish(builder, kmp.get_output_output_port(), kmp.get_fallback_output_port())
+
+
+class SkgrlGuidance(PrimitiveGuidance):
+    """sKGRL (equations 5.1-5.3): KGRL whose motion passes through where it has been."""
+
+    def __init__(self, skill: PrimitiveSkill):
+        super().__init__()
+        builder = DiagramBuilder()
+        action, pose = self._export_inputs(builder, skill)
+        primitive = skill.primitive(history=True)
+        gains = skill.null_space_gains(primitive)
+        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, skill.control_period))
+        history = builder.AddNamedSystem(
+            "history", HistoryBuffer(skill.num_outputs, skill.history, skill.control_period)
+        )
+        past = kmp.get_output_output_port() if skill.history_source == "commanded" else pose
+        builder.Connect(action, kmp.get_null_space_action_input_port())
+        builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
+        builder.Connect(past, history.get_output_input_port())
+        # Either way it starts from where the robot is: a command from anywhere else would be a jump.
+        builder.Connect(pose, history.get_initial_output_input_port())
+        self._finish(builder, kmp.get_output_output_port(), kmp.get_fallback_output_port())

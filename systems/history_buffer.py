@@ -1,0 +1,75 @@
+"""The last outputs of a movement primitive, oldest first (thesis, equation 5.3)."""
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+
+
+class HistoryBuffer(LeafSystem):
+    """Remembers the last P outputs, so that sKGRL can pass through where it has been.
+
+    At every control step the newest output enters and the oldest leaves. At initialization the history is filled with
+    ``initial_output`` where that is connected (the measured pose, for a commanded history), else with ``output``: the
+    robot has, as far as the primitive knows, always been where it starts.
+
+    .. pydrake_system::
+
+        name: HistoryBuffer
+        input_ports:
+        - output
+        - initial_output
+        output_ports:
+        - history
+
+    ``output`` and ``initial_output`` are (O,), ``history`` is (P*O,), row-major, oldest first, in the units of
+    ``output``. ``history`` is state: it never depends on ``output`` within a step, which is what lets the primitive
+    close a loop around it.
+    """
+
+    def __init__(self, num_outputs: int, length: int, period: float):
+        """
+        Args:
+            num_outputs: O, at least 1.
+            length: P, how many outputs are kept, at least 1.
+            period: seconds between control steps, positive.
+
+        Raises:
+            ValueError: if an argument is out of range.
+        """
+        super().__init__()
+        if num_outputs < 1 or length < 1:
+            raise ValueError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
+        if not period > 0:
+            raise ValueError(f"the control period must be positive, not {period} s")
+        self._shape = (length, num_outputs)
+
+        self._output_port = self.DeclareVectorInputPort("output", num_outputs)
+        self._initial_output_port = self.DeclareVectorInputPort("initial_output", num_outputs)
+        self._state = self.DeclareDiscreteState(length * num_outputs)
+        self._history_port = self.DeclareStateOutputPort("history", self._state)
+        self.DeclareInitializationDiscreteUpdateEvent(self._fill)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._shift)
+
+    def get_output_input_port(self) -> InputPort:
+        """The output to remember, (O,)."""
+        return self._output_port
+
+    def get_initial_output_input_port(self) -> InputPort:
+        """What the history is filled with at initialization, (O,); may be left unconnected."""
+        return self._initial_output_port
+
+    def get_history_output_port(self) -> OutputPort:
+        """The remembered outputs, (P*O,), oldest first."""
+        return self._history_port
+
+    def _fill(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        initial = self._initial_output_port if self._initial_output_port.HasValue(context) else self._output_port
+        discrete_state.set_value(np.tile(initial.Eval(context), self._shape[0]))
+        return EventStatus.Succeeded()
+
+    def _shift(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        # At time zero nothing was executed yet. (An offset of one period would say the same, but period + k * period
+        # differs from (k + 1) * period in the last bit for every third k, and the shift would miss its instant.)
+        if context.get_time() > 0:
+            kept = context.get_discrete_state(self._state).value()[self._shape[1] :]
+            discrete_state.set_value(np.concatenate([kept, self._output_port.Eval(context)]))
+        return EventStatus.Succeeded()

@@ -1,0 +1,81 @@
+"""Contact forces as a control step sees them."""
+
+import numpy as np
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
+
+
+class MeanForce(LeafSystem):
+    """The force averaged over the control step that is just over, from the running sum of the plant's forces.
+
+    A plant takes many steps within one control step. What it says at the end of them misses a touch that is already
+    over, and when things collide depends on the size of the plant's step; the mean does neither.
+
+    .. pydrake_system::
+
+        name: MeanForce
+        input_ports:
+        - force_sum
+        output_ports:
+        - force
+        - magnitude
+
+    ``force_sum`` (D,) is the sum over all plant steps so far, N; ``force`` (D,) the mean over the plant steps since the
+    last control step, N, and ``magnitude`` (1,) its norm.
+    """
+
+    def __init__(self, size: int, substeps: int, period: float):
+        """
+        Args:
+            size: D, at least 1.
+            substeps: plant steps in a control step, at least 1.
+            period: seconds between control steps, positive.
+
+        Raises:
+            ValueError: if an argument is out of range.
+        """
+        super().__init__()
+        if size < 1 or substeps < 1:
+            raise ValueError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
+        if not period > 0:
+            raise ValueError(f"the control period must be positive, not {period} s")
+        self._scale = 1.0 / substeps
+        self._sum_port = self.DeclareVectorInputPort("force_sum", size)
+        self._last = self.DeclareDiscreteState(size)
+        self.DeclareInitializationDiscreteUpdateEvent(self._sample)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        tickets = {self._sum_port.ticket(), self.discrete_state_ticket(self._last)}
+        self._force_port = self.DeclareVectorOutputPort("force", size, self._calc_force, tickets)
+        self._magnitude_port = self.DeclareVectorOutputPort("magnitude", 1, self._calc_magnitude, tickets)
+
+    def get_force_sum_input_port(self) -> InputPort:
+        """The sum of all plant steps' forces, (D,), N."""
+        return self._sum_port
+
+    def get_force_output_port(self) -> OutputPort:
+        """The mean force of the control step, (D,), N."""
+        return self._force_port
+
+    def get_magnitude_output_port(self) -> OutputPort:
+        """The norm of the mean force, (1,), N."""
+        return self._magnitude_port
+
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._sum_port.Eval(context))
+        return EventStatus.Succeeded()
+
+    def _mean(self, context: Context) -> np.ndarray:
+        return (self._sum_port.Eval(context) - context.get_discrete_state(self._last).value()) * self._scale
+
+    def _calc_force(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._mean(context))
+
+    def _calc_magnitude(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(np.linalg.norm(self._mean(context))))

@@ -1,0 +1,94 @@
+"""Stops commands before they become a collision."""
+
+import numpy as np
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
+
+from guiderail.models.keep_out import KeepOut
+from guiderail.systems.caching import declare_array_cache
+
+
+class SafetyFilter(LeafSystem):
+    """Projects a commanded position by hand-made active constraints (thesis, section 4.4.1), see `KeepOut`.
+
+    .. pydrake_system::
+
+        name: SafetyFilter
+        input_ports:
+        - desired_pose
+        - pose
+        output_ports:
+        - safe_pose
+        - intervention
+
+    ``desired_pose`` and ``pose`` (measured) are (O,). ``safe_pose`` (O,) is what may be commanded, ``intervention``
+    (1,) is 1 where a box changed the command. The measured pose is sampled at control steps: between two of them the
+    command stays what it is.
+    """
+
+    def __init__(self, keep_out: KeepOut, period: float):
+        """
+        Args:
+            keep_out: what to keep away from.
+            period: seconds between control steps, positive.
+
+        Raises:
+            ValueError: if the period is not positive.
+        """
+        super().__init__()
+        if not period > 0:
+            raise ValueError(f"the control period must be positive, not {period} s")
+        self._keep_out = keep_out
+        outputs = keep_out.num_outputs
+        self._desired_port = self.DeclareVectorInputPort("desired_pose", outputs)
+        self._pose_port = self.DeclareVectorInputPort("pose", outputs)
+        self._sampled = self.DeclareDiscreteState(outputs)
+        self.DeclareInitializationDiscreteUpdateEvent(self._sample)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        self._safe = declare_array_cache(
+            self,
+            "safe",
+            self._calc,
+            {self._desired_port.ticket(), self.discrete_state_ticket(self._sampled)},
+        )
+        tickets = {self._safe.ticket()}
+        self._safe_port = self.DeclareVectorOutputPort("safe_pose", outputs, self._calc_safe_pose, tickets)
+        self._intervention_port = self.DeclareVectorOutputPort("intervention", 1, self._calc_intervention, tickets)
+
+    def get_desired_pose_input_port(self) -> InputPort:
+        """The command to check, (O,)."""
+        return self._desired_port
+
+    def get_pose_input_port(self) -> InputPort:
+        """The measured pose, (O,)."""
+        return self._pose_port
+
+    def get_safe_pose_output_port(self) -> OutputPort:
+        """What may be commanded, (O,)."""
+        return self._safe_port
+
+    def get_intervention_output_port(self) -> OutputPort:
+        """1 where a box changed the command, (1,)."""
+        return self._intervention_port
+
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._pose_port.Eval(context))
+        return EventStatus.Succeeded()
+
+    def _calc(self, context: Context) -> np.ndarray:
+        position = context.get_discrete_state(self._sampled).value()
+        safe, intervened = self._keep_out.project(position, self._desired_port.Eval(context))
+        return np.append(safe, float(intervened))
+
+    def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._safe.Eval(context)[:-1])
+
+    def _calc_intervention(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._safe.Eval(context)[-1])

@@ -1,0 +1,121 @@
+"""What an episode did to the robot and its surroundings."""
+
+import numpy as np
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
+
+_INPUTS = ("commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "fallback")
+
+# The state: worst commanded and measured violation, peak force, sum of forces, collisions, steps in collision,
+# saturations, fallbacks, steps, and whether the last step was in collision.
+_FRESH = np.array([-np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+class SafetyLedger(LeafSystem):
+    """Keeps, over all control steps of an episode, what must be known about its safety.
+
+    Every control step counts once: the output already counts the step that is just over, the state takes it in at the
+    event of that instant, and initialization empties the ledger.
+
+    .. pydrake_system::
+
+        name: SafetyLedger
+        input_ports:
+        - commanded_violation
+        - measured_violation
+        - contact_force
+        - collision
+        - saturation
+        - fallback
+        output_ports:
+        - ledger
+
+    All inputs are (1,): the violations are max(c - G y), ``contact_force`` is in N; ``collision``, ``saturation`` and
+    ``fallback`` say by a positive number that the robot touches what it must not touch, that an actuator is at its
+    limit, and that the last safe command was repeated. ``ledger`` is named by `FIELDS`: a collision is one that lasts
+    from the first control step in contact to the last; ``collision_steps`` counts those steps.
+    """
+
+    FIELDS = (
+        "worst_commanded_violation",
+        "worst_measured_violation",
+        "peak_force",
+        "mean_force",
+        "collisions",
+        "collision_steps",
+        "saturations",
+        "fallbacks",
+        "steps",
+    )
+
+    def __init__(self, period: float):
+        """
+        Args:
+            period: seconds between control steps, positive.
+
+        Raises:
+            ValueError: if the period is not positive.
+        """
+        super().__init__()
+        if not period > 0:
+            raise ValueError(f"the control period must be positive, not {period} s")
+        self._ports = [self.DeclareVectorInputPort(name, 1) for name in _INPUTS]
+        self._state = self.DeclareDiscreteState(_FRESH)
+        self._ledger_port = self.DeclareVectorOutputPort(
+            "ledger",
+            len(self.FIELDS),
+            self._calc_ledger,
+            prerequisites_of_calc={
+                self.discrete_state_ticket(self._state),
+                *(port.ticket() for port in self._ports),
+            },
+        )
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def get_ledger_output_port(self) -> OutputPort:
+        """The ledger so far, named by `FIELDS`."""
+        return self._ledger_port
+
+    def get_record_input_port(self, name: str) -> InputPort:
+        """The input of this name, (1,)."""
+        return self._ports[_INPUTS.index(name)]
+
+    def _next(self, context: Context) -> np.ndarray:
+        commanded, measured, force, collision, saturation, fallback = (port.Eval(context)[0] for port in self._ports)
+        state = context.get_discrete_state(self._state).value().copy()
+        # A comparison with NaN is false, so the new value is asked first: a NaN must not hide behind an old maximum.
+        for i, value in enumerate((commanded, measured, force)):
+            if not value <= state[i]:
+                state[i] = value
+        state[3] += force
+        if collision > 0:
+            state[4] += state[9] == 0
+            state[5] += 1
+        state[6] += saturation > 0
+        state[7] += fallback > 0
+        state[8] += 1
+        state[9] = collision > 0
+        return state
+
+    def _calc_ledger(self, context: Context, output: BasicVector) -> None:
+        state = self._next(context)
+        state[3] /= state[8]
+        output.SetFromVector(state[:9])
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(_FRESH)
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        # At time zero no step is over yet; an offset of one period would not fall on k * period exactly.
+        if context.get_time() > 0:
+            discrete_state.set_value(self._next(context))
+        return EventStatus.Succeeded()
