@@ -11,6 +11,8 @@ from guiderail.systems.caching import declare_array_cache
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """How an episode can end; a `termination` port carries an index into this. The empty one means: it goes on."""
 
+SUCCESS = TERMINATIONS.index("success")
+
 
 @dataclass(frozen=True)
 class Condition:

@@ -37,10 +37,11 @@ class SafetyLedger(LeafSystem):
         output_ports:
         - ledger
 
-    All inputs are (1,): the violations are max(c - G y), ``contact_force`` is in N; ``collision``, ``saturation`` and
-    ``fallback`` say by a positive number that the robot touches what it must not touch, that an actuator is at its
-    limit, and that the last safe command was repeated. ``ledger`` is named by `FIELDS`: a collision is one that lasts
-    from the first control step in contact to the last; ``collision_steps`` counts those steps.
+    Inputs are (1,): the violations are max(c - G y), ``contact_force`` is in N; ``collision`` and ``fallback`` say by a
+    positive number that the robot touches what it must not touch, and that the last safe command was repeated.
+    ``saturation`` (A,) is what was asked of each actuator beyond its limit, zero within it. ``ledger`` is named by
+    `FIELDS`: a collision is one that lasts from the first control step in contact to the last; ``collision_steps``
+    counts those steps.
     """
 
     FIELDS = (
@@ -55,18 +56,23 @@ class SafetyLedger(LeafSystem):
         "steps",
     )
 
-    def __init__(self, period: float):
+    def __init__(self, period: float, num_actuators: int = 1):
         """
         Args:
             period: seconds between control steps, positive.
+            num_actuators: A, at least 1.
 
         Raises:
-            ValueError: if the period is not positive.
+            ValueError: if an argument is out of range.
         """
         super().__init__()
         if not period > 0:
             raise ValueError(f"the control period must be positive, not {period} s")
-        self._ports = [self.DeclareVectorInputPort(name, 1) for name in _INPUTS]
+        if num_actuators < 1:
+            raise ValueError(f"a robot has at least one actuator, not {num_actuators}")
+        self._ports = [
+            self.DeclareVectorInputPort(name, num_actuators if name == "saturation" else 1) for name in _INPUTS
+        ]
         self._state = self.DeclareDiscreteState(_FRESH)
         self._ledger_port = self.DeclareVectorOutputPort(
             "ledger",
@@ -85,11 +91,12 @@ class SafetyLedger(LeafSystem):
         return self._ledger_port
 
     def get_record_input_port(self, name: str) -> InputPort:
-        """The input of this name, (1,)."""
+        """The input of this name, (1,); (A,) for "saturation"."""
         return self._ports[_INPUTS.index(name)]
 
     def _next(self, context: Context) -> np.ndarray:
-        commanded, measured, force, collision, saturation, fallback = (port.Eval(context)[0] for port in self._ports)
+        signals = [port.Eval(context) for port in self._ports]
+        commanded, measured, force, collision, _, fallback = (float(signal[0]) for signal in signals)
         state = context.get_discrete_state(self._state).value().copy()
         # A comparison with NaN is false, so the new value is asked first: a NaN must not hide behind an old maximum.
         for i, value in enumerate((commanded, measured, force)):
@@ -99,7 +106,7 @@ class SafetyLedger(LeafSystem):
         if collision > 0:
             state[4] += state[9] == 0
             state[5] += 1
-        state[6] += saturation > 0
+        state[6] += signals[4].any()
         state[7] += fallback > 0
         state[8] += 1
         state[9] = collision > 0

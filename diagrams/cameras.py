@@ -1,0 +1,81 @@
+"""Cameras for image observations and for people, and the browser view."""
+
+import ctypes
+
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    MakeRenderEngineVtk,
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    Role,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.sensors import CameraInfo, RgbdSensor
+
+from guiderail.models.errors import InputError
+
+_RENDERER = "vtk"
+
+
+def add_camera(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    query: OutputPort,
+    name: str,
+    *,
+    size: tuple[int, int],
+    vertical_fov: float,
+    X_WC: RigidTransform,  # C: x to the right, y down, z into the picture
+) -> OutputPort:
+    """Adds a fixed camera and returns its colour image, an `ImageRgba8U` of `size` = (width, height).
+
+    Raises:
+        InputError: if this machine lacks the library that renders without a display.
+    """
+    check_rendering()
+    if not scene_graph.HasRenderer(_RENDERER):
+        scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
+    clipping = ClippingRange(0.01, 10.0)
+    core = RenderCameraCore(_RENDERER, CameraInfo(*size, vertical_fov), clipping, RigidTransform())
+    camera = RgbdSensor(
+        parent_id=scene_graph.world_frame_id(),
+        X_PB=X_WC,
+        color_camera=ColorRenderCamera(core, show_window=False),
+        depth_camera=DepthRenderCamera(core, DepthRange(0.02, 9.0)),
+    )
+    builder.AddNamedSystem(name, camera)
+    builder.Connect(query, camera.query_object_input_port())
+    return camera.color_image_output_port()
+
+
+def check_rendering() -> None:
+    """Refuses to render where EGL is missing, before Drake would end the process over it.
+
+    Raises:
+        InputError: naming the package to install.
+    """
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        raise InputError(
+            "images need libEGL.so.1, which this machine lacks: install it (Debian, Ubuntu: apt install libegl1), or use "
+            "observation='state' without render_mode='rgb_array'"
+        ) from None
+
+
+def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> tuple[Meshcat, MeshcatVisualizer]:
+    """Adds a browser view, on this machine only: Meshcat would listen on every interface by default."""
+    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=1 / 50)
+    visualizer = builder.AddNamedSystem("meshcat", MeshcatVisualizer(meshcat, parameters))
+    builder.Connect(query, visualizer.query_object_input_port())
+    return meshcat, visualizer
