@@ -1,0 +1,97 @@
+"""The law of a Cartesian impedance: a spring to a desired pose, and a damper that suits the spring and the inertia.
+
+Every vector of six here is [translational, rotational], and everything is in the axes of one frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class JointTorques:
+    """What a step of the law leads to; `wrench` (6,) is the impedance's, `torque` (n,) what is sent."""
+
+    torque: np.ndarray
+    wrench: np.ndarray
+    is_saturated: bool
+
+
+def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.ndarray) -> np.ndarray:
+    """The wrench of the potential ½ eᵀ K e, e = [p_error, 2ε], at an orientation error of quaternion (η, ε).
+
+    Its rotational part is E(η, ε)ᵀ times that of K e, E = η I + [ε]× (Caccavale, Natale, Siciliano, Villani 1999):
+    exactly the potential's gradient, so that a spring never gives back more than it was given. For small errors it is
+    K times the rotation vector.
+
+    Args:
+        K: stiffness (6, 6), symmetric, positive definite.
+        p_error: desired minus actual position, (3,).
+        eta, epsilon: of R_desired Rᵀ.
+    """
+    generalized = K @ np.concatenate([p_error, 2.0 * epsilon])
+    torque = generalized[3:]
+    return np.concatenate([generalized[:3], eta * torque - np.cross(epsilon, torque)])
+
+
+def damping_matrix(K: np.ndarray, Lambda: np.ndarray, damping_ratio: float) -> np.ndarray:
+    """D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ: every mode of the pair (K, Λ) has the damping ratio ζ."""
+    L = np.linalg.cholesky(Lambda)
+    K_normalized = np.linalg.solve(L, np.linalg.solve(L, K).T)
+    eigenvalues, modes = np.linalg.eigh(0.5 * (K_normalized + K_normalized.T))
+    root = (modes * np.sqrt(np.maximum(eigenvalues, 0.0))) @ modes.T
+    return 2.0 * damping_ratio * L @ root @ L.T
+
+
+def impedance_torques(
+    *,
+    K: np.ndarray,
+    damping_ratio: float,
+    wrench_limits: np.ndarray,
+    R_axes: np.ndarray,
+    p_error: np.ndarray,
+    eta: float,
+    epsilon: np.ndarray,
+    J: np.ndarray,
+    M: np.ndarray,
+    v: np.ndarray,
+    posture_torque: np.ndarray,
+    gravity_torque: np.ndarray,
+    torque_limits: np.ndarray,
+) -> JointTorques:
+    """τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to what the motors can.
+
+    The wrench is clipped per axis, spring and damper together: whatever happens, the tool pushes with no more, and it
+    still follows a fast command, where the two cancel. N = I − Jᵀ Λ J M⁻¹ leaves of the posture's torque what
+    accelerates no part of the tool's pose.
+
+    Args:
+        K: stiffness (6, 6) in the axes of the stiffness frame.
+        damping_ratio: ζ of every mode.
+        wrench_limits: (6,) along the axes of the stiffness frame [N, Nm].
+        R_axes: from the stiffness frame's axes to those of everything else, (3, 3).
+        p_error, eta, epsilon: see `spring_wrench`.
+        J: geometric Jacobian of the tool centre, (6, n).
+        M: mass matrix with the rotors' reflected inertia, (n, n).
+        v: joint velocities (n,).
+        posture_torque: what would pull the joints to their posture, (n,).
+        gravity_torque: what holds the arm's weight, (n,).
+        torque_limits: (n,) [Nm].
+    """
+    R = np.zeros((6, 6))
+    R[:3, :3] = R[3:, 3:] = R_axes
+    K = R @ K @ R.T
+
+    M_inverse_JT = np.linalg.solve(M, J.T)
+    Lambda = np.linalg.inv(J @ M_inverse_JT + 1e-9 * np.eye(6))  # the term keeps a singular arm finite
+    Lambda = 0.5 * (Lambda + Lambda.T)
+    wanted_wrench = spring_wrench(K, p_error, eta, epsilon) - damping_matrix(K, Lambda, damping_ratio) @ (J @ v)
+    along_axes = R.T @ wanted_wrench
+    wrench = R @ np.clip(along_axes, -wrench_limits, wrench_limits)
+    null_torque = posture_torque - J.T @ (Lambda @ (M_inverse_JT.T @ posture_torque))
+    wanted_torque = J.T @ wrench + null_torque + gravity_torque
+    torque = np.clip(wanted_torque, -torque_limits, torque_limits)
+    is_saturated = bool((np.abs(along_axes) >= wrench_limits).any() or (torque != wanted_torque).any())
+    return JointTorques(torque, wrench, is_saturated)

@@ -1,0 +1,23 @@
+"""Six numbers for a pose: [x y z Rz Ry Rx], the coordinates in which the thesis records and commands."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+
+def pose_to_transform(pose: np.ndarray) -> RigidTransform:
+    """X = (Rz(a) Ry(b) Rx(c), [x y z]) of pose = [x y z a b c], metres and radians."""
+    return RigidTransform(RollPitchYaw(pose[5], pose[4], pose[3]), pose[:3])
+
+
+def transform_to_pose(X: RigidTransform) -> np.ndarray:
+    """The inverse of `pose_to_transform`, with a and c in (−π, π] and b in [−π/2, π/2]."""
+    return np.concatenate([X.translation(), RollPitchYaw(X.rotation()).vector()[::-1]])
+
+
+def orientation_error(R_desired: RotationMatrix, R: RotationMatrix) -> tuple[float, np.ndarray]:
+    """Quaternion (η, ε) of R_desired Rᵀ with η ≥ 0: the shorter way round, and no singularity anywhere."""
+    q = (R_desired @ R.inverse()).ToQuaternion()
+    sign = 1.0 if q.w() >= 0.0 else -1.0
+    return sign * q.w(), sign * q.xyz()

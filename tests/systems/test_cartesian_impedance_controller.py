@@ -1,0 +1,309 @@
+"""The impedance by what it does to an arm in free space: statics, energy, limits and the watchdog."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.geometry import Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import (
+    AddMultibodyPlantSceneGraph,
+    CoulombFriction,
+    ExternallyAppliedSpatialForce,
+    MultibodyPlant,
+)
+from pydrake.multibody.tree import FixedOffsetFrame, SpatialInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from scipy.spatial.transform import Rotation
+
+from guiderail.diagrams.stations.arm import add_arm, controller_model
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.models.errors import InputError
+from guiderail.models.robots.cartesian_impedance import damping_matrix, spring_wrench
+from guiderail.models.robots.pose import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
+
+STIFFNESS = np.diag([1500.0, 1000.0, 800.0, 40.0, 30.0, 30.0])
+LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])
+POSTURES = [
+    [0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0],
+    [0.8, 0.3, -0.4, -1.8, 0.3, 0.9, 1.0],
+    [-1.0, 0.9, 0.5, -0.9, -0.8, -0.7, -1.5],
+    [2.0, -0.5, 0.2, 1.5, 0.4, -1.2, 0.3],
+]
+WORKCELL = BncWorkcell()
+
+
+class FreeArm:
+    """The arm at a posture, told to stay there, with a force that a test can apply to its tool."""
+
+    def __init__(self, q, *, gains=None, time_step=0.001, ball=False, turned_axes=None):
+        builder = DiagramBuilder()
+        self.plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
+        self.arm = add_arm(self.plant, WORKCELL)
+        if ball:
+            model = self.plant.AddModelInstance("ball")
+            self.ball = self.plant.AddRigidBody("ball", model, SpatialInertia.SolidSphereWithMass(2.0, 0.06))
+            self.plant.RegisterCollisionGeometry(
+                self.ball, RigidTransform(), Sphere(0.06), "ball", CoulombFriction(0.5, 0.5)
+            )
+        self.plant.Finalize()
+        self.model, arm = controller_model(WORKCELL)
+        self.tool_centre, self.target = arm.tool_centre, arm.target
+        frame = None
+        if turned_axes is not None:
+            self.model, arm = _with_axes(turned_axes)
+            self.tool_centre, self.target = arm.tool_centre, arm.target
+            frame = self.model.GetFrameByName("axes")
+        gains = gains or ImpedanceGains(STIFFNESS, LIMITS, np.array(q, dtype=float))
+        self.controller = builder.AddSystem(
+            CartesianImpedanceController(
+                self.model,
+                self.target,
+                self.tool_centre,
+                gains,
+                period=time_step,
+                stiffness_frame=frame,
+                timeout=timeout,
+            )
+        )
+        builder.Connect(self.plant.get_state_output_port(self.arm.model), self.controller.get_state_input_port())
+        builder.Connect(self.controller.get_torque_output_port(), self.plant.get_actuation_input_port(self.arm.model))
+        self.simulator = Simulator(builder.Build())
+        self.context = self.simulator.get_mutable_context()
+        self.plant_context = self.plant.GetMyMutableContextFromRoot(self.context)
+        self.controller_context = self.controller.GetMyMutableContextFromRoot(self.context)
+        self.plant.SetPositions(self.plant_context, self.arm.model, q)
+        self.command(self.pose())
+
+    def pose(self):
+        X_TP = self.plant.GetFrameByName("tool_centre").CalcPose(
+            self.plant_context, self.plant.GetFrameByName("target")
+        )
+        return transform_to_pose(X_TP)
+
+    def command(self, pose, time=None):
+        self.controller.get_desired_pose_input_port().FixValue(self.controller_context, pose)
+        if time is not None:
+            self.controller.get_command_time_input_port().FixValue(self.controller_context, [time])
+
+    def push(self, force, torque=(0, 0, 0)):
+        applied = ExternallyAppliedSpatialForce()
+        body = self.plant.GetBodyByName("tool_centre")
+        applied.body_index = body.index()
+        applied.p_BoBq_B = np.zeros(3)
+        applied.F_Bq_W = SpatialForce(tau=np.array(torque, dtype=float), f=np.array(force, dtype=float))
+        port = self.plant.get_applied_spatial_force_input_port()
+        port.FixValue(self.plant_context, Value([applied]))
+
+    def torque(self):
+        return self.controller.get_torque_output_port().Eval(self.controller_context)
+
+    def advance(self, seconds, watch=None):
+        end = self.context.get_time() + seconds
+        while self.context.get_time() < end - 1e-9:
+            self.simulator.AdvanceTo(min(end, self.context.get_time() + 0.01))
+            if watch:
+                watch()
+
+
+def _with_axes(R_WAxes):
+    plant = MultibodyPlant(0.0)
+    arm = add_arm(plant, WORKCELL)
+    plant.AddFrame(FixedOffsetFrame("axes", plant.world_frame(), RigidTransform(R_WAxes, [0, 0, 0])))
+    plant.Finalize()
+    return plant, arm
+
+
+def displacement(before, after):
+    """Translation and rotation vector of the tool between two poses, in T's axes."""
+    X, Y = pose_to_transform(before), pose_to_transform(after)
+    turn = (Y.rotation() @ X.rotation().inverse()).ToAngleAxis()
+    return np.concatenate([Y.translation() - X.translation(), turn.angle() * turn.axis()])
+
+
+@pytest.mark.parametrize("q", POSTURES)
+def test_static_displacement_is_the_compliance_times_the_wrench(q):
+    arm = FreeArm(q, time_step=0.005)
+    before = arm.pose()
+    force, torque = np.array([6.0, -4.0, 8.0]), np.array([0.3, -0.2, 0.4])
+    arm.push(force, torque)
+    arm.advance(4.0)
+    expected = np.linalg.solve(STIFFNESS, np.concatenate([force, torque]))
+    moved = displacement(before, arm.pose())
+    assert np.linalg.norm(moved[:3] - expected[:3]) < 0.02 * np.linalg.norm(expected[:3])
+    assert np.linalg.norm(moved[3:] - expected[3:]) < 0.02 * np.linalg.norm(expected[3:])
+
+
+def test_stiffness_in_a_turned_frame():
+    """Soft along a world axis that no joint and no axis of T is along."""
+    R_WAxes = RotationMatrix.MakeZRotation(0.7) @ RotationMatrix.MakeXRotation(0.4)
+    K = np.diag([400.0, 2000.0, 2000.0, 40.0, 40.0, 40.0])
+    arm = FreeArm(
+        POSTURES[0], gains=ImpedanceGains(K, LIMITS, np.array(POSTURES[0])), time_step=0.005, turned_axes=R_WAxes
+    )
+    before = arm.pose()
+    force = np.array([5.0, 5.0, 0.0])
+    arm.push(force)
+    arm.advance(4.0)
+    R = R_WAxes.matrix()
+    expected = R @ np.linalg.inv(K[:3, :3]) @ R.T @ force
+    np.testing.assert_allclose(displacement(before, arm.pose())[:3], expected, atol=0.02 * np.linalg.norm(expected))
+
+
+def test_pushed_and_released_its_energy_never_grows():
+    gains = ImpedanceGains(STIFFNESS, LIMITS, np.array(POSTURES[1]), damping_ratio=0.3, posture_stiffness=0.0)
+    arm = FreeArm(POSTURES[1], gains=gains, time_step=0.001)
+    desired = arm.pose()
+    # The spring is pushed below its limits: its energy is then the quadratic form.
+    arm.push([12.0, -10.0, 15.0], [0.5, 0.5, -0.5])
+    arm.advance(0.4)
+    arm.push([0.0, 0.0, 0.0])
+    energies = []
+
+    def measure():
+        X, X_desired = pose_to_transform(arm.pose()), pose_to_transform(desired)
+        _, epsilon = orientation_error(X_desired.rotation(), X.rotation())
+        error = np.concatenate([X_desired.translation() - X.translation(), 2 * epsilon])
+        v = arm.plant.GetVelocities(arm.plant_context)
+        energies.append(0.5 * v @ arm.plant.CalcMassMatrix(arm.plant_context) @ v + 0.5 * error @ STIFFNESS @ error)
+
+    measure()
+    arm.advance(1.5, measure)
+    assert energies[0] > 0.05
+    assert np.diff(energies).max() < 1e-4 * energies[0]
+    assert energies[-1] < 0.01 * energies[0]
+
+
+def test_a_target_half_a_metre_away_is_approached_within_limits():
+    arm = FreeArm(POSTURES[0], time_step=0.005)
+    start = arm.pose()
+    arm.command(start + [-0.1, 0.35, 0.35, 0.5, 0, 0])
+    limits = arm.model.GetEffortUpperLimits()
+    torques, forces = [], []
+
+    def watch():
+        torques.append(np.abs(arm.torque()))
+        forces.append(np.abs(arm.controller.get_impedance_wrench_output_port().Eval(arm.controller_context)))
+
+    arm.advance(3.0, watch)
+    assert (np.array(torques) <= limits).all()
+    assert (np.array(forces) <= LIMITS + 1e-9).all()
+    assert np.linalg.norm((arm.pose() - start)[:3]) > 0.3
+
+
+def test_a_mass_dropped_on_it_is_caught_within_limits():
+    arm = FreeArm(POSTURES[0], time_step=0.001, ball=True)
+    start = arm.pose()
+    p_WLink = arm.plant.GetFrameByName("iiwa_link_6").CalcPoseInWorld(arm.plant_context).translation()
+    arm.plant.SetFreeBodyPose(arm.plant_context, arm.ball, RigidTransform(p_WLink + [0.0, 0.0, 0.35]))
+    limits = arm.model.GetEffortUpperLimits()
+    deviations = []
+
+    def watch():
+        assert (np.abs(arm.torque()) <= limits).all()
+        deviations.append(np.abs(arm.pose() - start)[:3].max())
+
+    arm.advance(2.5, watch)
+    assert max(deviations) > 0.002
+    np.testing.assert_allclose(arm.pose(), start, atol=2e-3)
+
+
+def test_when_commands_stop_the_last_sound_pose_is_held():
+    arm = FreeArm(POSTURES[0], time_step=0.005)
+    start = arm.pose()
+    holding = arm.controller.get_holding_output_port()
+    safe = start + [0.01, 0, 0, 0, 0, 0]
+    arm.command(safe, time=0.0)
+    arm.advance(0.05)
+    assert holding.Eval(arm.controller_context)[0] == 0.0
+    arm.advance(0.2)
+    assert holding.Eval(arm.controller_context)[0] == 1.0
+    arm.command(start + [0.5, 0.5, 0, 0, 0, 0], time=0.0)  # an old message with a far target
+    arm.advance(2.0)
+    np.testing.assert_allclose(arm.pose(), safe, atol=5e-4)
+
+
+def test_what_is_not_a_number_is_no_command():
+    arm = FreeArm(POSTURES[0], time_step=0.005)
+    start = arm.pose()
+    arm.command(np.full(6, np.nan))
+    arm.advance(0.5)
+    assert np.isfinite(arm.torque()).all()
+    np.testing.assert_allclose(arm.pose(), start, atol=1e-4)
+
+
+def test_spring_is_the_gradient_of_its_potential():
+    """Along any motion of the tool, minus the spring's power is the growth of ½ eᵀ K e."""
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((6, 6))
+    K = A @ A.T + np.eye(6)
+    for _ in range(5):
+        X_desired, X = (RigidTransform(RotationMatrix(_random_rotation(rng)), rng.standard_normal(3)) for _ in range(2))
+        V = rng.standard_normal(6)
+
+        def error(step, X=X, X_desired=X_desired, V=V):
+            angle = step * np.linalg.norm(V[3:])
+            turned = RotationMatrix(_axis_angle(V[3:] / np.linalg.norm(V[3:]), angle)) @ X.rotation()
+            eta, epsilon = orientation_error(X_desired.rotation(), turned)
+            return X_desired.translation() - X.translation() - step * V[:3], eta, epsilon
+
+        def potential(step, error=error):
+            p, _, epsilon = error(step)
+            e = np.concatenate([p, 2 * epsilon])
+            return 0.5 * e @ K @ e
+
+        growth = (potential(1e-5) - potential(-1e-5)) / 2e-5
+        assert spring_wrench(K, *error(0.0)) @ V == pytest.approx(-growth, rel=1e-5, abs=1e-6)
+
+
+def test_damping_gives_every_mode_its_ratio():
+    rng = np.random.default_rng(1)
+    A, B = rng.standard_normal((2, 6, 6))
+    K, Lambda = A @ A.T + np.eye(6), B @ B.T + np.eye(6)
+    D = damping_matrix(K, Lambda, 0.7)
+    companion = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.linalg.solve(Lambda, K), -np.linalg.solve(Lambda, D)]])
+    poles = np.linalg.eigvals(companion)
+    np.testing.assert_allclose(-poles.real / np.abs(poles), 0.7, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"stiffness": np.diag([1.0, 1, 1, 1, 1, -1])},
+        {"stiffness": np.eye(3)},
+        {"wrench_limits": np.zeros(6)},
+        {"damping_ratio": 0.0},
+        {"posture_stiffness": -1.0},
+    ],
+)
+def test_refuses_what_makes_no_sense(wrong):
+    sound = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
+    with pytest.raises(InputError):
+        ImpedanceGains(**(sound | wrong))
+
+
+def test_ports_and_feedthrough():
+    model, arm = controller_model(WORKCELL)
+    system = CartesianImpedanceController(
+        model, arm.target, arm.tool_centre, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7)), period=0.005
+    )
+    assert [system.get_input_port(i).get_name() for i in range(3)] == ["desired_pose", "state", "command_time"]
+    assert [system.get_output_port(i).get_name() for i in range(5)] == [
+        "torque",
+        "pose",
+        "impedance_wrench",
+        "saturation",
+        "holding",
+    ]
+    desired, pose = system.get_desired_pose_input_port(), system.get_pose_output_port()
+    assert not system.HasDirectFeedthrough(desired.get_index(), pose.get_index())
+
+
+def _axis_angle(axis, angle):
+    return Rotation.from_rotvec(angle * np.asarray(axis)).as_matrix()
+
+
+def _random_rotation(rng):
+    return Rotation.random(random_state=rng.integers(1 << 30)).as_matrix()
