@@ -65,7 +65,6 @@ class FreeArm:
                 gains,
                 period=time_step,
                 stiffness_frame=frame,
-                timeout=timeout,
             )
         )
         builder.Connect(self.plant.get_state_output_port(self.arm.model), self.controller.get_state_input_port())
