@@ -3,6 +3,7 @@
 from guiderail.models.primitives.constraints import LinearConstraints
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel, Matern52, SquaredExponential
+from guiderail.models.primitives.kmp import Kmp
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp, Prediction
 from guiderail.models.primitives.least_norm import UnsolvableError
 from guiderail.models.primitives.poses import pose_demonstrations, pose_outputs, pose_rotation
@@ -11,6 +12,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 __all__ = [
     "Demonstrations",
     "Kernel",
+    "Kmp",
     "LcNsKmp",
     "LinearConstraints",
     "Matern52",

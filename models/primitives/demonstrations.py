@@ -14,6 +14,8 @@ from guiderail.models.errors import InputError
 class Demonstrations:
     """M recordings of O outputs over time, each of its own length and rate.
 
+    A sample that was recorded twice, the same time with the same outputs, counts once.
+
     Attributes:
         times: M arrays (N_m,), strictly increasing.
         outputs: M arrays (N_m, O).
@@ -49,8 +51,6 @@ class Demonstrations:
                 raise InputError(
                     f"demonstration {m} needs times (N,) and outputs (N, O), not shapes {t.shape} and {y.shape}"
                 )
-            if len(t) < 2:
-                raise InputError(f"demonstration {m} has {len(t)} point: a motion needs at least two")
             if y.shape[1] < 1 or y.shape[1] != self.outputs[0].shape[1]:
                 raise InputError(
                     f"demonstration {m} has {y.shape[1]} outputs, the first has {self.outputs[0].shape[1]}: "
@@ -58,12 +58,25 @@ class Demonstrations:
                 )
             if not np.isfinite(t).all() or not np.isfinite(y).all():
                 raise InputError(f"demonstration {m} contains NaN or infinity: cut those samples out")
+        self._drop_repeated_samples()
+        for m, t in enumerate(self.times):
+            if len(t) < 2:
+                raise InputError(f"demonstration {m} has {len(t)} point: a motion needs at least two")
             if not (np.diff(t) > 0).all():
                 at = int(np.argmax(np.diff(t) <= 0)) + 1
                 raise InputError(f"demonstration {m}'s time does not increase at sample {at}: sort or drop samples")
         self.names = tuple(names) if names is not None else tuple(f"y{o + 1}" for o in range(self.num_outputs))
         if len(self.names) != self.num_outputs:
             raise InputError(f"there are {len(self.names)} names for {self.num_outputs} outputs")
+
+    def _drop_repeated_samples(self) -> None:
+        """A recorder that is faster than its robot logs a sample twice, time and all: that is one sample."""
+        times, outputs = [], []
+        for t, y in zip(self.times, self.outputs, strict=True):
+            new = np.append(True, (np.diff(t) != 0) | (np.diff(y, axis=0) != 0).any(axis=1))
+            times.append(t[new])
+            outputs.append(y[new])
+        self.times, self.outputs = tuple(times), tuple(outputs)
 
     @property
     def num_demonstrations(self) -> int:

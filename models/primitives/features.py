@@ -50,6 +50,61 @@ def window_features(
     return WindowFeatures(history_map.astype(float), _pivoted_cholesky(K).astype(float))
 
 
+class KernelBasis:
+    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), on as few of its inputs as span the others."""
+
+    def __init__(self, kernel: Kernel, inputs: np.ndarray):
+        """
+        Args:
+            kernel: k.
+            inputs: (N, I), which the features must represent to rounding.
+        """
+        self._kernel = kernel
+        self._pivots = np.zeros((0, inputs.shape[1]))
+        self._triangle = np.zeros((0, 0), dtype=_Extended)
+        self.extend(inputs)
+
+    @property
+    def size(self) -> int:
+        """r, the number of features."""
+        return len(self._pivots)
+
+    def features(self, inputs: np.ndarray) -> np.ndarray:
+        """(n, r) at `inputs` (n, I)."""
+        return self._extended_features(inputs).astype(float)
+
+    def residual(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """k(ζ, ζ) − ‖f(ζ)‖² (n,): what the features don't see of inputs (n, I)."""
+        prior = np.array([self._kernel(x[None], x[None])[0, 0] for x in inputs])
+        return prior - (features**2).sum(axis=1)
+
+    def extend(self, inputs: np.ndarray) -> bool:
+        """Adds features until `inputs` (n, I) are represented; True if any were needed."""
+        inputs = inputs.astype(_Extended)
+        F = self._extended_features(inputs)
+        residual = np.array([self._kernel(x[None], x[None])[0, 0] for x in inputs]) - (F**2).sum(axis=1)
+        # Not to rounding, as in a window: a feature of size 1e-7 would multiply weights that no data determines.
+        tolerance = 1e-15
+        before = self.size
+        while len(inputs) and residual.max() > tolerance:
+            pivot = int(np.argmax(residual))
+            column = (self._kernel(inputs, inputs[pivot : pivot + 1])[:, 0] - F @ F[pivot]) / np.sqrt(residual[pivot])
+            grown = np.zeros((self.size + 1, self.size + 1), dtype=_Extended)
+            grown[:-1, :-1], grown[-1, :-1], grown[-1, -1] = self._triangle, F[pivot], column[pivot]
+            self._triangle = grown
+            self._pivots = np.vstack([self._pivots, inputs[pivot].astype(float)])
+            F = np.column_stack([F, column])
+            residual = residual - column**2
+            residual[pivot] = 0
+        return self.size > before
+
+    def _extended_features(self, inputs: np.ndarray) -> np.ndarray:
+        pivots, inputs = self._pivots.astype(_Extended), inputs.astype(_Extended)
+        if not len(pivots):
+            return np.zeros((len(inputs), 0), dtype=_Extended)
+        return _solve_lower(self._triangle, self._kernel(pivots, inputs)).T
+
+
 def _cholesky(A: np.ndarray) -> np.ndarray:
     """Lower Cholesky factor in the precision of A (LAPACK has none beyond double)."""
     L = np.zeros_like(A)

@@ -30,7 +30,7 @@ class Prediction:
         output: (O,), what to execute.
     """
 
-    __slots__ = ("_alpha", "_factor", "_v", "_x", "output")
+    __slots__ = ("_factor", "_signed", "_v", "_x", "output")
 
     def __init__(
         self,
@@ -38,9 +38,9 @@ class Prediction:
         factor: StepFactor,
         x: np.ndarray,
         v: np.ndarray | None = None,
-        alpha: np.ndarray | None = None,
+        signed: np.ndarray | None = None,
     ):
-        self.output, self._factor, self._x, self._v, self._alpha = output, factor, x, v, alpha
+        self.output, self._factor, self._x, self._v, self._signed = output, factor, x, v, signed
 
     @property
     def constrained(self) -> bool:
@@ -49,10 +49,10 @@ class Prediction:
 
     @property
     def multipliers(self) -> np.ndarray:
-        """α (H+1, F) ≥ 0, zero where a constraint is slack."""
-        if self._alpha is None:
+        """α (H+1, F) ≥ 0, zero where a constraint is slack; computed at each call."""
+        if self._signed is None:
             return np.zeros(self._factor.multipliers_shape)
-        return self._alpha
+        return self._factor.multipliers(self._signed)
 
     @property
     def trajectory(self) -> np.ndarray:
@@ -67,7 +67,8 @@ class LcNsKmp:
     is first asked for, and a prediction is two small products, plus a QP where a constraint is not slack.
 
     Attributes:
-        reference, kernel, lambda_, beta, horizon, history, history_variance, constraints: as given.
+        reference, kernel, lambda_, beta, horizon, history, history_variance, constraints, solver: as given.
+        cached_bytes: what the factored steps take now.
     """
 
     def __init__(
@@ -126,7 +127,7 @@ class LcNsKmp:
         self.solver = solver
         self._solve = find_solver(solver)
         self._cache: OrderedDict[int, StepFactor] = OrderedDict()
-        self._cache_bytes, self._cached_bytes = cache_bytes, 0
+        self._cache_bytes, self.cached_bytes = cache_bytes, 0
         self._shared_features: WindowFeatures | None = None
         self._history_shape = (self.history, reference.num_outputs)
 
@@ -157,18 +158,60 @@ class LcNsKmp:
         if step < 0:
             raise InputError(f"step counts from 0, not {step}")
         factor = self._cache.get(step) or self._factor(step)
+        return self._finish(factor, self._stack(null_space_action, history))
+
+    def predict_at(
+        self,
+        inputs: np.ndarray,
+        means: np.ndarray,
+        covariances: np.ndarray,
+        null_space_action: np.ndarray | None = None,
+        history: np.ndarray | None = None,
+        history_inputs: np.ndarray | None = None,
+    ) -> Prediction:
+        """The output at inputs that are not the reference's clock, such as a state: factored here and now.
+
+        Args:
+            inputs: (H+1,) or (H+1, I), the executed point's first.
+            means, covariances: (H+1, O) and (H+1, O, O), the reference there.
+            null_space_action, history: as in `predict`.
+            history_inputs: (P,) or (P, I), where the history was.
+
+        Raises:
+            InputError: as `predict`, if shapes don't fit, or if constraints differ from step to step: they would need a
+                clock.
+            UnsolvableError: as `predict`.
+        """
+        if self.constraints.num_steps is not None:
+            raise InputError("constraints that differ from step to step need a clock: use predict")
         x = self._stack(null_space_action, history)
+        means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
+        inputs = np.asarray(inputs, dtype=float)
+        past = inputs[:0] if history_inputs is None else np.asarray(history_inputs, dtype=float)
+        shape = (len(inputs), self.num_outputs)
+        if means.shape != shape or covariances.shape != (*shape, self.num_outputs):
+            raise InputError(f"means and covariances must have shapes {shape} and {(*shape, self.num_outputs)}")
+        if len(past) != self.history or past.shape[1:] != inputs.shape[1:]:
+            raise InputError(f"history_inputs must be {self.history} inputs like the others, not {past.shape}")
+        if not all(np.isfinite(a).all() for a in (inputs, past, means, covariances)):
+            raise InputError("inputs, means and covariances must be finite")
+        features = window_features(self.kernel, past, inputs, self._history_noise)
+        G, c = self.constraints.window(np.arange(len(inputs)))
+        return self._finish(StepFactor(Window(means, covariances, G, c), features, self.lambda_, self.beta), x)
+
+    def _finish(self, factor: StepFactor, x: np.ndarray) -> Prediction:
+        """The prediction of a factored window, corrected where a constraint is not slack."""
         output = factor.output_map @ x
         output += factor.output_offset
         free = factor.constraint_map @ x
         if (free >= factor.lower).all() and (free <= factor.upper).all():
             return Prediction(output, factor, x)
-        v, alpha = factor.correct(free, self._solve)
-        output = output + factor.correction_map @ v
-        violation = self.constraints.violation(output, step)
+        v, signed = factor.correct(free, self._solve)
+        output += factor.correction_map @ v
+        violation = factor.violation(output)
         if not violation <= TOLERANCE:
-            raise UnsolvableError(f"step {step}: the solver left a violation of {violation:.1e}")
-        return Prediction(output, factor, x, v, alpha)
+            raise UnsolvableError(f"the solver left a violation of {violation:.1e}")
+        return Prediction(output, factor, x, v, signed)
 
     def linear_response(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The free output of a step, R_h h + N ξ̂ + r: R_h (O, PO), N (O, O), r (O,), where no constraint is active."""
@@ -180,7 +223,7 @@ class LcNsKmp:
         """Factors every step now rather than when first asked for; returns the bytes that takes."""
         for step in range(self.num_steps):
             self._factor(step)
-        return self._cached_bytes
+        return self.cached_bytes
 
     def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
         """x = [history, null-space action], checked."""
@@ -207,11 +250,16 @@ class LcNsKmp:
         if factor is None:
             factor = StepFactor(self._window(step), self._features(step), self.lambda_, self.beta)
             self._cache[step] = factor
-            self._cached_bytes += factor.nbytes
-            while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
+            self.cached_bytes += factor.nbytes
+            while self.cached_bytes > self._cache_bytes and len(self._cache) > 1:
                 _, oldest = self._cache.popitem(last=False)
-                self._cached_bytes -= oldest.nbytes
+                self.cached_bytes -= oldest.nbytes
         return factor
+
+    @property
+    def _history_noise(self) -> float:
+        """ħρ: what the history's covariance weighs against the kernel."""
+        return (self.lambda_ + self.beta) * self.history_variance
 
     def _window(self, step: int) -> Window:
         steps = np.arange(step, step + self.horizon + 1)
@@ -224,8 +272,7 @@ class LcNsKmp:
             return self._shared_features
         past = self.reference.inputs(np.arange(step - self.history, step))
         future = self.reference.inputs(np.arange(step, step + self.horizon + 1))
-        noise = (self.lambda_ + self.beta) * self.history_variance
-        features = window_features(self.kernel, past, future, noise)
+        features = window_features(self.kernel, past, future, self._history_noise)
         if self.kernel.stationary and self.reference.uniform:
             self._shared_features = features
         return features

@@ -14,8 +14,6 @@ from guiderail.models.errors import InputError
 
 Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
-_UNBOUNDED = 1e29  # what the solvers take for infinity
-
 
 class UnsolvableError(RuntimeError):
     """No solution within the solver's tolerance: the caller must fall back to its last safe command."""
@@ -67,7 +65,7 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
         polishing=True,
         max_iter=20_000,
     )
-    result = solver.solve()
+    result = solver.solve(raise_error=False)
     if result.info.status_val not in (1, 2):
         raise UnsolvableError(f"OSQP ended with '{result.info.status}'")
     return result.x, result.y
@@ -106,7 +104,7 @@ def solve_least_norm(
     """
     # The problem is homogeneous: at unit scale the solver's absolute tolerance is a relative one.
     scale = max(lower.max(), -upper.min())
-    v, multipliers = solver(rows, np.maximum(lower / scale, -_UNBOUNDED), np.minimum(upper / scale, _UNBOUNDED))
+    v, multipliers = solver(rows, lower / scale, upper / scale)
     return scale * v, scale * multipliers
 
 

@@ -52,10 +52,9 @@ def pose_outputs(
     p_TE = R_WT.inv().apply(positions - np.asarray(target_position, dtype=float))
     R_TE = R_WT.inv() * Rotation.from_quat(quaternions, scalar_first=True)
     if orientation == "euler_zyx":
-        angles = R_TE.as_euler("ZYX")
-        if np.abs(np.abs(angles[:, 1]) - np.pi / 2).min() < np.deg2rad(1):
+        if np.abs(R_TE.as_matrix()[:, 2, 0]).max() > np.sin(np.deg2rad(89)):
             raise InputError("ZYX Euler angles are singular in this motion: use orientation='rotation_vector'")
-        return np.hstack([p_TE, _continued(angles, near)])
+        return np.hstack([p_TE, _continued(R_TE.as_euler("ZYX"), near)])
     if orientation == "rotation_vector":
         return np.hstack([p_TE, _continued_vectors(R_TE.as_rotvec(), near)])
     raise InputError(f"there is no orientation '{orientation}': choose euler_zyx or rotation_vector")

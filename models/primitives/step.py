@@ -28,120 +28,141 @@ class Window:
     c: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Solution:
+    """The whole window as a function of x = [history, null-space action], where no constraint is active.
+
+    y = L (latent_mean + latent_map x) + direct_map history, and a correction v moves it by L v.
+    """
+
+    L: np.ndarray
+    latent_mean: np.ndarray
+    latent_map: np.ndarray
+    direct_map: np.ndarray
+
+    def rows(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The map (n, PO+O) and the offset (n,) that give the rows `at` of y from x."""
+        map_ = self.L[at] @ self.latent_map
+        map_[:, : self.direct_map.shape[1]] += self.direct_map[at]
+        return map_, self.L[at] @ self.latent_mean
+
+
 class StepFactor:
     """The factored problem 4.5 of one window, in terms of x = [history, null-space action].
 
     With y = W̄h + F̄w for weights w of unit prior, problem 4.5 is a regularized least-squares problem in w; its QR
     factor gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ directly, without ever forming Σ⁻¹ or K⁻¹ (equation 4.12, read in weights).
-    The window is then linear in x, and the executed point and the constrained directions are rows of it.
+    The window is then linear in x, and the executed point and the constrained directions are rows of it. Only those
+    rows are kept: the rest of the window is solved for again when somebody wants to look at it.
+
+    Attributes:
+        output_map, output_offset: (O, PO+O) and (O,), the executed point from x.
+        constraint_map, lower, upper: (m, PO+O), (m,), (m,): constrained directions from x, and their bounds, each in
+            units of how far its direction can move.
+        constraint_rows: (m, r), unit rows that a correction v moves those directions by.
+        correction_map: (O, r), what v does to the executed point.
     """
 
     def __init__(self, window: Window, features: WindowFeatures, lambda_: float, beta: float):
-        self._means, self._features, self._hbar, self._beta = window.means, features, lambda_ + beta, beta
-        steps, outputs = window.means.shape
-        self._shape = (steps, outputs)
+        self._window, self._features, self._hbar, self._beta = window, features, lambda_ + beta, beta
+        outputs = window.means.shape[1]
+        solution = self._solve()
+        self.output_map, self.output_offset = solution.rows(np.arange(outputs))
+        self._factor_constraints(solution)
 
+    def _solve(self) -> _Solution:
+        steps, outputs = self._window.means.shape
         # Columns of F̄ = F ⊗ I are ordered (feature, output); rows (step, output).
-        chol = np.linalg.cholesky(window.covariances)
-        chol_inv = np.linalg.inv(chol)
-        F, W = features.features, features.history_map
+        F, W = self._features.features, self._features.history_map
         rank, past = F.shape[1], W.shape[1]
-        whitened = np.einsum("jk,joi->joki", F, chol_inv).reshape(steps * outputs, rank * outputs)
+        whiten = np.linalg.inv(np.linalg.cholesky(self._window.covariances))
+        whitened = np.einsum("jk,joi->joki", F, whiten).reshape(steps * outputs, rank * outputs)
         R = np.linalg.qr(np.vstack([whitened, np.sqrt(self._hbar) * np.eye(rank * outputs)]), mode="r")
+        eye = np.eye(outputs)
+        F_bar = np.einsum("jk,oi->joki", F, eye).reshape(steps * outputs, rank * outputs)
         # Lw = Σ^(-1/2) L. L follows from the features, not from Σ^(1/2) Lw: the former is exact where Σ is tiny.
-        F_bar = np.einsum("jk,oi->joki", F, np.eye(outputs)).reshape(steps * outputs, rank * outputs)
         L = solve_triangular(R, F_bar.T, trans="T", check_finite=False).T
         Lw = solve_triangular(R, whitened.T, trans="T", check_finite=False).T
-        self._L = L
+        # Data terms: L Lᵀ Σ⁻¹ μ of the means, and W̄ − L Lᵀ Σ⁻¹ W̄ of the history.
+        whitened_means = np.einsum("joi,ji->jo", whiten, self._window.means).ravel()
+        whitened_map = np.einsum("jp,joi->jopi", W, whiten).reshape(steps * outputs, past * outputs)
+        return _Solution(
+            L=L,
+            latent_mean=Lw.T @ whitened_means,
+            latent_map=np.concatenate([-Lw.T @ whitened_map, self._beta * L[:outputs].T], axis=1),
+            direct_map=np.einsum("jp,oi->jopi", W, eye).reshape(steps * outputs, past * outputs),
+        )
 
-        # Data terms: weights of the mean, L Lᵀ Σ⁻¹ μ, and of the history, W̄ − L Lᵀ Σ⁻¹ W̄.
-        whitened_means = np.einsum("joi,ji->jo", chol_inv, window.means).reshape(-1)
-        whitened_map = np.einsum("jp,joi->jopi", W, chol_inv).reshape(steps * outputs, past * outputs)
-        W_bar = np.einsum("jp,oi->jopi", W, np.eye(outputs)).reshape(steps * outputs, past * outputs)
-        self._latent_mean = Lw.T @ whitened_means
-        self._latent_map = np.concatenate([-Lw.T @ whitened_map, beta * L[:outputs].T], axis=1)
-        self._direct_map = W_bar
-
-        self.output_map, self.output_offset = self._rows(np.arange(outputs))
-        self._build_constraints(window)
-
-    def _rows(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The map (n, PO+O) and the offset (n,) that give these rows of the free window from x."""
-        map_ = self._L[rows] @ self._latent_map
-        map_[:, : self._direct_map.shape[1]] += self._direct_map[rows]
-        return map_, self._L[rows] @ self._latent_mean
-
-    def _build_constraints(self, window: Window) -> None:
-        steps, outputs = self._shape
-        num = window.G.shape[1]
-        self._num_constraints = num
-        self._rows_of_constraints = _pair_opposites(window.G)
-        directions, first, second = self._rows_of_constraints
+    def _factor_constraints(self, solution: _Solution) -> None:
+        window = self._window
+        steps, outputs = window.means.shape
+        self._directions = directions, first, second = _pair_opposites(window.G)
         D = window.G[:, directions].reshape(-1, outputs)
-        at = np.repeat(np.arange(steps), len(directions))
         lower = np.where(first >= 0, window.c[:, first], -np.inf)
         upper = np.where(second >= 0, -window.c[:, second], np.inf)
-        self.lower, self.upper = lower.reshape(-1), upper.reshape(-1)
 
-        y_map, y_offset = self._rows(np.arange(steps * outputs))
-        y_map, L = y_map.reshape(steps, outputs, -1), self._L.reshape(steps, outputs, -1)
-        self.constraint_map = np.ascontiguousarray(np.einsum("mo,mox->mx", D, y_map[at]))
-        offset = np.einsum("mo,mo->m", D, y_offset.reshape(steps, outputs)[at])
-        self.lower, self.upper = self.lower - offset, self.upper - offset
-
-        A = np.einsum("mo,mor->mr", D, L[at])
+        y_map, y_offset = solution.rows(np.arange(steps * outputs))
+        at = np.repeat(np.arange(steps), len(directions))
+        A = np.einsum("mo,mor->mr", D, solution.L.reshape(steps, outputs, -1)[at])
         size = np.linalg.norm(A, axis=1)
         self._scale = 1 / np.where(size > 0, size, 1)
         A = A * self._scale[:, None]
+        offset = np.einsum("mo,mo->m", D, y_offset.reshape(steps, outputs)[at])
+        self.lower, self.upper = ((bound.ravel() - offset) * self._scale for bound in (lower, upper))
+        y_map = y_map.reshape(steps, outputs, -1)[at]
+        self.constraint_map = np.ascontiguousarray(np.einsum("mo,mox,m->mx", D, y_map, self._scale))
         if len(A):
             U, s, Vt = np.linalg.svd(A, full_matrices=False)
-            keep = s > _NEGLIGIBLE * s[0] if s[0] > 0 else np.zeros(len(s), dtype=bool)
-            self._basis = Vt[keep].T
+            keep = s > _NEGLIGIBLE * s[0]
+            self._basis = np.ascontiguousarray(Vt[keep].T)
             self.constraint_rows = np.ascontiguousarray(U[:, keep] * s[keep])
         else:
             self._basis, self.constraint_rows = np.zeros((A.shape[1], 0)), A[:, :0]
-        self.correction_map = self._L[:outputs] @ self._basis
+        self.correction_map = solution.L[:outputs] @ self._basis
 
     def correct(self, free: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
         """The least-norm correction v of a window whose constrained directions come out as `free` (m,).
 
         Returns:
-            v (r,), such that the executed point moves by `correction_map @ v`, and α (H+1, F) ≥ 0.
+            v (r,), such that the executed point moves by `correction_map @ v`, and the solver's multipliers (m,).
 
         Raises:
             UnsolvableError: if the solver finds none.
         """
-        v, signed = solve_least_norm(
-            self.constraint_rows, (self.lower - free) * self._scale, (self.upper - free) * self._scale, solver
-        )
-        return v, self._multipliers(signed * self._scale)
+        return solve_least_norm(self.constraint_rows, self.lower - free, self.upper - free, solver)
 
-    def _multipliers(self, signed: np.ndarray) -> np.ndarray:
-        steps, _ = self._shape
-        directions, first, second = self._rows_of_constraints
-        signed = signed.reshape(steps, len(directions))
-        alpha = np.zeros((steps, self._num_constraints))
+    def multipliers(self, signed: np.ndarray) -> np.ndarray:
+        """α (H+1, F) ≥ 0 of the solver's (m,), which are positive at an upper and negative at a lower bound."""
+        directions, first, second = self._directions
+        signed = (signed * self._scale).reshape(-1, len(directions))
+        alpha = np.zeros(self.multipliers_shape)
         alpha[:, first[first >= 0]] = np.maximum(-signed[:, first >= 0], 0)
         alpha[:, second[second >= 0]] = np.maximum(signed[:, second >= 0], 0)
         return alpha
 
+    def violation(self, output: np.ndarray) -> float:
+        """max(c − G y) of an output (O,) at the executed point; there is at least one constraint."""
+        return float((self._window.c[0] - self._window.G[0] @ output).max())
+
     def trajectory(self, x: np.ndarray, v: np.ndarray | None) -> np.ndarray:
         """The whole window (H+1, O), corrected by v if given."""
-        latent = self._latent_mean + self._latent_map @ x
+        solution = self._solve()
+        latent = solution.latent_mean + solution.latent_map @ x
         if v is not None:
             latent = latent + self._basis @ v
-        y = self._L @ latent + self._direct_map @ x[: self._direct_map.shape[1]]
-        return y.reshape(self._shape)
+        y = solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]
+        return y.reshape(self._window.means.shape)
 
     @property
     def multipliers_shape(self) -> tuple[int, int]:
         """(H+1, F)."""
-        return self._shape[0], self._num_constraints
+        return self._window.c.shape
 
     @property
     def nbytes(self) -> int:
         """What keeping this step costs [bytes]."""
-        return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
+        arrays = (*vars(self).values(), self._window.means, self._window.covariances)
+        return sum(value.nbytes for value in arrays if isinstance(value, np.ndarray))
 
 
 def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

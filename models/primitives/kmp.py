@@ -1,0 +1,198 @@
+"""A kernelized movement primitive at any input, with via-points that come and go (thesis, equations 2.17 and 2.18)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives.features import KernelBasis
+from guiderail.models.primitives.kernels import Kernel, SquaredExponential
+
+
+@dataclass(frozen=True)
+class _Data:
+    input: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+class Kmp:
+    """E(ζ) = k*(K + λΣ)⁻¹μ and cov(ζ) = N/λ_c (k** − k*(K + λ_cΣ)⁻¹k*ᵀ), for inputs of any dimension.
+
+    Where `LcNsKmp` looks at a window of a clock, this one knows its whole reference at once: for primitives driven by a
+    state rather than by time, and for via-points. Both are held in the weights of the kernel's features, whose number
+    is the kernel's rank and not the number of points; the factor is the triangle of a QR decomposition, to which a
+    via-point adds O rows. Removing or moving one starts from the reference's own triangle again, never from scratch.
+    """
+
+    def __init__(
+        self,
+        inputs: np.ndarray,
+        means: np.ndarray,
+        covariances: np.ndarray,
+        kernel: Kernel | None = None,
+        lambda_: float = 1.0,
+        covariance_lambda: float | None = None,
+    ):
+        """
+        Args:
+            inputs: (N,) or (N, I): times, or states.
+            means: (N, O).
+            covariances: (N, O, O), positive definite.
+            kernel: k; `SquaredExponential(inverse_length=2.0)` unless given.
+            lambda_: λ, positive.
+            covariance_lambda: λ_c, positive; λ unless given.
+
+        Raises:
+            InputError: if an argument is out of range or shapes don't fit.
+        """
+        inputs = _rows(inputs)
+        means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
+        if means.ndim != 2 or len(inputs) != len(means) or covariances.shape != (*means.shape, means.shape[1]):
+            raise InputError(
+                f"a primitive needs inputs (N, I), means (N, O) and covariances (N, O, O), not {inputs.shape}, "
+                f"{means.shape} and {covariances.shape}"
+            )
+        for name, value in (("lambda_", lambda_), ("covariance_lambda", covariance_lambda)):
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise InputError(f"{name} must be positive, not {value}")
+        self.num_inputs, self.num_outputs = inputs.shape[1], means.shape[1]
+        self._reference = [
+            _Data(x, m, _checked(s, "reference")) for x, m, s in zip(inputs, means, covariances, strict=True)
+        ]
+        self._via: dict[int, _Data] = {}
+        self._next_name = 0
+        self._lambda, self._covariance_lambda = lambda_, covariance_lambda if covariance_lambda is not None else lambda_
+        self._basis = KernelBasis(kernel if kernel is not None else SquaredExponential(), inputs)
+        self._factor_reference()
+
+    def mean(self, inputs: np.ndarray) -> np.ndarray:
+        """(n, O) at `inputs` (n,) or (n, I): equation 2.17."""
+        F = self._basis.features(self._queries(inputs))
+        return (F @ self._weights.reshape(-1, self.num_outputs)).reshape(-1, self.num_outputs)
+
+    def covariance(self, inputs: np.ndarray) -> np.ndarray:
+        """(n, O, O) at `inputs` (n,) or (n, I): equation 2.18."""
+        queries = self._queries(inputs)
+        F = self._basis.features(queries)
+        prior_left = np.maximum(self._basis.residual(queries, F), 0)
+        eye = np.eye(self.num_outputs)
+        F_bar = np.einsum("nk,oi->noki", F, eye).reshape(len(queries) * self.num_outputs, -1)
+        half = solve_triangular(self._covariance_triangle, F_bar.T, trans="T", check_finite=False)
+        half = half.T.reshape(len(queries), self.num_outputs, -1)
+        points = len(self._reference) + len(self._via)
+        posterior = self._covariance_lambda * np.einsum("nor,nir->noi", half, half)
+        return points / self._covariance_lambda * (posterior + prior_left[:, None, None] * eye)
+
+    def add_via_point(self, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> int:
+        """The motion shall pass `mean` (O,) at `input_` (I,), as exactly as `covariance` (O, O) says.
+
+        Returns:
+            A name to move or remove it by.
+
+        Raises:
+            InputError: if shapes don't fit, a number is not finite, or the covariance is not positive definite.
+        """
+        name = self._next_name
+        self._via[name] = self._data(input_, mean, covariance)
+        self._next_name += 1
+        self._factor_via_points()
+        return name
+
+    def move_via_point(self, name: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
+        """Moves a via-point in any respect.
+
+        Raises:
+            InputError: as `add_via_point`, or if there is no via-point of that name.
+        """
+        self._check_name(name)
+        self._via[name] = self._data(input_, mean, covariance)
+        self._factor_via_points()
+
+    def remove_via_point(self, name: int) -> None:
+        """Forgets a via-point.
+
+        Raises:
+            InputError: if there is none of that name.
+        """
+        self._check_name(name)
+        del self._via[name]
+        self._factor_via_points()
+
+    def _check_name(self, name: int) -> None:
+        if name not in self._via:
+            raise InputError(f"there is no via-point {name}: there are {sorted(self._via)}")
+
+    def _data(self, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> _Data:
+        point, mean = np.atleast_1d(np.asarray(input_, dtype=float)), np.asarray(mean, dtype=float)
+        if point.shape != (self.num_inputs,) or mean.shape != (self.num_outputs,):
+            raise InputError(
+                f"a via-point has input ({self.num_inputs},) and mean ({self.num_outputs},), not {point.shape} and "
+                f"{mean.shape}"
+            )
+        if not (np.isfinite(point).all() and np.isfinite(mean).all()):
+            raise InputError("a via-point must be finite")
+        return _Data(point, mean, _checked(np.asarray(covariance, dtype=float), "via-point", self.num_outputs))
+
+    def _queries(self, inputs: np.ndarray) -> np.ndarray:
+        queries = _rows(inputs)
+        if queries.shape[1] != self.num_inputs or not np.isfinite(queries).all():
+            raise InputError(f"inputs must be finite and of shape (n, {self.num_inputs}), not {np.shape(inputs)}")
+        return queries
+
+    def _factor_reference(self) -> None:
+        size = self._basis.size * self.num_outputs
+        prior = [np.sqrt(scale) * np.eye(size) for scale in (self._lambda, self._covariance_lambda)]
+        zero = np.zeros(size)
+        rows, targets = self._whitened(self._reference)
+        self._base = _append(prior[0], zero, rows, targets)
+        same = self._lambda == self._covariance_lambda
+        self._covariance_base = self._base if same else _append(prior[1], zero, rows, targets)
+        self._factor_via_points()
+
+    def _factor_via_points(self) -> None:
+        via = list(self._via.values())
+        if via and self._basis.extend(np.array([data.input for data in via])):
+            self._factor_reference()  # a via-point beyond the reference needs features that nothing had before
+            return
+        rows, targets = self._whitened(via)
+        triangle, right = _append(*self._base, rows, targets)
+        self._weights = solve_triangular(triangle, right, check_finite=False)
+        same = self._lambda == self._covariance_lambda
+        self._covariance_triangle = triangle if same else _append(*self._covariance_base, rows, targets)[0]
+
+    def _whitened(self, data: list[_Data]) -> tuple[np.ndarray, np.ndarray]:
+        """Rows Σ^(-1/2)(F ⊗ I) (n·O, r·O) and targets Σ^(-1/2) μ (n·O,)."""
+        if not data:
+            return np.zeros((0, self._basis.size * self.num_outputs)), np.zeros(0)
+        F = self._basis.features(np.array([point.input for point in data]))
+        whiten = np.linalg.inv(np.linalg.cholesky(np.array([point.covariance for point in data])))
+        rows = np.einsum("nk,noi->noki", F, whiten).reshape(len(data) * self.num_outputs, -1)
+        means = np.array([point.mean for point in data])
+        return rows, np.einsum("noi,ni->no", whiten, means).ravel()
+
+
+def _append(triangle: np.ndarray, right: np.ndarray, rows: np.ndarray, targets: np.ndarray):
+    """The triangle, and its right-hand side, of a least-squares problem with more rows."""
+    if not len(rows):
+        return triangle, right
+    both = np.linalg.qr(np.vstack([np.column_stack([triangle, right]), np.column_stack([rows, targets])]), mode="r")
+    size = triangle.shape[1]
+    return both[:size, :size], both[:size, size]
+
+
+def _rows(inputs: np.ndarray) -> np.ndarray:
+    inputs = np.asarray(inputs, dtype=float)
+    return inputs.reshape(-1, 1) if inputs.ndim < 2 else inputs
+
+
+def _checked(covariance: np.ndarray, what: str, outputs: int | None = None) -> np.ndarray:
+    shape = covariance.shape if outputs is None else (outputs, outputs)
+    if covariance.shape != shape or not np.isfinite(covariance).all():
+        raise InputError(f"the {what}'s covariance must be finite and of shape {shape}, not {covariance.shape}")
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"the {what}'s covariance is not positive definite") from error
+    return covariance

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import Demonstrations
+
+
+def wavy(lengths=(50, 80), outputs=2):
+    times = [np.linspace(0.1 * m, 2 + m, n) for m, n in enumerate(lengths)]
+    return Demonstrations(times, [np.column_stack([np.sin(t + o) for o in range(outputs)]) for t in times])
+
+
+@pytest.mark.parametrize("ending", ["npz", "csv"])
+def test_a_file_gives_back_exactly_what_was_saved(tmp_path, ending):
+    demonstrations = wavy()
+    demonstrations.save(tmp_path / f"d.{ending}")
+    loaded = Demonstrations.load(tmp_path / f"d.{ending}")
+    assert loaded.names == demonstrations.names
+    for a, b in zip(loaded.times + loaded.outputs, demonstrations.times + demonstrations.outputs, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_plain_arrays_load_too(tmp_path):
+    t = np.linspace(0, 1, 10)
+    np.savez(tmp_path / "d.npz", times=np.tile(t, (3, 1)), outputs=np.ones((3, 10, 2)))
+    loaded = Demonstrations.load(tmp_path / "d.npz")
+    assert loaded.num_demonstrations == 3
+    assert loaded.num_outputs == 2
+
+
+def test_resampling_puts_all_on_one_clock_and_keeps_their_shape():
+    resampled = wavy((50, 200)).resampled(100)
+    np.testing.assert_array_equal(resampled.times[0], resampled.times[1])
+    assert np.ptp(np.diff(resampled.times[0])) < 1e-12
+    assert resampled.times[0][-1] - resampled.times[0][0] == pytest.approx((2 + 2.9) / 2)
+    for before, after in zip(wavy((50, 200)).outputs, resampled.outputs, strict=True):
+        np.testing.assert_array_equal(after[[0, -1]], before[[0, -1]])
+        assert after.shape == (100, 2)
+
+
+def test_resampling_leaves_alone_what_is_on_one_clock():
+    t = np.linspace(0, 1, 20)
+    d = Demonstrations(t, np.random.default_rng(0).standard_normal((3, 20, 1)))
+    assert d.resampled() is d
+
+
+def test_a_sample_logged_twice_counts_once():
+    d = Demonstrations([[0.0, 0.1, 0.1, 0.2]], [[[1.0], [2.0], [2.0], [3.0]]])
+    np.testing.assert_array_equal(d.times[0], [0, 0.1, 0.2])
+
+
+@pytest.mark.parametrize(
+    ("times", "outputs", "names"),
+    [
+        ([], [], "at least one"),
+        ([[0.0]], [[[1.0]]], "1 point"),
+        ([[0.0, 1.0]], [[[1.0], [np.nan]]], "NaN"),
+        ([[0.0, np.inf]], [[[1.0], [2.0]]], "infinity"),
+        ([[0.0, 0.0]], [[[1.0], [2.0]]], "does not increase at sample 1"),
+        ([[0.0, 2.0, 1.0]], [[[1.0], [2.0], [3.0]]], "does not increase at sample 2"),
+        ([[0.0, 1.0], [0.0, 1.0]], [[[1.0], [2.0]], [[1.0, 1.0], [2.0, 2.0]]], "2 outputs, the first has 1"),
+        ([[0.0, 1.0]], [[1.0, 2.0]], "shapes"),
+        ([[0.0, 1.0, 2.0]], [[[1.0], [2.0]]], "shapes"),
+        ([[0.0, 1.0]], [[["a"], ["b"]]], "not an array of numbers"),
+    ],
+)
+def test_refuses(times, outputs, names):
+    with pytest.raises(InputError, match=names):
+        Demonstrations(times, outputs)
+
+
+def test_refuses_damaged_and_dangerous_files(tmp_path):
+    with pytest.raises(InputError, match="no demonstration file"):
+        Demonstrations.load(tmp_path / "missing.npz")
+    good = tmp_path / "good.npz"
+    wavy().save(good)
+    truncated = tmp_path / "truncated.npz"
+    truncated.write_bytes(good.read_bytes()[:200])
+    with pytest.raises(InputError, match="damaged"):
+        Demonstrations.load(truncated)
+    pickled = tmp_path / "pickled.npz"
+    np.savez(pickled, times=np.array([0.0, 1.0]), outputs=np.array([[[object()]] * 2], dtype=object))
+    with pytest.raises(InputError, match="damaged"):
+        Demonstrations.load(pickled)
+    lying = tmp_path / "lying.npz"
+    np.savez(lying, lengths=[5], times=np.arange(4.0), outputs=np.ones((4, 1)))
+    with pytest.raises(InputError, match="add up"):
+        Demonstrations.load(lying)
+    ragged = tmp_path / "ragged.csv"
+    ragged.write_text("demonstration,time,x\n0,0,1\n0,1\n")
+    with pytest.raises(InputError, match="line 3"):
+        Demonstrations.load(ragged)
+    (tmp_path / "d.txt").write_text("")
+    with pytest.raises(InputError, match="ending"):
+        Demonstrations.load(tmp_path / "d.txt")

@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
+from guiderail.models.primitives.gains import authority, authority_gains, exploration_rms, rms_gains
+
+
+@pytest.fixture(scope="module", params=[0, 5])
+def primitive(request):
+    t = np.linspace(0, 3, 150)
+    width = np.column_stack([0.01 + 0.1 * np.sin(t), 1e-3 * np.ones_like(t)])
+    mix = np.array([[1, 0.3], [0.3, 1]])
+    reference = ReferenceTrajectory(t, np.column_stack([t, t]), np.einsum("ni,ij,nj->nij", width, mix, width))
+    return LcNsKmp(reference, history=request.param, history_variance=1e-6, horizon=20)
+
+
+def rollout(primitive, actions):
+    """The closed loop as a robot would run it, step by step."""
+    past = np.tile(primitive.reference.means[0], (primitive.history, 1))
+    out = []
+    for n, action in enumerate(actions):
+        out.append(primitive.predict(n, action, past if primitive.history else None).output)
+        past = np.vstack([past, out[-1]])[1:] if primitive.history else past
+    return np.array(out)
+
+
+def deviation_rms(primitive, actions):
+    moved = rollout(primitive, actions) - rollout(primitive, np.zeros_like(actions))
+    return np.sqrt((moved**2).mean(axis=0)) / np.sqrt((primitive.reference.standard_deviations**2).mean(axis=0))
+
+
+def test_constant_actions_end_up_where_authority_says(primitive):
+    gains = authority_gains(primitive, kappa=1.5)
+    np.testing.assert_allclose(authority(primitive, gains), np.sqrt(3) * 1.5)
+    for o in range(2):
+        reached = deviation_rms(primitive, np.tile(gains * np.eye(2)[o], (150, 1)))[o]
+        assert reached == pytest.approx(np.sqrt(3) * 1.5, rel=1e-6)
+
+
+@pytest.mark.parametrize("hold", [1, 5])
+def test_white_actions_stir_up_what_rms_says(primitive, hold):
+    gains = rms_gains(primitive, kappa=1.0, hold=hold)
+    np.testing.assert_allclose(exploration_rms(primitive, gains, hold), 1.0)
+    rng = np.random.default_rng(0)
+    samples = [
+        deviation_rms(primitive, gains * np.repeat(rng.uniform(-1, 1, (150 // hold, 2)), hold, axis=0))
+        for _ in range(40)
+    ]
+    np.testing.assert_allclose(np.sqrt(np.mean(np.square(samples), axis=0)), 1.0, rtol=0.15)
+
+
+def test_only_named_outputs_are_explored(primitive):
+    for gains in (authority_gains(primitive, outputs=[1]), rms_gains(primitive, outputs=[1])):
+        assert gains[0] == 0
+        assert gains[1] > 0
+
+
+def test_refuses(primitive):
+    with pytest.raises(InputError, match="kappa"):
+        authority_gains(primitive, kappa=0)
+    with pytest.raises(InputError, match="explored"):
+        rms_gains(primitive, outputs=[2])
+    with pytest.raises(InputError, match="hold"):
+        rms_gains(primitive, hold=0)
+    deaf = LcNsKmp(primitive.reference, beta=0.0, lambda_=12.0, horizon=20)
+    with pytest.raises(InputError, match="beta"):
+        authority_gains(deaf)

@@ -1,0 +1,340 @@
+"""The primitive against problem 4.5 itself, and against what its callers may do to it."""
+
+from pathlib import Path
+
+import numpy as np
+import piqp
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import (
+    LcNsKmp,
+    LinearConstraints,
+    Matern52,
+    ReferenceTrajectory,
+    SquaredExponential,
+    pose_demonstrations,
+)
+from oracles.dense import Extended
+from oracles.problems import Problem, random_problem
+
+REAL_DATA = Path(__file__).parents[4] / "shared" / "data" / "dlr_sara_ring_loading.npz"
+
+
+def scale_of(problem):
+    return np.abs(problem.primitive.reference.means).max(axis=0)
+
+
+def relative_error(problem, prediction, dense) -> float:
+    """Largest difference of the window to the textbook's at the same multipliers, in scales of the outputs."""
+    G, _ = problem.constraints()
+    expected = dense.corrected(G, prediction.multipliers)
+    return float((np.abs(prediction.trajectory - expected) / scale_of(problem)).max())
+
+
+def kkt_residual(problem, prediction) -> float:
+    """Largest violation, negative multiplier, or product of a multiplier (in shares of the largest) and its slack."""
+    G, c = problem.constraints()
+    if not c.size:
+        return 0.0
+    alpha = prediction.multipliers
+    slack = np.einsum("nfo,no->nf", G, prediction.trajectory) - c
+    largest = max(float(alpha.max()), 1e-300)
+    return max(float((-slack).max()), float((-alpha).max()) / largest, float((alpha * slack).max()) / largest)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_solves_problem_4_5(seed):
+    problem = random_problem(seed)
+    prediction = problem.solve()
+    assert relative_error(problem, prediction, problem.dense()) < 1e-8
+    assert kkt_residual(problem, prediction) < 1e-8
+    np.testing.assert_allclose(prediction.output, prediction.trajectory[0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_stays_accurate_where_a_dense_cholesky_does_not(seed):
+    problem = random_problem(seed, history_variance=1e-8, history_noise=1e-3)
+    prediction = problem.solve()
+    dense = problem.dense()
+    error = relative_error(problem, prediction, dense)
+    assert error < 1e-5
+    assert kkt_residual(problem, prediction) < 1e-8
+    G, _ = problem.constraints()
+    in_doubles = problem.dense(np.float64).corrected(G, prediction.multipliers)
+    exact = dense.corrected(G, prediction.multipliers)
+    assert error <= max(float((np.abs(in_doubles - exact) / scale_of(problem)).max()), 1e-12)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_agrees_with_a_generic_qp_solver_over_kernel_weights(seed):
+    """Problem 4.5 as it stands, over weights that the kernel represents, by an interior-point method.
+
+    With a short length scale the kernel matrix is regular, so that a solver in double precision is good to 1e-8 too.
+    """
+    problem = random_problem(seed, history_variance=1e-2, inverse_length=1500.0)
+    p, P, num_outputs = problem.primitive, problem.primitive.history, problem.primitive.num_outputs
+    n, H = problem.step, p.horizon
+    t = p.reference.inputs(np.arange(n - P, n + H + 1))
+    held = np.minimum(np.arange(n, n + H + 1), p.num_steps - 1)
+    scale = scale_of(problem)
+    means = p.reference.means[held] / scale
+    weights = np.linalg.inv(p.reference.covariances[held] / (scale[:, None] * scale))
+    if P:
+        means = np.vstack([problem.history / scale, means])
+        weights = np.concatenate([np.tile(np.diag(scale**2) / p.history_variance, (P, 1, 1)), weights])
+    Phi = np.kron(np.linalg.cholesky(p.kernel(t, t)), np.eye(num_outputs))
+    blocks = np.zeros((len(t) * num_outputs, len(t) * num_outputs))
+    for i, block in enumerate(weights):
+        blocks[i * num_outputs : (i + 1) * num_outputs, i * num_outputs : (i + 1) * num_outputs] = block
+    executed = Phi[P * num_outputs : (P + 1) * num_outputs]
+    # λ/2 ‖w‖² and β/2 ‖w − φ ξ̂‖² are in the outputs' own units: scaling an output by s puts s² in front of them.
+    quadratic = Phi.T @ blocks @ Phi + (p.lambda_ + p.beta) * np.diag(np.tile(scale**2, len(t)))
+    linear = -(Phi.T @ blocks @ means.ravel() + p.beta * executed.T @ (problem.action * scale))
+    G, c = problem.constraints()
+    rows = np.einsum("nfo,nox->nfx", G * scale, Phi[P * num_outputs :].reshape(H + 1, num_outputs, -1)).reshape(
+        -1, Phi.shape[1]
+    )
+    # Around the unconstrained minimum, in units of the Hessian: what is left for the solver is well scaled.
+    free = np.linalg.solve(quadratic, -linear)
+    unit = np.linalg.inv(np.linalg.cholesky(quadratic)).T
+    rows, bounds = rows @ unit, c.ravel() - rows @ free
+    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
+    solver = piqp.DenseSolver()
+    solver.settings.verbose = False
+    solver.settings.eps_abs = solver.settings.eps_rel = 1e-13
+    solver.settings.eps_duality_gap_abs = solver.settings.eps_duality_gap_rel = 1e-13
+    n = len(free)
+    solver.setup(np.eye(n), np.zeros(n), None, None, rows / size[:, None], bounds / size, None, None, None)
+    assert solver.solve().name == "PIQP_SOLVED"
+    expected = (Phi[P * num_outputs :] @ (free + unit @ solver.result.x)).reshape(H + 1, num_outputs)
+    np.testing.assert_allclose(problem.solve().trajectory / scale, expected, rtol=0, atol=1e-8)
+
+
+def real_problem(history, seed) -> Problem:
+    """Loading a bearing ring, four kinesthetic demonstrations of a robot arm; ±1 cm around the mean as constraint."""
+    with np.load(REAL_DATA) as file:
+        demonstrations = pose_demonstrations(
+            list(file["time"]), list(file["position"]), list(file["quaternion_wxyz"]), orientation="rotation_vector"
+        )
+    reference = ReferenceTrajectory.from_demonstrations(demonstrations, components=10, num_steps=200)
+    inside = reference.means.mean(axis=0)
+    rng = np.random.default_rng(seed)
+    primitive = LcNsKmp(
+        reference,
+        kernel=SquaredExponential(20.0),
+        history=history,
+        history_variance=1e-6,
+        constraints=LinearConstraints(np.eye(6)[:3], inside[:3] - 0.02),
+    )
+    step = int(rng.integers(0, 200))
+    past = None
+    if history:
+        past = reference.means[np.maximum(np.arange(step - history, step), 0)]
+        past = past + 1e-4 * rng.standard_normal(past.shape)
+    return Problem(primitive, step, rng.standard_normal(6) * 100, past, 20.0)
+
+
+@pytest.mark.skipif(not REAL_DATA.exists(), reason="the recordings are not part of the repository")
+@pytest.mark.parametrize("history", [0, 10])
+@pytest.mark.parametrize("seed", range(4))
+def test_solves_problem_4_5_on_real_demonstrations(history, seed):
+    problem = real_problem(history, seed)
+    prediction = problem.solve()
+    assert relative_error(problem, prediction, problem.dense()) < 1e-8
+    assert kkt_residual(problem, prediction) < 1e-8
+
+
+@pytest.mark.parametrize("solver", ["piqp", "osqp"])
+@pytest.mark.parametrize("seed", range(6))
+def test_solvers_agree(solver, seed):
+    problem = random_problem(seed)
+    other = LcNsKmp(**{**arguments_of(problem.primitive), "solver": solver})
+    difference = other.predict(problem.step, problem.action, problem.history).trajectory - problem.solve().trajectory
+    np.testing.assert_allclose(difference / scale_of(problem), 0, atol=1e-6)
+
+
+def arguments_of(p: LcNsKmp) -> dict:
+    names = (
+        "reference",
+        "kernel",
+        "lambda_",
+        "beta",
+        "horizon",
+        "history",
+        "history_variance",
+        "constraints",
+        "solver",
+    )
+    return {name: getattr(p, name) for name in names}
+
+
+def test_family_with_parts_switched_off():
+    """KMP (2.17), NS-KMP (4.4) and LC-KMP (4.2) are the same prediction without the parts they don't have."""
+    problem = random_problem(3)
+    p, n = problem.primitive, problem.step
+    arguments = {**arguments_of(p), "history": 0, "constraints": None, "lambda_": p.lambda_ + p.beta, "beta": 0.0}
+    t = p.reference.inputs(np.arange(n, n + p.horizon + 1)).astype(Extended)
+    held = np.minimum(np.arange(n, n + p.horizon + 1), p.num_steps - 1)
+    K = np.kron(p.kernel(t, t), np.eye(p.num_outputs))
+    sigma = np.zeros(K.shape)
+    for i, block in enumerate(p.reference.covariances[held]):
+        at = slice(i * p.num_outputs, (i + 1) * p.num_outputs)
+        sigma[at, at] = block
+    A = np.linalg.inv((K + (p.lambda_ + p.beta) * sigma).astype(float))
+    kmp = (K[: p.num_outputs] @ A @ p.reference.means[held].ravel()).astype(float)
+    np.testing.assert_allclose(LcNsKmp(**arguments).predict(n).output, kmp, rtol=0, atol=1e-7)
+    # Without a pull the action has no effect; with one it moves the output by the soft null-space projector.
+    np.testing.assert_array_equal(
+        LcNsKmp(**arguments).predict(n, problem.action).output, LcNsKmp(**arguments).predict(n).output
+    )
+    pulled = LcNsKmp(**{**arguments_of(p), "history": 0, "constraints": None})
+    moved = pulled.predict(n, problem.action).output - pulled.predict(n).output
+    e = slice(0, p.num_outputs)
+    projector = p.beta / (p.lambda_ + p.beta) * (np.eye(p.num_outputs) - (K[e] @ A @ K[:, e]).astype(float))
+    np.testing.assert_allclose(moved, projector @ problem.action, rtol=1e-4, atol=1e-9)
+
+
+def small(**changes) -> dict:
+    """A plain primitive: two outputs, twenty steps, x ≤ 0.5."""
+    t = np.linspace(0, 1, 20)
+    means = np.column_stack([t, np.sin(t)])
+    covariances = np.tile(0.01 * np.eye(2), (20, 1, 1))
+    reference = ReferenceTrajectory(t, means, covariances)
+    return {
+        "reference": reference,
+        "horizon": 8,
+        "constraints": LinearConstraints.box([-np.inf, -np.inf], [0.5, np.inf]),
+        **changes,
+    }
+
+
+def test_constraints_hold_from_the_next_step_on_even_where_the_history_violates_them():
+    p = LcNsKmp(**small(history=3))
+    pushed_out = np.tile([0.8, 0.2], (3, 1))
+    prediction = p.predict(8, np.zeros(2), pushed_out)
+    assert prediction.constrained
+    assert p.constraints.violation(prediction.output) <= 1e-9
+    assert (prediction.trajectory[:, 0] <= 0.5 + 1e-9).all()
+
+
+@pytest.mark.parametrize("history", [0, 1, 10])
+@pytest.mark.parametrize("period", [0.02, 0.001])
+@pytest.mark.parametrize("history_variance", [1e-4, 1e-10])
+def test_bound_holds_under_hostile_actions(history, period, history_variance):
+    """Closed loop, actions far beyond any sensible gain, in one direction, alternating, and random."""
+    t = period * np.arange(60)
+    covariances = np.tile(np.diag([1e-6, 1e-2]), (60, 1, 1))
+    reference = ReferenceTrajectory(t, np.column_stack([t, np.sin(t)]), covariances)
+    p = LcNsKmp(
+        reference,
+        history=history,
+        history_variance=history_variance,
+        constraints=LinearConstraints.box([-0.002, -0.1], [t[-1] / 2, 0.1]),
+    )
+    rng = np.random.default_rng(0)
+    for kind in range(3):
+        past = np.zeros((history, 2)) if history else None
+        for n in range(60):
+            sign = (1, (-1) ** n, rng.choice([-1, 1]))[kind]
+            output = p.predict(n, sign * 1e6 * np.ones(2), past).output
+            assert p.constraints.violation(output) <= 1e-9
+            if history:
+                past = np.vstack([past[1:], output])
+
+
+def test_constraints_that_change_with_the_step_bind_where_they_apply():
+    t = np.linspace(0, 1, 20)
+    upper = np.where(t[:, None] < 0.5, np.inf, 0.3) * np.ones(2)
+    upper[t < 0.5] = 10.0
+    p = LcNsKmp(**small(constraints=LinearConstraints.box(np.full((20, 2), -10.0), upper)))
+    assert p.predict(2).output[0] < 0.2
+    assert p.predict(15).output[0] <= 0.3 + 1e-9
+    assert p.constraints.violation(np.array([0.4, 0.0]), 2) < 0 < p.constraints.violation(np.array([0.4, 0.0]), 15)
+
+
+def test_holds_the_last_mean_at_the_end():
+    p = LcNsKmp(**small(constraints=None))
+    np.testing.assert_array_equal(p.predict(19).output, p.predict(10_000).output)
+    np.testing.assert_allclose(p.predict(19).output, p.reference.means[-1], atol=0.06)
+
+
+def test_passes_through_its_history():
+    """With ρ → 0 the window continues the history: the first point is nearer to it than the mean is."""
+    p = LcNsKmp(**small(history=5, history_variance=1e-8, constraints=None))
+    beside = p.reference.means[5:10] + np.array([0.05, 0])
+    output = p.predict(10, np.zeros(2), beside).output
+    assert abs(output[0] - (p.reference.means[10, 0] + 0.05)) < 0.005
+
+
+def test_any_kernel_and_an_uneven_clock():
+    t = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.1, 30))
+    reference = ReferenceTrajectory(t, np.column_stack([np.sin(t)]), np.full((30, 1, 1), 1e-4))
+    p = LcNsKmp(reference, kernel=Matern52(0.3), horizon=10)
+    outputs = np.array([p.predict(n).output[0] for n in range(30)])
+    np.testing.assert_allclose(outputs, np.sin(t), atol=0.05)
+
+
+def test_driven_by_inputs_of_its_own():
+    """The direct path says what the clock's says, and takes inputs of any dimension."""
+    p = LcNsKmp(**small(history=2))
+    steps, past = np.arange(8, 17), p.reference.means[6:8]
+    args = p.reference.means[steps], p.reference.covariances[steps], np.ones(2) * 5, past
+    direct = p.predict_at(p.reference.times[steps], *args, p.reference.times[6:8])
+    clocked = p.predict(8, np.ones(2) * 5, past)
+    assert clocked.constrained
+    np.testing.assert_allclose(direct.trajectory, clocked.trajectory, rtol=0, atol=1e-10)
+    states = np.column_stack([np.cos(p.reference.times), np.sin(p.reference.times)])
+    output = p.predict_at(states[steps], *args, states[6:8]).output
+    assert p.constraints.violation(output) <= 1e-9
+    with pytest.raises(InputError, match="history_inputs"):
+        p.predict_at(states[steps], *args, p.reference.times[6:8])
+    with pytest.raises(InputError, match="finite"):
+        p.predict_at(states[steps] * np.nan, *args, states[6:8])
+
+
+def test_memory_stays_within_its_limit():
+    p = LcNsKmp(**small(cache_bytes=20_000))
+    for n in list(range(20)) * 3:
+        p.predict(n)
+    assert p.cached_bytes <= 20_000
+    everything = LcNsKmp(**small())
+    assert everything.factor_all() == everything.cached_bytes > 20_000
+    expected = everything.predict(7).output
+    np.testing.assert_array_equal(p.predict(7).output, expected)
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"lambda_": -1.0}, "lambda_"),
+        ({"beta": np.nan}, "beta"),
+        ({"lambda_": 0.0, "beta": 0.0}, "regularization"),
+        ({"horizon": -1}, "horizon"),
+        ({"history": 2.5}, "history"),
+        ({"history": 2, "history_variance": 0.0}, "history_variance"),
+        ({"constraints": LinearConstraints(np.eye(3), np.zeros(3))}, "3 outputs"),
+        ({"constraints": LinearConstraints(np.zeros((7, 1, 2)), np.zeros((7, 1)))}, "7 steps"),
+        ({"solver": "magic"}, "magic"),
+    ],
+)
+def test_refuses_at_construction(changes, names):
+    with pytest.raises(InputError, match=names):
+        LcNsKmp(**small(**changes))
+
+
+@pytest.mark.parametrize(
+    ("step", "action", "history", "names"),
+    [
+        (-1, np.zeros(2), np.zeros((3, 2)), "step"),
+        (0, np.zeros(3), np.zeros((3, 2)), "null-space action"),
+        (0, np.array([np.nan, 0]), np.zeros((3, 2)), "finite"),
+        (0, np.array([np.inf, 0]), np.zeros((3, 2)), "finite"),
+        (0, np.zeros(2), np.zeros((2, 2)), "history"),
+        (0, np.zeros(2), None, "history"),
+        (0, np.zeros(2), np.full((3, 2), np.nan), "finite"),
+    ],
+)
+def test_refuses_at_prediction(step, action, history, names):
+    with pytest.raises(InputError, match=names):
+        LcNsKmp(**small(history=3)).predict(step, action, history)

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import pose_demonstrations, pose_outputs, pose_rotation
+
+
+def turning(total, n=60, axis=(0.0, 0.0, 1.0), flips=True):
+    """A turn about an axis, with quaternions whose sign flips as a driver's may."""
+    rotations = Rotation.from_rotvec(np.outer(np.linspace(0, total, n), axis))
+    quaternions = rotations.as_quat(scalar_first=True)
+    if flips:
+        quaternions[::7] *= -1
+    return np.column_stack([np.linspace(0, 1, n)] * 3), quaternions
+
+
+@pytest.mark.parametrize("orientation", ["euler_zyx", "rotation_vector"])
+@pytest.mark.parametrize("total", [np.pi / 2, 1.2 * np.pi, 3.5 * np.pi])
+def test_no_jumps_and_the_same_rotation(orientation, total):
+    positions, quaternions = turning(total)
+    outputs = pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0], orientation)
+    assert np.abs(np.diff(outputs[:, 3:], axis=0)).max() < 2 * total / 59
+    difference = pose_rotation(outputs[:, 3:], orientation).inv() * Rotation.from_quat(quaternions, scalar_first=True)
+    assert difference.magnitude().max() < 1e-9
+
+
+def test_target_frame():
+    """The target's own pose is zero; a point one unit ahead of the target is ahead in its frame."""
+    R_WT = Rotation.from_euler("z", 90, degrees=True)
+    q = R_WT.as_quat(scalar_first=True)
+    p_WT = np.array([1.0, 2.0, 3.0])
+    outputs = pose_outputs(np.array([p_WT, p_WT + [0, 1, 0]]), np.array([q, q]), p_WT, q)
+    np.testing.assert_allclose(outputs, [[0] * 6, [1, 0, 0, 0, 0, 0]], atol=1e-12)
+
+
+def test_demonstrations_share_a_branch():
+    """Two recordings of one motion near a half turn, one of which starts just beyond it."""
+    n = 40
+    position = np.zeros((n, 3))
+    first = Rotation.from_rotvec(np.outer(np.linspace(3.10, 2.0, n), [0, 0, 1])).as_quat(scalar_first=True)
+    second = Rotation.from_rotvec(np.outer(np.linspace(3.18, 2.0, n), [0, 0, 1])).as_quat(scalar_first=True)
+    for orientation, column in (("rotation_vector", 5), ("euler_zyx", 3)):
+        d = pose_demonstrations(
+            [np.arange(n)] * 2, [position] * 2, [first, second], np.zeros(3), [1, 0, 0, 0], orientation
+        )
+        assert abs(d.outputs[0][0, column] - d.outputs[1][0, column]) < 0.1
+
+
+def test_last_pose_is_the_target_unless_given():
+    positions, quaternions = turning(1.0)
+    d = pose_demonstrations([np.arange(60)], [positions], [quaternions])
+    np.testing.assert_allclose(d.outputs[0][-1], 0, atol=1e-12)
+
+
+def test_refuses():
+    positions, quaternions = turning(1.0)
+    with pytest.raises(InputError, match="singular"):
+        pose_outputs(*turning(np.pi / 2, axis=(0, 1, 0)), np.zeros(3), [1, 0, 0, 0])
+    with pytest.raises(InputError, match="length zero"):
+        pose_outputs(positions, 0 * quaternions, np.zeros(3), [1, 0, 0, 0])
+    with pytest.raises(InputError, match="choose"):
+        pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0], "quaternion")
+    with pytest.raises(InputError, match="positions"):
+        pose_outputs(positions[:, :2], quaternions, np.zeros(3), [1, 0, 0, 0])

@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+
+
+def hourglass(num=9, n=120, seed=0):
+    """Demonstrations that are wide, narrow in the middle, and wide again."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, 2, n)
+    width = 0.1 * np.abs(t - 1) + 0.005
+    return Demonstrations(t, [np.column_stack([np.sin(t) + rng.standard_normal() * width, t]) for _ in range(num)])
+
+
+@pytest.mark.parametrize("components", [8, None])
+def test_regression_recovers_mean_and_width(components):
+    d = hourglass(60)
+    reference = ReferenceTrajectory.from_demonstrations(d, components)
+    outputs = np.stack(d.outputs)
+    np.testing.assert_allclose(reference.means[:, 0], outputs[..., 0].mean(axis=0), atol=0.02)
+    wide, narrow = reference.standard_deviations[[10, 60], 0]
+    assert wide > 4 * narrow
+    assert wide == pytest.approx(outputs[:, 10, 0].std(), rel=0.3)
+
+
+def test_same_seed_same_reference():
+    a, b = (ReferenceTrajectory.from_demonstrations(hourglass(), 6, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(a.covariances, b.covariances)
+
+
+def test_demonstrations_that_coincide_and_one_alone():
+    """EM's own regularization keeps them regular; a floor is what a person would set."""
+    t = np.linspace(0, 1, 50)
+    same = Demonstrations(t, [np.column_stack([np.sin(t), np.zeros(50)])] * 3)
+    assert (ReferenceTrajectory.from_demonstrations(same, 5).standard_deviations > 0).all()
+    floored = ReferenceTrajectory.from_demonstrations(same, 5, floor=[0.01, 0.02])
+    assert (floored.standard_deviations >= [0.01, 0.02]).all()
+    assert ReferenceTrajectory.from_demonstrations(hourglass(1), 5).num_outputs == 2
+
+
+def test_clock_goes_on_beyond_its_ends():
+    reference = ReferenceTrajectory([0, 1, 3], np.zeros((3, 1)), np.ones((3, 1, 1)))
+    np.testing.assert_array_equal(reference.inputs(np.arange(-2, 5)), [-2, -1, 0, 1, 3, 5, 7])
+    assert not reference.uniform
+    assert ReferenceTrajectory(np.linspace(0, 7.98, 400), np.zeros((400, 1)), np.ones((400, 1, 1))).uniform
+
+
+@pytest.mark.parametrize(
+    ("times", "means", "covariances", "names"),
+    [
+        ([0.0], [[0.0]], [[[1.0]]], "at least two"),
+        ([0.0, 0.0], [[0.0]] * 2, [[[1.0]]] * 2, "increase"),
+        ([0.0, 1.0], [[0.0]] * 3, [[[1.0]]] * 2, "means"),
+        ([0.0, 1.0], [[0.0]] * 2, [[[1.0]]] * 3, "covariances"),
+        ([0.0, 1.0], [[0.0], [np.nan]], [[[1.0]]] * 2, "means must be finite"),
+        ([0.0, 1.0], [[0.0]] * 2, [[[1.0]], [[0.0]]], "step 1 is singular"),
+        ([0.0, 1.0], [[0.0]] * 2, [[[1.0]], [[-1.0]]], "step 1 is singular"),
+        ([0.0, 1.0], [[0.0, 0.0]] * 2, [[[1.0, 1.0], [1.0, 1.0]]] * 2, "singular"),
+        ([0.0, 1.0], [[0.0, 0.0]] * 2, [[[1.0, 0.5], [0.0, 1.0]]] * 2, "symmetric"),
+    ],
+)
+def test_refuses(times, means, covariances, names):
+    with pytest.raises(InputError, match=names):
+        ReferenceTrajectory(times, means, covariances)
+
+
+def test_refuses_senseless_mixtures():
+    with pytest.raises(InputError, match="components"):
+        ReferenceTrajectory.from_demonstrations(hourglass(), 0)
+    with pytest.raises(InputError, match="floor"):
+        ReferenceTrajectory.from_demonstrations(hourglass(), 5, floor=-1)

@@ -1,0 +1,77 @@
+"""Random and real problems for the primitive, each with everything that the textbook solution needs."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
+from oracles.dense import DenseWindow, Extended, squared_exponential
+
+
+@dataclass
+class Problem:
+    primitive: LcNsKmp
+    step: int
+    action: np.ndarray
+    history: np.ndarray | None
+    inverse_length: float
+
+    def solve(self):
+        return self.primitive.predict(self.step, self.action, self.history)
+
+    def dense(self, precision=Extended) -> DenseWindow:
+        p = self.primitive
+        n, P, H, N = self.step, p.history, p.horizon, p.num_steps
+        dt = p.reference.times[1] - p.reference.times[0]
+        held = np.minimum(np.arange(n, n + H + 1), N - 1)
+        inputs = p.reference.times[0] + dt * np.arange(n - P, n + H + 1)
+        means, covariances = p.reference.means[held], p.reference.covariances[held]
+        if P:
+            past = p.history_variance * np.broadcast_to(np.eye(p.num_outputs), (P, p.num_outputs, p.num_outputs))
+            means, covariances = np.vstack([self.history, means]), np.concatenate([past, covariances])
+        return DenseWindow(
+            squared_exponential, self.inverse_length, inputs, means, covariances, P, p.lambda_, p.beta, self.action,
+            precision,
+        )  # fmt: skip
+
+    def constraints(self):
+        return self.primitive.constraints.window(np.arange(self.step, self.step + self.primitive.horizon + 1))
+
+
+def random_problem(
+    seed: int, history_variance: float = 1e-4, history_noise: float = 1e-3, inverse_length: float | None = None
+) -> Problem:
+    """O = 1…6, F = 0…8, H = 5…60, P = 0…15, correlated covariances, horizons past the end, constraints that bite."""
+    rng = np.random.default_rng(seed)
+    outputs, rows, H, P = rng.integers(1, 7), rng.integers(0, 9), rng.integers(5, 61), rng.integers(0, 16)
+    N = 80
+    dt = 0.02
+    t = dt * np.arange(N)
+    scale = 10 ** rng.uniform(-2, 0, outputs)
+    phase = rng.uniform(0, 2 * np.pi, outputs)
+    means = scale * np.sin(rng.uniform(1, 4) * t[:, None] + phase)
+    mix = rng.standard_normal((outputs, outputs)) * 0.4 + np.eye(outputs)
+    width = scale * (0.05 + 0.3 * np.sin(np.pi * t[:, None] / t[-1]) ** 2)
+    covariances = np.einsum("ni,ij,kj,nk->nik", width, mix, mix, width)
+    # Constraints that the mean violates here and there, but that a point within a few deviations satisfies.
+    inside = means.mean(axis=0)
+    G = rng.standard_normal((rows, outputs)) / scale
+    c = G @ inside - rng.uniform(0.1, 0.8, rows)
+    inverse_length = rng.uniform(1, 6) if inverse_length is None else inverse_length
+    step = int(rng.integers(0, N))
+    primitive = LcNsKmp(
+        ReferenceTrajectory(t, means, covariances),
+        kernel=SquaredExponential(inverse_length),
+        lambda_=rng.uniform(1, 10),
+        beta=rng.uniform(1, 10),
+        horizon=int(H),
+        history=int(P),
+        history_variance=float(history_variance * scale.min() ** 2),
+        constraints=LinearConstraints(G, c),
+    )
+    history = None
+    if P:
+        past = np.clip(np.arange(step - P, step), 0, N - 1)
+        history = means[past] + history_noise * scale * rng.standard_normal((P, outputs))
+    action = rng.standard_normal(outputs) * 30 / scale * rng.choice([0.1, 1, 10])
+    return Problem(primitive, step, action, history, inverse_length)

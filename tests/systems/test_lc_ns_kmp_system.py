@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, VectorLogSink, ZeroOrderHold
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
+from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+
+PERIOD = 0.02
+
+
+def primitive(history=3, upper=0.5):
+    t = PERIOD * np.arange(50)
+    reference = ReferenceTrajectory(t, np.column_stack([t, np.sin(t)]), np.tile(0.01 * np.eye(2), (50, 1, 1)))
+    constraints = LinearConstraints.box([-np.inf, -np.inf], [upper, np.inf])
+    return LcNsKmp(reference, history=history, horizon=8, constraints=constraints)
+
+
+def names(system, kind):
+    count = getattr(system, f"num_{kind}_ports")()
+    return [getattr(system, f"get_{kind}_port")(i).get_name() for i in range(count)]
+
+
+def test_ports():
+    system = LcNsKmpSystem(primitive(), None, PERIOD)
+    assert names(system, "input") == ["null_space_action", "history"]
+    assert names(system, "output") == ["output", "constraint_violation", "fallback"]
+    assert system.get_history_input_port().size() == 6
+    assert system.get_output_output_port().size() == 2
+    without = LcNsKmpSystem(primitive(history=0), None, PERIOD)
+    assert names(without, "input") == ["null_space_action"]
+    with pytest.raises(InputError, match="history"):
+        without.get_history_input_port()
+
+
+def test_output_is_the_law_at_the_step_the_clock_says():
+    p = primitive()
+    gain = np.array([3.0, 5.0])
+    system = LcNsKmpSystem(p, gain, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    past = p.reference.means[2:5]
+    system.get_null_space_action_input_port().FixValue(context, [0.5, -1.0])
+    system.get_history_input_port().FixValue(context, past.ravel())
+    simulator.Initialize()
+    for step in (0, 7, 30):
+        simulator.AdvanceTo(PERIOD * (step + 0.5))
+        expected = p.predict(step, gain * [0.5, -1.0], past).output
+        np.testing.assert_array_equal(system.get_output_output_port().Eval(context), expected)
+        violation = system.get_constraint_violation_output_port().Eval(context)[0]
+        assert violation == pytest.approx(expected[0] - 0.5, abs=1e-12)
+
+
+def test_the_same_within_a_control_step_and_not_recomputed():
+    calls = []
+    p = primitive(history=0)
+    predict, p.predict = p.predict, lambda *a: calls.append(a[0]) or predict(*a)
+    system = LcNsKmpSystem(p, None, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    simulator.Initialize()
+    for k in range(1, 41):
+        simulator.AdvanceTo(k * PERIOD / 4 + 1e-6)
+        system.get_output_output_port().Eval(context)
+        system.get_fallback_output_port().Eval(context)
+    assert calls == list(range(11))
+
+
+def loop(history):
+    """KGRL or sKGRL as wired in every guidance diagram, with the command logged at each control instant."""
+    builder = DiagramBuilder()
+    p = primitive(history)
+    system = builder.AddSystem(LcNsKmpSystem(p, np.array([20.0, 20.0]), PERIOD))
+    hold = builder.AddSystem(ZeroOrderHold(PERIOD, 2))
+    builder.Connect(hold.get_output_port(), system.get_null_space_action_input_port())
+    builder.ExportInput(hold.get_input_port(), "action")
+    if history:
+        buffer = builder.AddSystem(HistoryBuffer(2, history, PERIOD))
+        start = builder.AddSystem(ConstantVectorSource(p.reference.means[0]))
+        builder.Connect(system.get_output_output_port(), buffer.get_output_input_port())
+        builder.Connect(start.get_output_port(), buffer.get_initial_output_input_port())
+        builder.Connect(buffer.get_history_output_port(), system.get_history_input_port())
+    builder.ExportOutput(system.get_output_output_port(), "desired_pose")
+    return builder.Build(), p
+
+
+@pytest.mark.parametrize("history", [0, 3])
+def test_closed_loop_is_the_recursion_of_algorithm_3(history):
+    diagram, p = loop(history)
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    action = diagram.GetInputPort("action").FixValue(context, np.zeros(2))
+    simulator.Initialize()
+    rng = np.random.default_rng(1)
+    past = np.tile(p.reference.means[0], (history, 1))
+    for n in range(50):
+        u = rng.uniform(-1, 1, 2)
+        action.GetMutableData().set_value(u)
+        simulator.AdvanceTo((n + 1) * PERIOD)
+        expected = p.predict(n, 20.0 * u, past if history else None).output
+        np.testing.assert_array_equal(diagram.GetOutputPort("desired_pose").Eval(context), expected)
+        assert expected[0] <= 0.5 + 1e-9
+        past = np.vstack([past, expected])[1:] if history else past
+
+
+def test_repeats_the_last_safe_command_where_there_is_no_solution_and_says_so():
+    p = primitive(history=0)
+    predict = p.predict
+
+    def failing(step, *arguments):
+        if step == 5:
+            raise UnsolvableError("no")
+        return predict(step, *arguments)
+
+    p.predict = failing
+    system = LcNsKmpSystem(p, None, PERIOD)
+    builder = DiagramBuilder()
+    builder.AddSystem(system)
+    zero = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
+    builder.Connect(zero.get_output_port(), system.get_null_space_action_input_port())
+    sinks = [builder.AddSystem(VectorLogSink(size, PERIOD)) for size in (2, 1)]
+    builder.Connect(system.get_output_output_port(), sinks[0].get_input_port())
+    builder.Connect(system.get_fallback_output_port(), sinks[1].get_input_port())
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    simulator.AdvanceTo(10 * PERIOD + 1e-6)
+    # A log at instant n sees the values just before it: command n − 1.
+    outputs, fallback = (sink.FindLog(simulator.get_context()).data()[:, 1:] for sink in sinks)
+    np.testing.assert_array_equal(np.flatnonzero(fallback[0]), [5])
+    np.testing.assert_array_equal(outputs[:, 5], outputs[:, 4])
+    assert (outputs[:, 6] != outputs[:, 4]).any()
+
+
+def test_first_fallback_is_within_the_constraints():
+    p = primitive(history=0, upper=-0.5)
+
+    def never(*arguments):
+        raise UnsolvableError("no")
+
+    p.predict = never
+    system = LcNsKmpSystem(p, None, PERIOD)
+    context = system.CreateDefaultContext()
+    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    assert system.get_output_output_port().Eval(context)[0] <= -0.5 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ("gain", "period", "words"), [(np.ones(3), 0.1, "gain"), ([np.nan, 1], 0.1, "gain"), (None, 0.0, "period")]
+)
+def test_refuses(gain, period, words):
+    with pytest.raises(InputError, match=words):
+        LcNsKmpSystem(primitive(), gain, period)
