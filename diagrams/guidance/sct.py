@@ -88,6 +88,7 @@ class SctGuidance(Diagram):
         - progress
         - commanded_violation
         - measured_violation
+        - held_action
 
     ``action`` is (n,) in [−1, 1], whoever gives it: a policy, or a person's device. It is held for a control period.
     """
@@ -146,6 +147,7 @@ class SctGuidance(Diagram):
             "measured_violation",
         ):
             builder.ExportOutput(self._filter.GetOutputPort(name), name)
+        builder.ExportOutput(hold.get_output_port(), "held_action")
         builder.BuildInto(self)
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:

@@ -127,6 +127,30 @@ class Cylinder(PositionConstraint):
         return np.array([*settled(wanted, direction, self.min_radius_m, self.max_radius_m), p_FE[2]])
 
 
+@register(ACTIVE_CONSTRAINTS, "sector")
+@dataclass(frozen=True)
+class Sector(PositionConstraint):
+    """The azimuth of p_FE about F's z axis is between min_deg and max_deg; radius and z are kept."""
+
+    frame: str
+    min_deg: float
+    max_deg: float
+
+    def __post_init__(self):
+        require(self.min_deg <= self.max_deg <= self.min_deg + 360, "angles must span 0 to 360 degrees.")
+
+    def project_position(self, p_FE):
+        least, most = math.radians(self.min_deg), math.radians(self.max_deg)
+        azimuth = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (least + most))
+        if least <= azimuth <= most:
+            return p_FE
+        # A rounding error inside, so that projecting is idempotent.
+        nudge = min(1e-12, 0.25 * (most - least))
+        azimuth = least + nudge if azimuth < least else most - nudge
+        radius = math.hypot(p_FE[0], p_FE[1])
+        return np.array([radius * math.cos(azimuth), radius * math.sin(azimuth), p_FE[2]])
+
+
 def settled(wanted: float, direction: np.ndarray, least: float, most: float) -> np.ndarray:
     """wanted · direction, a rounding error inside [least, most], so that projecting is idempotent."""
     nudge = min(1e-12, 0.25 * (most - least))

@@ -1,0 +1,65 @@
+"""Where some bodies of a plant are, as seen from another one."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+
+
+class RelativePoses(LeafSystem):
+    """The poses X_RB of bodies B in the frame of a reference body R.
+
+    .. pydrake_system::
+
+        name: RelativePoses
+        input_ports:
+        - body_poses
+        output_ports:
+        - relative_poses
+
+    ``body_poses`` is the plant's. ``relative_poses`` is (6·n,), for each body its position in metres and its
+    orientation as a rotation vector in radians, of at most π.
+    """
+
+    def __init__(self, plant: MultibodyPlant, bodies: Sequence[RigidBody], reference: RigidBody):
+        """
+        Args:
+            plant: finalized.
+            bodies: whose poses are asked for, at least one.
+            reference: from which they are seen.
+
+        Raises:
+            ValueError: if there is no body.
+        """
+        super().__init__()
+        if not bodies:
+            raise ValueError("relative poses need at least one body")
+        self._bodies = [int(body.index()) for body in bodies]
+        self._reference = int(reference.index())
+        self._poses_port = self.DeclareAbstractInputPort("body_poses", plant.get_body_poses_output_port().Allocate())
+        self._relative_poses_port = self.DeclareVectorOutputPort(
+            "relative_poses",
+            6 * len(self._bodies),
+            self._calc_relative_poses,
+            prerequisites_of_calc={self._poses_port.ticket()},
+        )
+
+    def get_body_poses_input_port(self) -> InputPort:
+        """The plant's body poses."""
+        return self._poses_port
+
+    def get_relative_poses_output_port(self) -> OutputPort:
+        """Position and rotation vector of each body, (6·n,)."""
+        return self._relative_poses_port
+
+    def _calc_relative_poses(self, context: Context, output: BasicVector) -> None:
+        poses = self._poses_port.Eval(context)
+        X_WR = poses[self._reference]
+        for i, body in enumerate(self._bodies):
+            X_RB = X_WR.InvertAndCompose(poses[body])
+            turn = X_RB.rotation().ToAngleAxis()
+            output.get_mutable_value()[6 * i : 6 * i + 6] = np.concatenate(
+                [X_RB.translation(), turn.angle() * turn.axis()]
+            )
