@@ -14,7 +14,8 @@ from guiderail.models.errors import InputError
 
 # Guidance in which an action of zero is the demonstration, so that step-0 success can be stated.
 DEMONSTRATED = ("kmp", "residual", "safe_residual", "kgrl", "skgrl")
-_DIAGNOSTIC = {"is_success", "termination", "constraint_violation", "measured_violation", "contact_force"}
+# What the safety ledger counts.
+COUNTS = ("collisions", "collision_steps", "saturations", "fallbacks")
 
 
 def known_tasks() -> list[str]:
@@ -59,7 +60,8 @@ def most_decisions(env: gymnasium.Env) -> int:
 class EpisodeRecord:
     """Takes in the decisions of one episode, and tells what it came to.
 
-    Everything it says comes from what the environment reports of every control step, not only of the last of a hold.
+    Everything it says comes from the safety ledger and the trace, which know every control step and not only the last
+    of a hold. (An episode in which the simulation failed has no ledger; then it is what was seen until there.)
     """
 
     def __init__(self, env: gymnasium.Env):
@@ -97,15 +99,13 @@ class EpisodeRecord:
             "success": int(self._last["is_success"]),
             "termination": self._last["termination"],
             "steps": len(trace),
-            "peak_force": float(force.max(initial=0.0)),
-            "mean_force": float(force.mean()) if len(force) else 0.0,
+            "peak_force": float(ledger.get("peak_force", force.max(initial=0.0))),
+            "mean_force": float(ledger.get("mean_force", force.mean() if len(force) else 0.0)),
             **jerk,
-            "worst_violation": float(self._violation),
-            "worst_measured_violation": float(self._measured),
-            "collisions": float(ledger.get("collisions", 0.0)),
-            "fallbacks": float(ledger.get("fallbacks", 0.0)),
+            "worst_violation": float(ledger.get("worst_commanded_violation", self._violation)),
+            "worst_measured_violation": float(ledger.get("worst_measured_violation", self._measured)),
+            **{name: int(ledger.get(name, 0)) for name in COUNTS},
             **{f"reward_{name}": value for name, value in self._terms.items()},
-            **{f"ledger_{name}": float(value) for name, value in ledger.items()},
         }
 
 
@@ -116,16 +116,33 @@ def split_jerk(poses: np.ndarray, period: float) -> dict[str, float]:
     return {"linear": mean_jerk(poses[:, :3], period), "angular": angular}
 
 
+def reset_held_out(env: gymnasium.Env, seed: int) -> np.ndarray:
+    """Starts an episode with conditions that training never drew; a task in which every episode is alike has none."""
+    options = {"held_out": True}
+    try:
+        return env.reset(seed=seed, options=options)[0]
+    except InputError as error:
+        if "held_out" not in str(error):
+            raise
+        return env.reset(seed=seed)[0]
+
+
 def run_episode(
     env: gymnasium.Env,
     act: Callable[[np.ndarray], np.ndarray],
     *,
-    seed: int | None = None,
-    options: dict[str, Any] | None = None,
+    held_out_seed: int | None = None,
     episode: int = 0,
 ) -> dict[str, Any]:
-    """Runs one episode and returns its row; the environment's trace is still that episode's afterwards."""
-    observation, _ = env.reset(seed=seed, options=options)
+    """Runs one episode and returns its row; the environment's trace is still that episode's afterwards.
+
+    Args:
+        env: the environment.
+        act: the policy.
+        held_out_seed: draws conditions that training never drew; without it, the next ones that training would draw.
+        episode: the row's number.
+    """
+    observation = env.reset()[0] if held_out_seed is None else reset_held_out(env, held_out_seed)
     record = EpisodeRecord(env)
     finished = False
     while not finished:

@@ -59,9 +59,6 @@ def held_out(config: RunConfig, policy: Policy | None, *, episodes: int, seed: i
     try:
         act = standing_still(env) if policy is None else policy
         env.reset(seed=config.seed)  # what is hidden and constant in the run is drawn as it was for training
-        return [
-            run_episode(env, act, seed=seed + index, options={"held_out": True}, episode=index)
-            for index in range(episodes)
-        ]
+        return [run_episode(env, act, held_out_seed=seed + index, episode=index) for index in range(episodes)]
     finally:
         env.close()

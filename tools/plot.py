@@ -24,8 +24,8 @@ def plot_run(run: Path) -> Path:
     guidance = config.environment.get("guidance", "")
     colour = COLOURS.get(guidance, "C0")
 
-    figure, axes = new_figure(2, 2, (9, 6))
-    success, returns, violation, force = axes.flat
+    figure, axes = new_figure(2, 3, (13, 6))
+    success, returns, terms, violation, force, jerk = axes.flat
     success.plot(episodes, rolling(column["success"]), color=colour)
     success.scatter(episodes, column["success"], s=6, color=colour, alpha=0.4)
     success.set(ylabel="success (mean of 10)", ylim=(-0.05, 1.05))
@@ -35,15 +35,24 @@ def plot_run(run: Path) -> Path:
         success.set_title(f"ten in a row succeed after episode {converged}", fontsize=9)
     returns.plot(episodes, column["return"], color=colour, alpha=0.3)
     returns.plot(episodes, rolling(column["return"]), color=colour)
-    returns.set(ylabel="return")
+    returns.set(ylabel="return (faint: each episode)")
+    for name, values in column.items():
+        if name.startswith("reward_"):
+            terms.plot(episodes, values, label=name.removeprefix("reward_").replace("_", " "))
+    terms.set(ylabel="terms of the return")
     violation.plot(episodes, column["worst_violation"], color=colour, label="commanded")
     violation.plot(episodes, column["worst_measured_violation"], color="0.5", linewidth=1, label="measured")
     violation.axhline(0, color="firebrick", linewidth=0.8)
-    violation.set(ylabel="worst constraint violation\n(negative is slack)", xlabel="episode")
-    violation.legend(frameon=False, fontsize=8)
+    violation.set(ylabel="worst constraint violation\n(negative is slack)")
     force.plot(episodes, column["peak_force"], color=colour, label="peak")
     force.plot(episodes, column["mean_force"], color="0.5", linewidth=1, label="mean")
-    force.set(ylabel="contact force [N]", xlabel="episode")
-    force.legend(frameon=False, fontsize=8)
+    force.set(ylabel="contact force [N]")
+    jerk.plot(episodes, column["jerk_commanded_linear"], color=colour, label="commanded")
+    jerk.plot(episodes, column["jerk_measured_linear"], color="0.5", linewidth=1, label="measured")
+    jerk.set(ylabel="mean jerk [m/s³]", yscale="log" if (column["jerk_commanded_linear"] > 0).all() else "linear")
+    for axis in (terms, violation, force, jerk):
+        axis.legend(frameon=False, fontsize=8)
+    for axis in axes[1]:
+        axis.set_xlabel("episode")
     figure.suptitle(f"{config.task} · {guidance} · {config.learner.algorithm.upper()} · seed {config.seed}")
     return save_figure(figure, folder.path / "learning_curve.png")

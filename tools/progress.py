@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+TOLERANCE = 1e-9  # what a primitive keeps its bounds to; below it there is only rounding
 WINDOW = 10  # episodes that success and return are averaged over
 
 
@@ -69,7 +70,7 @@ class TrainingProgress:
     def says(self) -> str:
         """Success and return of the last episodes, and the worst violation of all that were seen."""
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
-        worst = "none" if self._worst <= 0 else f"{self._worst:.1e}"
+        worst = "none" if self._worst <= TOLERANCE else f"{self._worst:.1e}"
         return f"success {success:.0%}  return {returns:.1f}  violation {worst}"
 
     def _left(self, now: float) -> str:

@@ -43,7 +43,7 @@ def record(run: Path, out: Path, *, episodes: int = 5, signal: str = "commanded"
     env.reset(seed=config.seed)
     times, outputs = [], []
     for index in range(4 * episodes):
-        row = run_episode(env, policy, seed=seed + index, options={"held_out": True})
+        row = run_episode(env, policy, held_out_seed=seed + index)
         trace = cast(Any, env.unwrapped).trace
         if row["success"]:
             outputs.append(getattr(trace, signal).copy())

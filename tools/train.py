@@ -95,7 +95,7 @@ def _resume(folder: RunFolder, learner: Learner, env: Any) -> list[dict[str, Any
     rows = folder.episodes()[: values["episodes"]]
     if len(rows) < values["episodes"]:
         raise InputError(
-            f"{folder.path / 'episodes.csv'} ends before the checkpoint, at episode {len(rows)}: restore it or start anew"
+            f"{folder.path / 'episodes.csv'} ends before the checkpoint: restore it, or start anew elsewhere"
         )
     try:
         learner.restore(arrays, values["learner"])

@@ -73,18 +73,20 @@ def run(
         config = configure(task, environment, settings=settings, **given)
     with TrainingProgress(config.episodes, name=config.task) as progress:
         rows = train(folder, config, resume=resume, report=report or progress.update)
-    finish(out)
-    return summarise(out, rows)
+    return summarise(out, rows) | finish(out)
 
 
-def finish(out: Path) -> None:
-    """Adds the pictures to a run that has its numbers. What cannot be drawn here, as without a display library, is
-    no reason to lose them."""
+def finish(out: Path) -> dict[str, str]:
+    """Adds the pictures to a run that has its numbers; what cannot be drawn on this machine is said, not raised."""
     from guiderail.tools.plot import plot_run
     from guiderail.tools.replay import write_replay
 
-    plot_run(out)
-    write_replay(out)
+    drawn = {"curve": str(plot_run(out))}
+    try:
+        drawn["replay"] = str(write_replay(out))
+    except InputError as error:
+        drawn["replay"] = f"none: {error}"
+    return drawn
 
 
 def summarise(out: Path, rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -1,0 +1,27 @@
+"""Figure 4.7: KGRL learns from rendered images."""
+
+from pathlib import Path
+from typing import Any
+
+from guiderail.tools.figures import passage
+from guiderail.tools.figures.baselines import _learned
+from guiderail.tools.pictures import new_figure, save_figure
+from guiderail.tools.study import write_table
+
+
+def figure_4_7(out: Path, seeds: int = 3, episodes: int = 30) -> dict[str, Any]:
+    """Return, obstacle cost and success over 30 episodes, where all that the policy sees is a picture."""
+    results = passage.train_all(out, ("kgrl",), seeds=seeds, episodes=episodes, observation="image")
+    figure, (axes,) = new_figure(1, 3, (13, 3.8))
+    for axis, (column, label) in zip(
+        axes, (("return", "return"), ("reward_obstacle_cost", "obstacle cost"), ("success", "success")), strict=True
+    ):
+        passage.draw_learning(axis, results, ("kgrl",), column, label)
+    rows = [_learned(result) for result in results]
+    return {
+        "picture": str(save_figure(figure, out / "figure_4_7.png")),
+        "table": str(write_table(out / "figure_4_7", rows)),
+        "success of each seed": ", ".join(f"{row['success']:.0%}" for row in rows),
+        "obstacle avoided from episode": ", ".join(str(row["avoids_obstacle_from"] or "never") for row in rows),
+        "condition": f"an action lasts {passage.HOLD} control steps; pixels are averaged five by five",
+    }

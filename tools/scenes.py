@@ -1,0 +1,59 @@
+"""What belongs into a picture of a task besides the robot: demonstrations, constraints, and where to look from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Scene:
+    """How a task is drawn.
+
+    Attributes:
+        to_world: takes poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
+        demonstrations: poses (N, O) of each demonstration.
+        constraint: corner points (k, 3) of each line that bounds what is allowed.
+        camera: where to look from, and where to look at, in the world [m].
+        line_radius: how thick a path is drawn [m].
+    """
+
+    to_world: Callable[[np.ndarray], np.ndarray]
+    demonstrations: tuple[np.ndarray, ...] = ()
+    constraint: tuple[np.ndarray, ...] = ()
+    camera: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    line_radius: float = 0.0015
+
+
+def scene(task: str) -> Scene:
+    """The scene of a task; of one that is not known here, the measured positions as they are."""
+    return SCENES.get(task, _plain)()
+
+
+def _plain() -> Scene:
+    return Scene(to_world=_in_plane)
+
+
+def _in_plane(poses: np.ndarray) -> np.ndarray:
+    """(x, y) at height zero, or the position of a pose of six numbers."""
+    poses = np.asarray(poses)
+    if poses.shape[1] >= 3:
+        return poses[:, :3]
+    return np.column_stack([poses, np.zeros(len(poses))])
+
+
+def _narrow_passage() -> Scene:
+    from guiderail.models.demonstrations import narrow_passage
+    from guiderail.models.objects.narrow_passage import NarrowPassage
+
+    world = NarrowPassage()
+    edge = np.array([[world.zone_x, -0.1, 0.0], [world.zone_x, 1.1, 0.0]])
+    return Scene(
+        to_world=_in_plane,
+        demonstrations=tuple(narrow_passage.load().outputs),
+        constraint=(edge,),
+        camera=((0.4, 0.3, 0.85), (0.4, 0.48, 0.0)),
+    )
+
+
+SCENES: dict[str, Callable[[], Scene]] = {"NarrowPassage": _narrow_passage}
