@@ -7,6 +7,7 @@ imports Drake before an environment is made.
 import gymnasium
 
 TASKS = {
+    "BncConnector": "guiderail.diagrams.tasks.bnc_connector:make_env",
     "NarrowPassage": "guiderail.diagrams.tasks.narrow_passage:make_env",
 }
 

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from guiderail.diagrams.stations.station import POSE_SIZE, Station
-from guiderail.diagrams.task import exact_period
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE, Station
 from guiderail.systems.recorder import Recorder, Recording
 
-CONTROL_PERIOD = exact_period(0.02)
 SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_force": 1, "saturation": 1}
 
 
 class DrivenStation:
-    """A station whose commands come from anything with a (6,) output, held for a control period and recorded."""
+    """A station whose commands come from anything with a (6,) output, are held for a control period, and recorded."""
 
-    def __init__(self, station: Station, source, num_samples: int, add_to_builder=None):
+    def __init__(
+        self,
+        station: Station,
+        source: System,
+        num_samples: int,
+        add_to_builder: Callable[[DiagramBuilder, Station], None] | None = None,
+    ):
         """
         Args:
             station: what is driven; it becomes part of this diagram.

@@ -81,7 +81,9 @@ class WrenchSensor(LeafSystem):
         poses = plant.get_body_poses_output_port()
         self._poses = self.DeclareAbstractInputPort("body_poses", poses.Allocate())
         self._velocities = self.DeclareAbstractInputPort("body_spatial_velocities", Value([SpatialVelocity()]))
-        self._accelerations = self.DeclareAbstractInputPort("body_spatial_accelerations", Value([SpatialAcceleration()]))
+        self._accelerations = self.DeclareAbstractInputPort(
+            "body_spatial_accelerations", Value([SpatialAcceleration()])
+        )
         self._state = self.DeclareDiscreteState(6)
         self._wrench = self.DeclareStateOutputPort("wrench", self._state)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
@@ -124,4 +126,4 @@ class WrenchSensor(LeafSystem):
             R_PW @ self._gravity_W,
         )
         R_AxesP = (self._R_AxesW @ R_PW.inverse()).matrix()
-        return np.concatenate([R_AxesP @ torque_force_P[3:], R_AxesP @ torque_force_P[:3]])
+        return (torque_force_P.reshape(2, 3)[::-1] @ R_AxesP.T).ravel()

@@ -49,9 +49,10 @@ def record(seeds: range) -> dict[str, np.ndarray]:
         "times": successes[0][1].times,
         "outputs": stacked("desired_pose"),
         "names": np.array(NAMES),
-        "measured": stacked("pose"),
-        "wrench": stacked("wrench"),
-        "contact_force": stacked("contact_force")[..., 0],
+        # What was measured is kept to single precision: a nanometre.
+        "measured": stacked("pose").astype(np.float32),
+        "wrench": stacked("wrench").astype(np.float32),
+        "contact_force": stacked("contact_force")[..., 0].astype(np.float32),
         "seeds": np.array([seed for seed, _ in successes]),
         "stiffness": np.array(Impedance().stiffness),
         "frame": np.array("T: the locked plug on the nominal jack; [x y z Rz Ry Rx], R = Rz Ry Rx"),

@@ -11,10 +11,16 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from guiderail.diagrams.stations.station import Impedance, Station, add_contact_plant
+from guiderail.diagrams.stations.station import (
+    PLANT_PERIOD,
+    Impedance,
+    Station,
+    add_contact_plant,
+    export_simulation_ports,
+)
 from guiderail.diagrams.stations.workcell import Workcell
-from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.models.robots.iiwa import CONNECTOR_TOOL_URDF, IIWA_URDF, NUM_JOINTS, READY_POSTURE
+from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.models.robots.pose import pose_to_transform
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
@@ -22,7 +28,7 @@ from guiderail.systems.wrench_sensor import WrenchSensor
 
 # The tool is bolted on turned by this much, so that a quarter turn lies symmetric about joint 7's middle.
 TOOL_TURN = 0.75 * np.pi  # [rad]
-# The arm's joints are torque-controlled: feedback of the measured joint torque makes the rotors appear this much lighter
+# The arm's joints are torque-controlled: feedback of the joint torque makes the rotors appear this much lighter
 # (Albu-Schäffer, Ott, Hirzinger 2007). Without it a Cartesian impedance would lag far behind its command.
 APPARENT_ROTOR_INERTIA = 0.1
 
@@ -89,7 +95,7 @@ class ArmStation(Station):
         self,
         workcell: Workcell,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
-        time_step: float = 0.005,
+        time_step: float = PLANT_PERIOD,
         wrench_time_constant: float = 0.01,
     ):
         """
@@ -143,6 +149,7 @@ class ArmStation(Station):
         builder.ExportOutput(sensor.get_wrench_output_port(), "wrench")
         builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
         builder.ExportOutput(controller.get_saturation_output_port(), "saturation")
+        export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 
     def solve(self, pose: np.ndarray, guess: np.ndarray) -> np.ndarray:

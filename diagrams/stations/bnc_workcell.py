@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
@@ -20,6 +20,9 @@ FILTERED_PAIRS = [
     (("barrel", "pad"), ("slots",)),
     (("lug_0", "lug_1", "barrel"), ("seat",)),
 ]
+
+LOCKED_HEIGHT = 0.6e-3  # [m]
+LOCKED_ANGLE = np.deg2rad(4.0)
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,15 @@ class BncWorkcell:
         """Where the plug is as seen from where it locks, offsets included: the identity when it is locked."""
         X_JPlug = plant.GetFrameByName("plug").CalcPose(plant_context, plant.GetFrameByName("jack"))
         return self.X_JT.inverse() @ X_JPlug
+
+    @staticmethod
+    def is_locked(X_LockedPlug: RigidTransform) -> bool:
+        """Whether a plug seen from where it locks is locked: within 0.6 mm and 4 degrees along and about the axis.
+
+        The lugs are then past the apex, where only a torque brings them back.
+        """
+        yaw = RollPitchYaw(X_LockedPlug.rotation()).yaw_angle()
+        return bool(abs(X_LockedPlug.translation()[2]) < LOCKED_HEIGHT and abs(yaw) < LOCKED_ANGLE)
 
     @staticmethod
     def _geometries(plant: MultibodyPlant, scene_graph: SceneGraph, body: str) -> dict[str, GeometryId]:

@@ -19,7 +19,14 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 
-from guiderail.diagrams.stations.station import POSE_SIZE, Impedance, Station, add_contact_plant
+from guiderail.diagrams.stations.station import (
+    PLANT_PERIOD,
+    POSE_SIZE,
+    Impedance,
+    Station,
+    add_contact_plant,
+    export_simulation_ports,
+)
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.wrench_sensor import WrenchSensor
@@ -51,7 +58,7 @@ class RailsStation(Station):
         self,
         workcell: Workcell,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
-        time_step: float = 0.005,
+        time_step: float = PLANT_PERIOD,
         wrench_time_constant: float = 0.01,
     ):
         """
@@ -97,6 +104,7 @@ class RailsStation(Station):
         builder.ExportOutput(sensor.get_wrench_output_port(), "wrench")
         builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
         builder.ExportOutput(monitor.get_saturation_output_port(), "saturation")
+        export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:

@@ -19,6 +19,9 @@ output             size   meaning
 `saturation`       1      1 while the controller is at a limit of force or torque, otherwise 0
 =================  =====  ==========================================================================================
 
+A simulated station also has `query` (the scene graph's) and `body_poses` (the plant's): for cameras, and for judging
+what a robot can't see of itself.
+
 The orientation of X_TP is Rz(a) Ry(b) Rx(c), T being the target frame of the workcell: the pose is all zeros when the
 task is done. T lies still in the world, where the *nominal* fixture wants it: a station does not know of offsets.
 """
@@ -33,9 +36,12 @@ from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
+from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
 
 POSE_SIZE = 6
+PLANT_PERIOD = exact_period(0.005)  # [s]
+CONTROL_PERIOD = 4 * PLANT_PERIOD  # [s]
 
 
 @dataclass(frozen=True)
@@ -97,3 +103,9 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
         contact_surface_representation="polygon",
     )
     return AddMultibodyPlant(config, builder)
+
+
+def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Exports what only a simulation knows."""
+    builder.ExportOutput(scene_graph.get_query_output_port(), "query")
+    builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
