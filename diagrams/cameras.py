@@ -67,8 +67,8 @@ def check_rendering() -> None:
         ctypes.CDLL("libEGL.so.1")
     except OSError:
         raise InputError(
-            "images need libEGL.so.1, which this machine lacks: install it (Debian, Ubuntu: apt install libegl1), or use "
-            "observation='state' without render_mode='rgb_array'"
+            "images need libEGL.so.1, which this machine lacks: install it (Debian, Ubuntu: apt install libegl1), or "
+            "use observation='state' without render_mode='rgb_array'"
         ) from None
 
 

@@ -62,7 +62,10 @@ class TaskDiagram:
     ``rgb_image``           an abstract `ImageRgba8U`; only where the task was built with a camera
     ======================= ================================================================================
 
-    The environment reads them at the end of each control step, before the events of that instant.
+    The environment reads them at the end of each control step, before the events of that instant. For a system that
+    samples a plant at control steps to see the same numbers, the plant must be built with
+    ``use_sampled_output_ports=False``: with sampled output ports its step is an unrestricted update, which Drake does
+    before the discrete updates of the same instant, so that they see the plant one of its steps later.
 
     Args:
         diagram: the root diagram.

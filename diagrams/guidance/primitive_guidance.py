@@ -2,11 +2,12 @@
 
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import Adder, ConstantVectorSource, MatrixGain, PassThrough, ZeroOrderHold
+from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
 
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
 from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.residual import Residual
 from guiderail.systems.safety_filter import SafetyFilter
 
 
@@ -32,14 +33,17 @@ class PrimitiveGuidance(Diagram):
     def _export_inputs(self, builder: DiagramBuilder, skill: PrimitiveSkill) -> tuple[OutputPort, OutputPort]:
         """Exports the inputs and returns where the held action, spread over all outputs (O,), and the pose come out."""
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(skill.control_period, skill.num_actions))
-        spread = builder.AddNamedSystem("explored_outputs", MatrixGain(D=skill.selection))
+        action = hold.get_output_port()
+        if not np.array_equal(skill.selection, np.eye(skill.num_outputs)):
+            spread = builder.AddNamedSystem("explored_outputs", MatrixGain(D=skill.selection))
+            builder.Connect(action, spread.get_input_port())
+            action = spread.get_output_port()
         pose = builder.AddNamedSystem("pose", PassThrough(skill.num_outputs))
         wrench = builder.AddNamedSystem("wrench", PassThrough(skill.wrench_size))
-        builder.Connect(hold.get_output_port(), spread.get_input_port())
         builder.ExportInput(hold.get_input_port(), "action")
         builder.ExportInput(pose.get_input_port(), "pose")
         builder.ExportInput(wrench.get_input_port(), "wrench")
-        return spread.get_output_port(), pose.get_output_port()
+        return action, pose.get_output_port()
 
     def _finish(self, builder: DiagramBuilder, desired_pose: OutputPort, fallback: OutputPort) -> None:
         builder.ExportOutput(desired_pose, "desired_pose")
@@ -47,12 +51,15 @@ class PrimitiveGuidance(Diagram):
         builder.BuildInto(self)
 
 
-def _add_demonstration(builder: DiagramBuilder, skill: PrimitiveSkill) -> LcNsKmpSystem:
+def _add_demonstration(builder: DiagramBuilder, skill: PrimitiveSkill, action: OutputPort) -> LcNsKmpSystem:
     """The primitive that nothing pulls at: neither actions nor constraints nor a history."""
     primitive = skill.primitive(history=False, constrained=False)
     kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, skill.control_period))
-    nothing = builder.AddNamedSystem("no_action", ConstantVectorSource(np.zeros(skill.num_outputs)))
-    builder.Connect(nothing.get_output_port(), kmp.get_null_space_action_input_port())
+    # Not a ConstantVectorSource: Drake takes that for something that depends on time, and the primitive would be
+    # computed anew at every step of the plant.
+    deaf = builder.AddNamedSystem("no_action", MatrixGain(D=np.zeros((skill.num_outputs, skill.num_outputs))))
+    builder.Connect(action, deaf.get_input_port())
+    builder.Connect(deaf.get_output_port(), kmp.get_null_space_action_input_port())
     return kmp
 
 
@@ -62,8 +69,8 @@ class KmpGuidance(PrimitiveGuidance):
     def __init__(self, skill: PrimitiveSkill):
         super().__init__()
         builder = DiagramBuilder()
-        self._export_inputs(builder, skill)
-        kmp = _add_demonstration(builder, skill)
+        action, _ = self._export_inputs(builder, skill)
+        kmp = _add_demonstration(builder, skill, action)
         self._finish(builder, kmp.get_output_output_port(), kmp.get_fallback_output_port())
 
 
@@ -80,18 +87,16 @@ class ResidualGuidance(PrimitiveGuidance):
         super().__init__()
         builder = DiagramBuilder()
         action, pose = self._export_inputs(builder, skill)
-        kmp = _add_demonstration(builder, skill)
-        gain = builder.AddNamedSystem("residual", MatrixGain(D=np.diag(skill.residual_gains())))
-        total = builder.AddNamedSystem("sum", Adder(2, skill.num_outputs))
-        builder.Connect(action, gain.get_input_port())
-        builder.Connect(kmp.get_output_output_port(), total.get_input_port(0))
-        builder.Connect(gain.get_output_port(), total.get_input_port(1))
+        kmp = _add_demonstration(builder, skill, action)
+        residual = builder.AddNamedSystem("residual", Residual(skill.residual_gains()))
+        builder.Connect(kmp.get_output_output_port(), residual.get_reference_input_port())
+        builder.Connect(action, residual.get_action_input_port())
         if not safe:
-            self._finish(builder, total.get_output_port(), kmp.get_fallback_output_port())
+            self._finish(builder, residual.get_desired_pose_output_port(), kmp.get_fallback_output_port())
             return
         assert skill.keep_out is not None
         safety = builder.AddNamedSystem("safety_filter", SafetyFilter(skill.keep_out, skill.control_period))
-        builder.Connect(total.get_output_port(), safety.get_desired_pose_input_port())
+        builder.Connect(residual.get_desired_pose_output_port(), safety.get_desired_pose_input_port())
         builder.Connect(pose, safety.get_pose_input_port())
         self._finish(builder, safety.get_safe_pose_output_port(), safety.get_intervention_output_port())
 

@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import ModelInstanceIndex, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import Adder, Gain, LinearSystem, Saturation
+from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
 
 from guiderail.diagrams.task import exact_period
 from guiderail.models.objects.narrow_passage import NarrowPassage
@@ -98,8 +98,13 @@ class PlaneStation(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         self.world, self.config = world, config
+        # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
+        # updates of the same instant, and a system that samples the pose there would see it one plant step late.
         plant_config = MultibodyPlantConfig(
-            time_step=config.plant_period, discrete_contact_approximation="lagged", contact_model="point"
+            time_step=config.plant_period,
+            discrete_contact_approximation="lagged",
+            contact_model="point",
+            use_sampled_output_ports=False,
         )
         self.plant: MultibodyPlant
         self.scene_graph: SceneGraph
@@ -111,16 +116,15 @@ class PlaneStation(Diagram):
         self.plant.Finalize()
 
         # F = clip(k (x_d - x), ±F_max), against the rails' viscous friction.
-        negative = builder.AddNamedSystem("negative_pose", Gain(-1.0, 2))
-        error = builder.AddNamedSystem("position_error", Adder(2, 2))
-        gain = builder.AddNamedSystem("position_gain", Gain(config.position_gain, 2))
+        one = np.eye(2)
+        pose = builder.AddNamedSystem("pose", MatrixGain(D=np.eye(2, 4)))
+        poses = builder.AddNamedSystem("desired_and_measured_pose", Multiplexer([2, 2]))
+        gain = builder.AddNamedSystem("position_gain", MatrixGain(D=config.position_gain * np.hstack([one, -one])))
         limit = np.full(2, config.max_force)
         saturation = builder.AddNamedSystem("force_limit", Saturation(-limit, limit))
-        pose = builder.AddNamedSystem("pose", LinearSystem(D=np.eye(2, 4)))
         builder.Connect(self.plant.get_state_output_port(self._robot), pose.get_input_port())
-        builder.Connect(pose.get_output_port(), negative.get_input_port())
-        builder.Connect(negative.get_output_port(), error.get_input_port(1))
-        builder.Connect(error.get_output_port(), gain.get_input_port())
+        builder.Connect(pose.get_output_port(), poses.get_input_port(1))
+        builder.Connect(poses.get_output_port(), gain.get_input_port())
         builder.Connect(gain.get_output_port(), saturation.get_input_port())
         builder.Connect(saturation.get_output_port(), self.plant.get_actuation_input_port(self._robot))
 
@@ -130,13 +134,12 @@ class PlaneStation(Diagram):
         builder.Connect(gain.get_output_port(), excess.get_input_port(0))
         builder.Connect(applied.get_output_port(), excess.get_input_port(1))
 
-        one = np.eye(2)
-        force_sum = builder.AddNamedSystem("force_sum", LinearSystem(one, one, one, one, config.plant_period))
+        force_sum = builder.AddNamedSystem("force_sum", LinearSystem(one, one, one, 0 * one, config.plant_period))
         mean_force = builder.AddNamedSystem("mean_force", MeanForce(2, config.substeps, config.control_period))
         builder.Connect(self.plant.get_generalized_contact_forces_output_port(self._robot), force_sum.get_input_port())
         builder.Connect(force_sum.get_output_port(), mean_force.get_force_sum_input_port())
 
-        builder.ExportInput(error.get_input_port(0), "desired_pose")
+        builder.ExportInput(poses.get_input_port(0), "desired_pose")
         builder.ExportOutput(pose.get_output_port(), "pose")
         builder.ExportOutput(mean_force.get_force_output_port(), "contact_force")
         builder.ExportOutput(mean_force.get_magnitude_output_port(), "contact_force_magnitude")

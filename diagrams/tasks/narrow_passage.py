@@ -1,5 +1,6 @@
 """NarrowPassage: a planar robot that must get through a gap and around what was put in its way (4.4.1, 5.4.1)."""
 
+import math
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
@@ -233,7 +234,6 @@ def _conditions(world: NarrowPassage) -> list[Condition]:
 
 
 def _reward_terms(world: NarrowPassage, shaped: bool) -> list[RewardTerm]:
-    goal = np.array(world.goal)
     terms = [
         RewardTerm("action_cost", {"pose": 2, "last_pose": 2}, lambda pose, last_pose: action_cost(pose - last_pose)),
         RewardTerm("obstacle_cost", {"pose": 2}, world.obstacle_cost),
@@ -246,7 +246,7 @@ def _reward_terms(world: NarrowPassage, shaped: bool) -> list[RewardTerm]:
             RewardTerm(
                 "progress",
                 {"pose": 2, "last_pose": 2},
-                lambda pose, last_pose: 100.0 * (np.linalg.norm(last_pose - goal) - np.linalg.norm(pose - goal)),
+                lambda pose, last_pose: 100.0 * (math.dist(last_pose, world.goal) - math.dist(pose, world.goal)),
             )
         )
     return terms

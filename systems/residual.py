@@ -1,0 +1,59 @@
+"""A command and what a policy adds to it."""
+
+import numpy as np
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+
+from guiderail.models.errors import InputError
+
+
+class Residual(LeafSystem):
+    """Adds a policy's residual to a reference: p̂ = p^kmp + K Δp (thesis, section 4.4.1).
+
+    .. pydrake_system::
+
+        name: Residual
+        input_ports:
+        - reference
+        - action
+        output_ports:
+        - desired_pose
+
+    All are (O,); ``action`` is in [−1, 1]. (Drake's `Adder` would say the same, but it counts as depending on time:
+    whatever comes after it would be computed anew at every step of the plant.)
+    """
+
+    def __init__(self, gain: np.ndarray):
+        """
+        Args:
+            gain: K (O,), what an action of one adds to each output, in its unit.
+
+        Raises:
+            InputError: if the gain is not a vector of finite numbers.
+        """
+        super().__init__()
+        self._gain = np.array(gain, dtype=float)
+        if self._gain.ndim != 1 or not self._gain.size or not np.isfinite(self._gain).all():
+            raise InputError(f"a residual's gain is one finite number per output, not {gain}")
+        self._reference_port = self.DeclareVectorInputPort("reference", self._gain.size)
+        self._action_port = self.DeclareVectorInputPort("action", self._gain.size)
+        self._desired_port = self.DeclareVectorOutputPort(
+            "desired_pose",
+            self._gain.size,
+            self._calc,
+            prerequisites_of_calc={self._reference_port.ticket(), self._action_port.ticket()},
+        )
+
+    def get_reference_input_port(self) -> InputPort:
+        """What is commanded without a residual, (O,)."""
+        return self._reference_port
+
+    def get_action_input_port(self) -> InputPort:
+        """The policy's action, (O,)."""
+        return self._action_port
+
+    def get_desired_pose_output_port(self) -> OutputPort:
+        """The sum, (O,)."""
+        return self._desired_port
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._reference_port.Eval(context) + self._gain * self._action_port.Eval(context))
