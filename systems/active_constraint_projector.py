@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.skills.geometry import pose_from_vector, vector_from_pose
+from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
 from guiderail.systems.caching import declare_array_cache
 from guiderail.systems.skill_frames import SkillFrames
@@ -17,10 +17,10 @@ class ActiveConstraintProjector(LeafSystem):
 
         H^ac = project_q(H^im), reachable in one period from the last command
 
-    (`Skill.command`). The last command is state: it starts at the measured pose, projected. Between two control
-    instants the output is a pure function of it and of the request. The last safe command is repeated, and `fallback`
-    is 1, while a request is not finite, or while the robot is farther than the leash from its command and the request
-    leads no nearer to it: a robot that is held back is waited for.
+    (`Skill.command`). The last command is state: it starts at the measured pose, as far inside as one period leads.
+    Between two control instants the output is a pure function of it and of the request. The last safe command is
+    repeated, and `fallback` is 1, while a request is not finite, or while the robot is farther than the leash from its
+    command and the request leads no nearer to it: a robot that is held back is waited for.
 
     .. pydrake_system::
 
@@ -137,7 +137,7 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _violation(self, context: Context, pose: np.ndarray) -> float:
         state = int(self._state_port.Eval(context)[0])
-        return self._skill.violation(state, pose_from_vector(pose), self.frames.eval(context))
+        return self._skill.violation(state, pose_to_transform(pose), self.frames.eval(context))
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """The command (6,), and whether it is the last safe one."""
@@ -147,12 +147,12 @@ class ActiveConstraintProjector(LeafSystem):
             return np.append(last, 1.0)
         command = self._skill.command(
             int(self._state_port.Eval(context)[0]),
-            pose_from_vector(last),
-            pose_from_vector(requested),
+            pose_to_transform(last),
+            pose_to_transform(requested),
             self.frames.eval(context),
             self._period,
         )
-        desired = vector_from_pose(command.X_WE)
+        desired = transform_to_pose(command.X_WE)
         lag = np.linalg.norm(last[:3] - measured[:3])
         if lag > self._leash and np.linalg.norm(desired[:3] - measured[:3]) >= lag:
             return np.append(last, 1.0)
@@ -160,9 +160,11 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         measured = self._pose_port.Eval(context)
-        state = int(self._state_port.Eval(context)[0])
-        X_WE = self._skill.project(state, pose_from_vector(measured), self.frames.eval(context))
-        discrete_state.set_value(np.concatenate([vector_from_pose(X_WE), measured]))
+        X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
+        # Not what the state port says: that is decided at this same instant.
+        state = self._skill.state_at(X_WE, frames)
+        command = self._skill.command(state, X_WE, X_WE, frames, self._period)
+        discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:

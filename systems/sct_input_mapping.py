@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.skills.geometry import pose_from_vector, vector_from_pose
+from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
 from guiderail.systems.skill_frames import SkillFrames
 
@@ -79,7 +79,7 @@ class SctInputMapping(LeafSystem):
         return self._requested_pose_port
 
     def _calc_requested_pose(self, context: Context, output) -> None:
-        X_WE = pose_from_vector(self._pose_port.Eval(context))
+        X_WE = pose_to_transform(self._pose_port.Eval(context))
         displacement = self._skill.map(
             int(self._state_port.Eval(context)[0]),
             self._action_port.Eval(context),
@@ -87,4 +87,4 @@ class SctInputMapping(LeafSystem):
             self.frames.eval(context),
             self._period,
         )
-        output.SetFromVector(vector_from_pose(self._skill.displace(X_WE, displacement)))
+        output.SetFromVector(transform_to_pose(self._skill.displace(X_WE, displacement)))

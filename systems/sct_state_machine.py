@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.skills.geometry import pose_from_vector
+from guiderail.models.robots.pose import pose_to_transform
 from guiderail.models.skills.skill import Skill
 from guiderail.systems.skill_frames import SkillFrames
 
@@ -15,21 +15,24 @@ class SctStateMachine(LeafSystem):
 
     At every control instant it makes at most one transition, on the pose from just before: forward where the state's
     transition distance has fallen below its threshold, back where that of the state before exceeds it again by the
-    hysteresis. An episode begins in the skill's initial state.
+    hysteresis. An episode begins in the state that the initial pose is in.
 
     .. pydrake_system::
 
         name: SctStateMachine
         input_ports:
         - pose
+        - initial_pose
         output_ports:
         - state
         - transition_distance
         - progress
 
-    ``pose`` is (6,), [x y z Rz Ry Rx] in metres and radians. ``state`` is (1,), the number of the state, and never
-    feeds through. ``transition_distance`` is (1,), d_t of the current state in metres or radians. ``progress`` is (1,)
-    and rises as the distances fall, over all states on one scale: its increase is d_{t−1} − d_t of equation 3.2.
+    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians; the latter is looked at once, when
+    the episode begins, because then a command may not know yet where the robot is. ``state`` is (1,), the number of the
+    state, and never feeds through. ``transition_distance`` is (1,), d_t of the current state in metres or radians.
+    ``progress`` is (1,) and rises as the distances fall, over all states on one scale: its increase is d_{t−1} − d_t of
+    equation 3.2.
     """
 
     def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float):
@@ -48,6 +51,7 @@ class SctStateMachine(LeafSystem):
         self._skill = skill
         self.frames = SkillFrames(self, skill, frames)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
+        self._initial_pose_port = self.DeclareVectorInputPort("initial_pose", 6)
         self._state = self.DeclareDiscreteState([float(skill.initial_state)])
         self._state_port = self.DeclareStateOutputPort("state", self._state)
         everything = {self._pose_port.ticket(), self.discrete_state_ticket(self._state), self.frames.ticket}
@@ -70,6 +74,10 @@ class SctStateMachine(LeafSystem):
         """The pose whose distances count, (6,)."""
         return self._pose_port
 
+    def get_initial_pose_input_port(self) -> InputPort:
+        """The measured pose, (6,): it decides in which state an episode begins."""
+        return self._initial_pose_port
+
     def get_state_output_port(self) -> OutputPort:
         """The number of the skill's state, (1,)."""
         return self._state_port
@@ -84,10 +92,11 @@ class SctStateMachine(LeafSystem):
 
     def _where(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:
         state = int(context.get_discrete_state(self._state).value()[0])
-        return state, pose_from_vector(self._pose_port.Eval(context)), self.frames.eval(context)
+        return state, pose_to_transform(self._pose_port.Eval(context)), self.frames.eval(context)
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value([float(self._skill.initial_state)])
+        X_WE = pose_to_transform(self._initial_pose_port.Eval(context))
+        discrete_state.set_value([float(self._skill.state_at(X_WE, self.frames.eval(context)))])
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:

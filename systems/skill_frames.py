@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
 
-from guiderail.models.skills.geometry import pose_from_vector, vector_from_pose
+from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
 
 
@@ -33,7 +33,7 @@ class SkillFrames:
             raise ValueError(f"the skill {skill.name} needs the frame {missing[0]}")
         self._names = skill.frames
         self._indices = [
-            system.DeclareNumericParameter(BasicVector(vector_from_pose(frames[name]))) for name in skill.frames
+            system.DeclareNumericParameter(BasicVector(transform_to_pose(frames[name]))) for name in skill.frames
         ]
         self._cache = system.DeclareCacheEntry(
             "skill_frames",
@@ -61,10 +61,10 @@ class SkillFrames:
         """Moves frames in the system's context; the others stay where they are."""
         for name, X_WF in frames.items():
             index = self._indices[self._names.index(name)]
-            context.get_mutable_numeric_parameter(index).SetFromVector(vector_from_pose(X_WF))
+            context.get_mutable_numeric_parameter(index).SetFromVector(transform_to_pose(X_WF))
 
     def _calc(self, context: Context) -> dict[str, RigidTransform]:
         return {
-            name: pose_from_vector(np.asarray(context.get_numeric_parameter(index).CopyToVector()))
+            name: pose_to_transform(np.asarray(context.get_numeric_parameter(index).CopyToVector()))
             for name, index in zip(self._names, self._indices, strict=True)
         }

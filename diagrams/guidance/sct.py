@@ -55,6 +55,7 @@ class ActiveConstraintFilter(Diagram):
         builder.Connect(self._machine.get_state_output_port(), self._projector.get_state_input_port())
         builder.ExportInput(self._projector.get_requested_pose_input_port(), "requested_pose")
         builder.ExportInput(self._projector.get_pose_input_port(), "pose")
+        builder.ConnectInput("pose", self._machine.get_initial_pose_input_port())
         for system, names in (
             (self._projector, ("desired_pose", "fallback", "last_desired_pose")),
             (self._machine, ("state", "transition_distance", "progress")),

@@ -17,6 +17,7 @@ from guiderail.models.skills.geometry import (
     about,
     angle_about,
     angle_between,
+    bearing,
     position_in,
     rotation_deg,
     tilt_axis,
@@ -222,11 +223,14 @@ class FixedOrientation(ActiveConstraint):
 class TiltConstraint(ActiveConstraint):
     """The orientation is `rpy_deg` at rest, tilted towards F's z axis by an angle from an interval.
 
-    The interval may depend on the distance to F's origin. The nearest such rotation is taken.
+    The interval may depend on the distance to F's origin. The nearest such rotation is taken. With `turns_along`, the
+    end effector turns about F's z axis as it moves around it, so that it always tilts about the same axis of its own;
+    `rpy_deg` is then for a bearing along F's x axis. Without, it keeps its heading and tilts about another one.
     """
 
     frame: str
     rpy_deg: tuple[float, ...]
+    turns_along: bool
 
     @abstractmethod
     def limits_deg(self, distance_m: float) -> tuple[float, float]:
@@ -234,17 +238,27 @@ class TiltConstraint(ActiveConstraint):
 
     def tilt(self, X_WE: RigidTransform, frames: Frames) -> float:
         """The tilt [rad] of the nearest rotation that is tilted towards F's axis and nothing else."""
-        return self._tilt(position_in(self.frame, X_WE, frames), X_WE, frames)
+        p_FE = position_in(self.frame, X_WE, frames)
+        return self._tilt(tilt_axis(p_FE), self._at_rest(p_FE), X_WE, frames)
 
-    def _tilt(self, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> float:
+    def _at_rest(self, p_FE: np.ndarray) -> RotationMatrix:
+        """R_FE without a tilt."""
+        if not self.turns_along:
+            return rotation_deg(self.rpy_deg)
+        towards = bearing(p_FE)
+        heading = RotationMatrix.MakeZRotation(math.atan2(towards[1], towards[0]))
+        return heading.multiply(rotation_deg(self.rpy_deg))
+
+    def _tilt(self, axis: np.ndarray, R_FRest: RotationMatrix, X_WE: RigidTransform, frames: Frames) -> float:
         R_FE = axes(self.frame, frames).InvertAndCompose(X_WE.rotation())
-        return angle_about(tilt_axis(p_FE), R_FE.multiply(rotation_deg(self.rpy_deg).inverse()).matrix())
+        return angle_about(axis, R_FE.multiply(R_FRest.inverse()).matrix())
 
     def project(self, X_WE, frames):
         p_FE = position_in(self.frame, X_WE, frames)
+        axis, R_FRest = tilt_axis(p_FE), self._at_rest(p_FE)
         least, most = (math.radians(limit) for limit in self.limits_deg(math.sqrt(p_FE @ p_FE)))
-        angle = min(max(nearest_turn(self._tilt(p_FE, X_WE, frames), 0.5 * (least + most)), least), most)
-        R_FE = about(tilt_axis(p_FE), angle).multiply(rotation_deg(self.rpy_deg))
+        tilt = nearest_turn(self._tilt(axis, R_FRest, X_WE, frames), 0.5 * (least + most))
+        R_FE = about(axis, min(max(tilt, least), most)).multiply(R_FRest)
         return RigidTransform(axes(self.frame, frames).multiply(R_FE), X_WE.translation())
 
 
@@ -267,6 +281,7 @@ class TiltLimits(TiltConstraint):
     min_deg: float
     max_deg: float
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
+    turns_along: bool = False
 
     def __post_init__(self):
         require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
@@ -284,6 +299,7 @@ class TiltByDistance(TiltConstraint):
     distance_m: tuple[float, ...]  # increasing
     tilt_deg: tuple[float, ...]  # one for each distance, linear in between, constant beyond
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
+    turns_along: bool = False
 
     def __post_init__(self):
         require(

@@ -19,16 +19,6 @@ WORLD = "world"
 NEAR_AXIS = 1e-9  # [m] closer to the axis than this, there is no bearing
 
 
-def pose_from_vector(vector: np.ndarray) -> RigidTransform:
-    """The pose with the coordinates [x y z Rz Ry Rx] of every station, metres and radians."""
-    return RigidTransform(RotationMatrix(RollPitchYaw(vector[5], vector[4], vector[3])), vector[:3])
-
-
-def vector_from_pose(X: RigidTransform) -> np.ndarray:
-    """The coordinates [x y z Rz Ry Rx] of a pose."""
-    return np.concatenate([X.translation(), RollPitchYaw(X.rotation()).vector()[::-1]])
-
-
 @lru_cache(maxsize=64)
 def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
     """The rotation with these roll, pitch and yaw angles (x, y, z, about fixed axes) in degrees."""

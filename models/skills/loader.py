@@ -232,12 +232,10 @@ def _check_names(skill: Skill, where: str) -> None:
         for transition in state.transitions:
             if transition.to not in states:
                 raise InputError(f"{place}: there is no state {transition.to!r}; {did_you_mean(transition.to, states)}")
-        parts: tuple[Any, ...] = (*state.input_mapping, *state.active_constraints, state.transition_distance)
-        for part in parts:
-            for frame in part.frame_names:
-                if frame not in skill.frames:
-                    known = (*skill.frames, WORLD)
-                    raise InputError(f"{place}: there is no frame {frame!r}; {did_you_mean(frame, known)}")
+        for frame in sorted(state.frame_names):
+            if frame not in skill.frames:
+                known = (*skill.frames, WORLD)
+                raise InputError(f"{place}: there is no frame {frame!r}; {did_you_mean(frame, known)}")
         for mapping in state.input_mapping:
             for used in mapping.used_inputs:
                 if not 0 <= used < skill.inputs:

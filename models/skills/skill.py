@@ -41,6 +41,13 @@ class SkillState:
     weight: float = 1.0  # [1/m] or [1/rad] how much progress one unit of distance is
     transitions: tuple[Transition, ...] = ()
 
+    @property
+    def frame_names(self) -> set[str]:
+        """The objects' frames that it needs."""
+        parts: list[InputMapping | ActiveConstraint | TransitionDistance] = [*self.input_mapping]
+        parts += [*self.active_constraints, self.transition_distance]
+        return {frame for part in parts for frame in part.frame_names}
+
 
 @dataclass(frozen=True)
 class Command:
@@ -154,6 +161,13 @@ class Skill:
             distance = self.states[source].transition_distance.value(X_WE, frames)
             if sign * distance < sign * threshold:
                 return target
+        return state
+
+    def state_at(self, X_WE: RigidTransform, frames: Frames) -> int:
+        """The state that an episode begins in at X_WE: as far on as transitions lead from the initial one there."""
+        state = self.initial_state
+        for _ in self.states:
+            state = self.next_state(state, X_WE, frames)
         return state
 
     def distance(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:

@@ -71,13 +71,14 @@ class TiltToGo(TransitionDistance):
     frame: str
     until_deg: float
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
+    turns_along: bool = False  # as in the constraint on the tilt
     unit = "deg"
 
     def __post_init__(self):
         require(-180 <= self.until_deg <= 180, f"until_deg must be between −180 and 180, not {self.until_deg}.")
 
     def value(self, X_WE, frames):
-        tilt = TiltLimits(self.frame, -180.0, 180.0, self.rpy_deg).tilt(X_WE, frames)
+        tilt = TiltLimits(self.frame, -180.0, 180.0, self.rpy_deg, self.turns_along).tilt(X_WE, frames)
         return float(np.deg2rad(self.until_deg) - tilt)
 
 

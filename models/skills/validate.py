@@ -62,12 +62,7 @@ def _unused(skill: Skill) -> Iterator[Finding]:
     used = {i for state in skill.states for mapping in state.input_mapping for i in mapping.used_inputs}
     for i in sorted(set(range(skill.inputs)) - used):
         yield Finding(False, f"input {i} moves nothing in any state; lower `inputs` or map it")
-    named = {
-        frame
-        for state in skill.states
-        for part in (*state.input_mapping, *state.active_constraints, state.transition_distance)
-        for frame in part.frame_names
-    }
+    named = {frame for state in skill.states for frame in state.frame_names}
     for frame in sorted(set(skill.frames) - named):
         yield Finding(False, f"the frame {frame} is never used; leave it out")
 

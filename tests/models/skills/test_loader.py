@@ -1,0 +1,134 @@
+"""What a skill file may say, and what a person is told when it says something else."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from pydrake.math import RigidTransform
+
+from guiderail.models.errors import InputError
+from guiderail.models.skills import load_skill, parse_skill
+from guiderail.models.skills.active_constraints import ActiveConstraint, Cylinder
+from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, register
+
+SKILL = (Path(__file__).parent / "reach.yaml").read_text()
+
+
+def changed(change):
+    data = yaml.safe_load(SKILL)
+    change(data)
+    return yaml.safe_dump(data, sort_keys=False)
+
+
+def test_reads_states_in_order_with_units_turned_into_si():
+    skill = parse_skill(SKILL)
+    assert [state.name for state in skill.states] == ["far", "near"]
+    assert skill.initial_state == 0
+    assert skill.states[1].starts_at == pytest.approx(np.pi / 2)
+    assert skill.states[0].ends_at == 0.1
+
+
+def test_numbers_may_be_arithmetic_on_the_objects_sizes():
+    cylinder = parse_skill(SKILL).states[0].active_constraints[0]
+    assert isinstance(cylinder, Cylinder)
+    assert (cylinder.min_radius_m, cylinder.max_radius_m) == pytest.approx((0.06, 0.3))
+    larger = parse_skill(SKILL, rim_m=0.06).states[0].active_constraints[0]
+    assert isinstance(larger, Cylinder)
+    assert (larger.min_radius_m, larger.max_radius_m) == pytest.approx((0.07, 0.36))
+
+
+def test_a_new_kind_is_one_class_and_one_registration():
+    @register(ACTIVE_CONSTRAINTS, "at_origin")
+    @dataclass(frozen=True)
+    class AtOrigin(ActiveConstraint):
+        frame: str
+        height_m: float = 0.0
+
+        def project(self, X_WE, frames):
+            return RigidTransform(X_WE.rotation(), frames[self.frame] @ np.array([0.0, 0.0, self.height_m]))
+
+    try:
+
+        def use(data):
+            data["states"]["far"]["active_constraints"] = [
+                {"kind": "at_origin", "frame": "cup", "height_m": "2 * rim_m"}
+            ]
+
+        skill = parse_skill(changed(use))
+        X_WP = skill.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
+        np.testing.assert_allclose(X_WP.translation(), [1.0, 0.0, 0.1])
+        with pytest.raises(ValueError, match="already registered"):
+            register(ACTIVE_CONSTRAINTS, "at_origin")(AtOrigin)
+    finally:
+        del ACTIVE_CONSTRAINTS["at_origin"]
+
+
+def set_in(*path, value):
+    def change(data):
+        for key in path[:-1]:
+            data = data[key]
+        data[path[-1]] = value
+
+    return change
+
+
+def remove(*path):
+    def change(data):
+        for key in path[:-1]:
+            data = data[key]
+        del data[path[-1]]
+
+    return change
+
+
+FAR = ("states", "far")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (set_in("inptus", value=3), "did you mean inputs"),
+        (remove("max_speed_m_per_s"), "max_speed_m_per_s is missing"),
+        (set_in("inputs", value=7), "from 1 to 6"),
+        (set_in("initial_state", value="fra"), "did you mean far"),
+        (set_in(*FAR, "active_constraints", 0, "kind", value="cylindre"), "did you mean cylinder"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_mm", value=1), "did you mean min_radius_m"),
+        (set_in(*FAR, "active_constraints", 0, "frame", value="cpu"), "did you mean cup"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="rmi_m"), "did you mean rim_m"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="().__class__"), "is not a number"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1 / 0"), "not arithmetic"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=float("nan")), "finite"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=True), "must be a number"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=2.0), "0 ≤ min_radius_m ≤ max_radius_m"),
+        (remove(*FAR, "input_mapping", 0, "speed_m_per_s"), "speed_m_per_s is missing"),
+        (set_in(*FAR, "input_mapping", 0, "inputs", value=[0, 2]), "no input 2"),
+        (set_in(*FAR, "transitions", 0, "to", value="naer"), "did you mean near"),
+        (set_in(*FAR, "transitions", 0, "below_deg", value=5), "below_"),
+        (set_in(*FAR, "transitions", 0, "hysteresis_m", value=-0.1), "hysteresis_m must be positive"),
+        (set_in(*FAR, "starts_at_m", value=0.05), "distances decrease"),
+        (remove("states", "near", "ends_at_deg"), "ends_at_deg is missing"),
+        (set_in("states", "near", "starts_at_m", value=1.0), "did you mean starts_at_deg"),
+        (set_in("states", value={}), "at least one"),
+        (set_in("frames", value=["cup", "cup"]), "different names"),
+    ],
+)
+def test_says_what_is_wrong_and_what_to_do(change, said):
+    with pytest.raises(InputError) as refused:
+        parse_skill(changed(change))
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_refuses_what_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="did you mean pouring"):
+        load_skill("puoring")
+    with pytest.raises(InputError, match="can't be read"):
+        load_skill(tmp_path / "missing.yaml")
+    with pytest.raises(InputError, match="no parameter"):
+        load_skill("pouring", mug_size_m=0.1)
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("name: [")
+    with pytest.raises(InputError, match="not YAML"):
+        load_skill(broken)
