@@ -1,5 +1,7 @@
 """Active constraints made by hand: stop before walls and boundaries (thesis, section 4.4.1)."""
 
+import math
+
 import numpy as np
 
 from guiderail.models.primitives import LinearConstraints
@@ -40,6 +42,8 @@ class KeepOut:
         self.margin = float(margin)
         norms = np.linalg.norm(constraints.G, axis=1)
         self._constraints = LinearConstraints(constraints.G, constraints.c + self.margin * norms)
+        # A few boxes in the plane or in space: plain numbers are several times faster than arrays of two.
+        self._boxes = [(lower.tolist(), upper.tolist()) for lower, upper in zip(self._lower, self._upper, strict=True)]
 
     @property
     def num_outputs(self) -> int:
@@ -48,41 +52,66 @@ class KeepOut:
 
     def project(self, position: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Where to go instead of `desired` (O,) from `position` (O,), and whether a box is the reason for it."""
-        target, pushed = self._outside(self._constraints.nearest(desired))
-        target = self._constraints.nearest(target)
-        reach = self._free_fraction(position, target)
+        target, pushed = self._outside(self._inside(desired))
+        if pushed:
+            target = self._inside(target)
+        reach = self._free_fraction(position.tolist(), target.tolist())
         if reach < 1.0:
-            length = np.linalg.norm(target - position)
+            length = float(np.linalg.norm(target - position))
             return position + max(reach - self._GAP / length, 0.0) * (target - position), True
         return target, pushed
 
+    def _inside(self, desired: np.ndarray) -> np.ndarray:
+        """The nearest point within the constraints."""
+        G, c = self._constraints.G, self._constraints.c
+        violation = c - G @ desired
+        if not violation.size or violation.max() <= 0:
+            return desired
+        # Where moving straight out of the worst one is enough, that is the nearest point, and no QP is needed.
+        worst = int(np.argmax(violation))
+        nearest = desired + violation[worst] / (G[worst] @ G[worst]) * G[worst]
+        if (c - G @ nearest).max() <= 1e-12:
+            return nearest
+        return self._constraints.nearest(desired)
+
     def _outside(self, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """The nearest point on a face of the boxes that `desired` is in."""
-        pushed = False
-        for lower, upper in zip(self._lower - self.margin, self._upper + self.margin, strict=True):
-            below, above = desired - lower, upper - desired
-            if (below > 0).all() and (above > 0).all():
-                depth = np.concatenate([below, above])
-                face = int(np.argmin(depth))
-                desired, pushed = desired.copy(), True
-                axis = face % len(lower)
-                desired[axis] = lower[axis] - self._GAP if face < len(lower) else upper[axis] + self._GAP
-        return desired, pushed
+        point, pushed, margin = desired.tolist(), False, self.margin
+        for lower, upper in self._boxes:
+            # Depth below each face: (depth, axis, where the face is).
+            faces = [
+                face
+                for axis, x in enumerate(point)
+                for face in (
+                    (x - (lower[axis] - margin), axis, lower[axis] - margin - self._GAP),
+                    (upper[axis] + margin - x, axis, upper[axis] + margin + self._GAP),
+                )
+            ]
+            depth, axis, where = min(faces)
+            if depth > 0:
+                point[axis] = where
+                pushed = True
+        return np.array(point), pushed
 
-    def _free_fraction(self, start: np.ndarray, end: np.ndarray) -> float:
+    def _free_fraction(self, start: list[float], end: list[float]) -> float:
         """How much of the way from `start` to `end` is outside all boxes: 1 for all of it."""
-        # A robot that is already nearer to a box than the margin, or in it (someone pushed it), may leave but not come
-        # nearer: the box is taken as small as that.
-        clearance = np.maximum(self._lower - start, start - self._upper).max(axis=1)
-        margin = np.minimum(clearance - self._GAP / 2, self.margin)[:, None]
-        lower, upper = self._lower - margin, self._upper + margin
-        direction = end - start
-        with np.errstate(divide="ignore", invalid="ignore"):
-            first, second = (lower - start) / direction, (upper - start) / direction
-        # Parallel to a face: either between the two faces all the way, or never.
-        parallel = direction == 0
-        between = (start > lower) & (start < upper)
-        enter = np.where(parallel, np.where(between, -np.inf, np.inf), np.minimum(first, second)).max(axis=1)
-        leave = np.where(parallel, np.where(between, np.inf, -np.inf), np.maximum(first, second)).min(axis=1)
-        hits = (enter < leave) & (enter >= 0) & (enter < 1)
-        return float(enter[hits].min()) if hits.any() else 1.0
+        free = 1.0
+        for lower, upper in self._boxes:
+            # A robot that is already nearer to a box than the margin, or in it (someone pushed it), may leave but not
+            # come nearer: the box is taken as small as that.
+            clearance = max(max(a - x, x - b) for a, b, x in zip(lower, upper, start, strict=True))
+            margin = min(clearance, self.margin)
+            enter, leave = -math.inf, math.inf
+            for a, b, x, y in zip(lower, upper, start, end, strict=True):
+                a, b, way = a - margin, b + margin, y - x
+                if way == 0:
+                    # Parallel to two faces: between them all the way, or never.
+                    if not a < x < b:
+                        leave = -math.inf
+                    continue
+                first, second = (a - x) / way, (b - x) / way
+                enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
+            # It starts outside, so that less than zero is rounding, or a box that it already left behind.
+            if -1e-9 <= enter < min(leave, free):
+                free = max(enter, 0.0)
+        return free

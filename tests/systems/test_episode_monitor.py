@@ -1,0 +1,93 @@
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, Condition, EpisodeMonitor
+
+PERIOD = 0.1
+BLOCKED = TERMINATIONS.index("blocked")
+
+
+class Episode:
+    """Feeds a monitor one signal a control step and reads its output as an environment does."""
+
+    def __init__(self, *conditions, size=1):
+        self.system = EpisodeMonitor(conditions, PERIOD)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.pristine = self.system.CreateDefaultContext()
+        self.signal = self.system.get_signal_input_port("u").FixValue(self.context, [0.0] * size)
+        self.reset()
+
+    def reset(self):
+        self.context.SetTimeStateAndParametersFrom(self.pristine)
+        self.steps = 0
+        self.simulator.Initialize()
+
+    def step(self, *values):
+        """The events at the beginning of a step see the last signal; what it ends with is seen at the step's end."""
+        self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
+        self.signal.GetMutableData().set_value(values)
+        self.steps += 1
+        self.simulator.AdvanceTo(self.steps * PERIOD)
+        # An environment may read more than once.
+        self.system.get_termination_output_port().Eval(self.context)
+        return int(self.system.get_termination_output_port().Eval(self.context)[0])
+
+
+def above(limit, **parameters):
+    return Condition("blocked", {"u": 1}, lambda u: u[0] > limit, **parameters)
+
+
+def test_ports():
+    system = EpisodeMonitor([above(1), Condition("success", {"v": 3}, lambda v: False)], PERIOD)
+    assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == ["u", "v"]
+    assert system.get_signal_input_port("v").size() == 3
+    assert system.GetOutputPort("termination").size() == 1
+
+
+def test_sees_the_step_that_is_just_over():
+    episode = Episode(above(1))
+    assert [episode.step(0), episode.step(2)] == [0, BLOCKED]
+
+
+def test_stays_what_it_is_until_a_reset():
+    episode = Episode(above(1))
+    assert [episode.step(2), episode.step(0), episode.step(0)] == [BLOCKED] * 3
+    episode.reset()
+    assert episode.step(0) == 0
+
+
+def test_counts_consecutive_steps_once_each():
+    episode = Episode(above(1, steps=3))
+    assert [episode.step(u) for u in (2, 2, 0, 2, 2, 2)] == [0, 0, 0, 0, 0, BLOCKED]
+
+
+def test_counts_steps_since_the_last_progress():
+    # Stuck where the second signal says so; progress is the first one.
+    stuck = Condition("blocked", {"u": 2}, lambda u: u[1] > 0, steps=3, progress=lambda u: u[0], min_progress=0.1)
+    episode = Episode(stuck, size=2)
+    # Neither a free step nor one that gains less than 0.1 starts the count anew; one that gains more does.
+    moves = [(0, 1), (0, 1), (0.05, 0), (0.5, 1), (0.5, 1), (0.4, 0), (0.55, 1), (0.5, 1)]
+    assert [episode.step(*u) for u in moves] == [0] * 7 + [BLOCKED]
+
+
+def test_the_first_of_two_conditions_counts():
+    success = Condition("success", {"u": 1}, lambda u: u[0] > 1)
+    assert Episode(success, above(1)).step(2) == SUCCESS
+    assert Episode(above(1), success).step(2) == BLOCKED
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: EpisodeMonitor([], PERIOD),
+        lambda: EpisodeMonitor([above(1)], 0.0),
+        lambda: EpisodeMonitor([above(1), Condition("success", {"u": 2}, lambda u: True)], PERIOD),
+        lambda: Condition("lost", {"u": 1}, lambda u: True),
+        lambda: Condition("", {"u": 1}, lambda u: True),
+        lambda: above(1, steps=0),
+    ],
+)
+def test_refuses_what_makes_no_sense(make):
+    with pytest.raises(ValueError):
+        make()

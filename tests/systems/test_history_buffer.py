@@ -1,0 +1,109 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from guiderail.systems.history_buffer import HistoryBuffer
+
+
+class Counter(LeafSystem):
+    """Outputs how many periods have begun, as a movement primitive outputs its step's command."""
+
+    def __init__(self, period):
+        super().__init__()
+        self.period = period
+        self.state = self.DeclareDiscreteState(1)
+        self.DeclareStateOutputPort("count", self.state)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self.advance)
+
+    def advance(self, context, state):
+        state.set_value([round(context.get_time() / self.period)])
+
+
+@pytest.fixture
+def system():
+    return HistoryBuffer(num_outputs=2, length=3, period=0.1)
+
+
+def history(system, context):
+    return system.get_history_output_port().Eval(context).reshape(3, 2)
+
+
+def test_ports(system):
+    inputs = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
+    assert inputs == ["output", "initial_output"]
+    assert [system.get_output_port(i).get_name() for i in range(system.num_output_ports())] == ["history"]
+    assert system.get_history_output_port().size() == 6
+
+
+def test_history_never_feeds_through(system):
+    assert not system.HasAnyDirectFeedthrough()
+
+
+def test_starts_filled_with_the_present(system):
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_output_input_port().FixValue(context, [1.0, -2.0])
+    simulator.Initialize()
+    np.testing.assert_array_equal(history(system, context), [[1.0, -2.0]] * 3)
+
+
+def test_starts_filled_with_the_initial_output_where_there_is_one(system):
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_output_input_port().FixValue(context, [1.0, -2.0])
+    system.get_initial_output_input_port().FixValue(context, [5.0, 6.0])
+    simulator.Initialize()
+    np.testing.assert_array_equal(history(system, context), [[5.0, 6.0]] * 3)
+    simulator.AdvanceTo(0.15)
+    np.testing.assert_array_equal(history(system, context), [[5.0, 6.0], [5.0, 6.0], [1.0, -2.0]])
+
+
+def test_newest_enters_last_and_oldest_leaves(system):
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    port = system.get_output_input_port().FixValue(context, [0.0, 0.0])
+    simulator.Initialize()
+    for k in range(1, 5):
+        port.GetMutableData().set_value([k, -k])
+        simulator.AdvanceTo(0.1 * k + 0.05)
+    np.testing.assert_array_equal(history(system, context), [[2, -2], [3, -3], [4, -4]])
+
+
+@pytest.mark.parametrize("period", [0.02, 0.1, 1 / 3, 0.007])
+def test_takes_in_each_command_exactly_once_whatever_the_rounding_of_time(period):
+    builder = DiagramBuilder()
+    counter = builder.AddSystem(Counter(period))
+    buffer = builder.AddSystem(HistoryBuffer(1, 2, period))
+    builder.Connect(counter.get_output_port(), buffer.get_output_input_port())
+    simulator = Simulator(builder.Build())
+    context = buffer.GetMyContextFromRoot(simulator.get_context())
+    simulator.Initialize()
+    for n in range(1, 400):
+        simulator.AdvanceTo((n + 0.5) * period)
+        # After instant n, command n-1 is the newest of the past.
+        assert buffer.get_history_output_port().Eval(context)[-1] == n - 1
+
+
+def test_a_reset_forgets(system):
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    pristine = system.CreateDefaultContext()
+    port = system.get_output_input_port().FixValue(context, [1.0, 1.0])
+    simulator.Initialize()
+    simulator.AdvanceTo(1.05)
+    context.SetTimeStateAndParametersFrom(pristine)
+    port.GetMutableData().set_value([7.0, 8.0])
+    simulator.Initialize()
+    np.testing.assert_array_equal(history(system, context), [[7.0, 8.0]] * 3)
+
+
+@pytest.mark.parametrize("arguments", [(0, 3, 0.1), (2, 0, 0.1), (2, 3, 0.0), (2, 3, float("nan"))])
+def test_refuses_what_makes_no_sense(arguments):
+    with pytest.raises(ValueError):
+        HistoryBuffer(*arguments)
+
+
+def test_refuses_a_wrong_size(system):
+    with pytest.raises(Exception, match="size"):
+        system.get_output_input_port().FixValue(system.CreateDefaultContext(), [1.0, 2.0, 3.0])

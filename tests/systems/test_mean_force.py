@@ -1,0 +1,27 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.systems.mean_force import MeanForce
+
+
+def test_averages_over_the_control_step_and_forgets_the_one_before():
+    system = MeanForce(size=2, substeps=4, period=0.1)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    force_sum = system.get_force_sum_input_port().FixValue(context, [8.0, 0.0])
+    simulator.Initialize()
+    total = np.array([8.0, 0.0])
+    for n, added in enumerate(([0.0, 0.0], [12.0, 16.0], [-4.0, 0.0])):
+        simulator.AdvanceTo((n + 0.5) * 0.1)
+        total = total + added
+        force_sum.GetMutableData().set_value(total)
+        simulator.AdvanceTo((n + 1) * 0.1)
+        np.testing.assert_allclose(system.get_force_output_port().Eval(context), np.array(added) / 4)
+        np.testing.assert_allclose(system.get_magnitude_output_port().Eval(context), np.hypot(*added) / 4)
+
+
+@pytest.mark.parametrize("arguments", [(0, 4, 0.1), (2, 0, 0.1), (2, 4, 0.0)])
+def test_refuses_what_makes_no_sense(arguments):
+    with pytest.raises(ValueError):
+        MeanForce(*arguments)

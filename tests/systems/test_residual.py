@@ -1,0 +1,19 @@
+import numpy as np
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.systems.residual import Residual
+
+
+def test_adds_the_scaled_action():
+    system = Residual([0.1, 2.0])
+    context = system.CreateDefaultContext()
+    system.get_reference_input_port().FixValue(context, [1.0, 2.0])
+    system.get_action_input_port().FixValue(context, [0.5, -1.0])
+    np.testing.assert_allclose(system.get_desired_pose_output_port().Eval(context), [1.05, 0.0])
+
+
+@pytest.mark.parametrize("gain", [[], [[1.0]], [np.nan]])
+def test_refuses_what_makes_no_sense(gain):
+    with pytest.raises(InputError):
+        Residual(gain)

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from guiderail.systems.reward_system import RewardSystem, RewardTerm
+
+
+@pytest.fixture
+def system():
+    return RewardSystem(
+        [
+            RewardTerm("effort", {"pose": 2, "last_pose": 2}, lambda pose, last_pose: -np.sum((pose - last_pose) ** 2)),
+            RewardTerm("height", {"pose": 2}, lambda pose: pose[1]),
+        ]
+    )
+
+
+@pytest.fixture
+def context(system):
+    context = system.CreateDefaultContext()
+    system.get_signal_input_port("pose").FixValue(context, [3.0, 5.0])
+    system.get_signal_input_port("last_pose").FixValue(context, [1.0, 4.0])
+    return context
+
+
+def test_ports(system):
+    inputs = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
+    outputs = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
+    assert inputs == ["pose", "last_pose"]
+    assert outputs == ["reward", "effort", "height"]
+    assert system.term_names == ("effort", "height")
+
+
+def test_is_the_sum_of_its_terms(system, context):
+    assert system.get_term_output_port("effort").Eval(context) == [-5.0]
+    assert system.get_term_output_port("height").Eval(context) == [5.0]
+    assert system.get_reward_output_port().Eval(context) == [0.0]
+
+
+def test_follows_its_inputs(system, context):
+    system.get_reward_output_port().Eval(context)
+    system.get_signal_input_port("pose").FixValue(context, [1.0, 4.0])
+    assert system.get_reward_output_port().Eval(context) == [4.0]
+
+
+def test_evaluates_each_term_once_however_many_ports_are_read():
+    calls = []
+    system = RewardSystem([RewardTerm("x", {"u": 1}, lambda u: calls.append(1) or u[0])])
+    context = system.CreateDefaultContext()
+    system.get_signal_input_port("u").FixValue(context, [2.0])
+    for _ in range(3):
+        system.get_reward_output_port().Eval(context)
+        system.get_term_output_port("x").Eval(context)
+    context.SetTime(1.0)
+    system.get_reward_output_port().Eval(context)
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        [],
+        [RewardTerm("reward", {"u": 1}, lambda u: 0.0)],
+        [RewardTerm("a", {"u": 1}, lambda u: 0.0), RewardTerm("a", {"u": 1}, lambda u: 0.0)],
+        [RewardTerm("a", {"u": 1}, lambda u: 0.0), RewardTerm("b", {"u": 2}, lambda u: 0.0)],
+    ],
+)
+def test_refuses_what_makes_no_sense(terms):
+    with pytest.raises(ValueError):
+        RewardSystem(terms)

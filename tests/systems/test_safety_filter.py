@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.keep_out import KeepOut
+from guiderail.models.primitives import LinearConstraints
+from guiderail.systems.safety_filter import SafetyFilter
+
+
+@pytest.fixture
+def system():
+    wall = KeepOut([[1.0, -9.0]], [[2.0, 9.0]], LinearConstraints.none(2), margin=0.1)
+    return SafetyFilter(wall, period=0.1)
+
+
+def start(system, desired, pose):
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    ports = (
+        system.get_desired_pose_input_port().FixValue(context, desired),
+        system.get_pose_input_port().FixValue(context, pose),
+    )
+    simulator.Initialize()
+    return simulator, context, *ports
+
+
+def test_ports(system):
+    assert [system.get_input_port(i).get_name() for i in range(2)] == ["desired_pose", "pose"]
+    assert [system.get_output_port(i).get_name() for i in range(2)] == ["safe_pose", "intervention"]
+
+
+def test_passes_on_what_is_safe(system):
+    _, context, _, _ = start(system, [0.5, 0.3], [0.0, 0.0])
+    np.testing.assert_array_equal(system.get_safe_pose_output_port().Eval(context), [0.5, 0.3])
+    assert system.get_intervention_output_port().Eval(context) == [0.0]
+
+
+def test_stops_before_a_wall_from_the_first_instant_on(system):
+    _, context, _, _ = start(system, [3.0, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(system.get_safe_pose_output_port().Eval(context), [0.9, 0.0], atol=1e-5)
+    assert system.get_intervention_output_port().Eval(context) == [1.0]
+
+
+def test_the_command_stays_what_it_is_between_control_steps(system):
+    simulator, context, _, pose = start(system, [3.0, 1.0], [0.0, 0.0])
+    simulator.AdvanceTo(0.05)
+    before = system.get_safe_pose_output_port().Eval(context).copy()
+    pose.GetMutableData().set_value([0.8, 0.9])
+    simulator.AdvanceTo(0.1)
+    np.testing.assert_array_equal(system.get_safe_pose_output_port().Eval(context), before)
+    simulator.AdvanceTo(0.15)
+    assert system.get_safe_pose_output_port().Eval(context)[1] > 0.9
+
+
+def test_refuses_what_makes_no_sense():
+    with pytest.raises(ValueError):
+        SafetyFilter(KeepOut([[0, 0]], [[1, 1]], LinearConstraints.none(2), 0.1), period=0.0)
