@@ -123,13 +123,14 @@ class Skill:
         it is the displacement that is scaled down, so that the orientation never lags behind the position.
         A last command that is outside (the state has just changed) is led inside at the greatest speed.
         """
-        fraction = 1.0
+        # Within reach before it is projected: of a request far away, the projection alone would not tell a direction.
+        fraction = 1.0 / max(1.0, self._load(X_WLast, X_WRequest, period_s))
         for _ in range(BACKTRACKS):
             X_WE = self.project(state, between(X_WLast, X_WRequest, fraction), frames)
             load = self._load(X_WLast, X_WE, period_s)
             if load <= 1.0:
                 return Command(X_WE, fraction)
-            fraction *= 0.98 / load if load < np.inf else 0.0
+            fraction *= 0.98 / load
         X_WE = self.project(state, X_WLast, frames)
         load = self._load(X_WLast, X_WE, period_s)
         return Command(X_WE if load <= 1.0 else between(X_WLast, X_WE, 1.0 / load), 0.0)

@@ -1,0 +1,166 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.robots.pose import pose_to_transform
+from guiderail.models.skills import parse_skill
+from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
+
+PERIOD = 2.0**-7
+SKILL = parse_skill("""
+name: slab
+inputs: 3
+frames: [slab]
+max_speed_m_per_s: 0.5
+max_speed_rad_per_s: 1.0
+states:
+  above:
+    input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5}]
+    active_constraints:
+      - {kind: keep_above, frame: slab, height_m: 0.1}
+      - {kind: fixed_orientation, frame: slab}
+    transition_distance: {kind: height, frame: slab}
+    starts_at_m: 1.0
+    ends_at_m: 0.0
+""")
+FRAMES = {"slab": RigidTransform()}
+START = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
+
+
+class Rig:
+    """The projector with its inputs at hand."""
+
+    def __init__(self, start=START, leash=np.inf):
+        self.system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD, leash)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.system.get_state_input_port().FixValue(self.context, [0.0])
+        self.measured = self.system.get_pose_input_port().FixValue(self.context, start)
+        self.request = self.system.get_requested_pose_input_port().FixValue(self.context, start)
+        self.simulator.Initialize()
+        self.steps = 0
+
+    def step(self, request, measured=None):
+        """One control step: what was commanded during it, and whether that was a repetition."""
+        # The request comes from a hold: it changes with the events of an instant, not before them.
+        self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
+        self.request.GetMutableData().set_value(request)
+        if measured is not None:
+            self.measured.GetMutableData().set_value(measured)
+        self.steps += 1
+        self.simulator.AdvanceTo(self.steps * PERIOD)
+        return self.desired(), self.value("fallback")
+
+    def desired(self):
+        return self.system.get_desired_pose_output_port().Eval(self.context).copy()
+
+    def value(self, name):
+        return self.system.GetOutputPort(name).Eval(self.context)[0]
+
+
+def test_ports():
+    system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD)
+    names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
+    assert names == ["desired_pose", "last_desired_pose", "fallback", "commanded_violation", "measured_violation"]
+
+
+def test_the_last_command_never_feeds_through():
+    system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD)
+    last = system.get_last_desired_pose_output_port().get_index()
+    assert not any(system.HasDirectFeedthrough(i, last) for i in range(system.num_input_ports()))
+    # The command doesn't follow the measured pose within a step either.
+    desired = system.get_desired_pose_output_port().get_index()
+    assert not system.HasDirectFeedthrough(system.get_pose_input_port().get_index(), desired)
+
+
+def test_an_allowed_request_near_by_is_commanded():
+    rig = Rig()
+    request = START + [0.001, -0.002, 0.001, 0.0, 0.0, 0.0]
+    desired, fallback = rig.step(request)
+    np.testing.assert_allclose(desired, request, atol=1e-15)
+    assert fallback == 0.0
+
+
+def test_a_forbidden_request_is_projected_whatever_it_is():
+    rig = Rig()
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        rig.step(np.concatenate([rng.normal(size=3), rng.uniform(-np.pi, np.pi, 3)]))
+        X_WE = pose_to_transform(rig.desired())
+        assert SKILL.violation(0, X_WE, FRAMES) <= 1e-9
+        assert rig.value("commanded_violation") <= 1e-9
+
+
+def test_never_faster_than_the_skill_allows():
+    rig = Rig()
+    last = START
+    for _ in range(150):
+        desired, _ = rig.step(np.array([5.0, 0.0, -5.0, 0.0, 0.0, 0.0]))
+        assert np.linalg.norm(desired[:3] - last[:3]) <= 0.5 * PERIOD * (1 + 1e-9)
+        last = desired
+    assert last[2] == pytest.approx(0.1)  # it slid along the slab
+    assert last[0] > 0.1
+
+
+def test_a_command_is_taken_in_once_at_each_instant():
+    rig = Rig()
+    step = np.array([0.001, 0.0, 0.0, 0.0, 0.0, 0.0])
+    rig.step(START + step)
+    # Seen before the events of an instant: the command of the step that is over, and the one before it.
+    np.testing.assert_allclose(rig.value("last_desired_pose"), START[0])
+    rig.step(START + 2 * step)
+    np.testing.assert_allclose(rig.system.get_last_desired_pose_output_port().Eval(rig.context), START + step)
+
+
+def test_what_is_not_finite_repeats_the_last_safe_command():
+    rig = Rig()
+    before, _ = rig.step(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+    desired, fallback = rig.step(np.full(6, np.nan))
+    assert fallback == 1.0
+    np.testing.assert_array_equal(desired, before)
+
+
+def test_a_robot_that_is_held_back_is_waited_for():
+    rig = Rig(leash=0.02)
+    for _ in range(100):
+        desired, fallback = rig.step(np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0]), measured=START)
+    assert fallback == 1.0
+    assert 0.02 < desired[0] < 0.02 + 2 * 0.5 * PERIOD
+    # It may always come back.
+    desired, fallback = rig.step(START)
+    assert fallback == 0.0
+    assert desired[0] < 0.02
+
+
+def test_a_robot_that_starts_outside_is_led_inside():
+    low = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.2])
+    rig = Rig(start=low)
+    violations = []
+    for _ in range(40):
+        rig.step(rig.desired())
+        violations.append(rig.value("commanded_violation"))
+    assert violations[0] > 0.1
+    assert all(later <= earlier + 1e-12 for earlier, later in zip(violations, violations[1:], strict=False))
+    assert violations[-1] <= 1e-9
+
+
+def test_says_how_far_the_robot_itself_is_outside():
+    rig = Rig()
+    rig.step(START, measured=np.array([0.0, 0.0, 0.07, 0.0, 0.0, 0.0]))
+    assert rig.value("measured_violation") == pytest.approx(0.03)
+    assert rig.value("commanded_violation") == 0.0
+
+
+def test_a_reset_can_move_an_object():
+    rig = Rig()
+    rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.15])})
+    for _ in range(60):
+        desired, _ = rig.step(np.zeros(6))
+    assert desired[2] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(("period", "leash"), [(0.0, 1.0), (-0.1, 1.0), (0.1, 0.0), (float("nan"), 1.0)])
+def test_refuses_what_makes_no_sense(period, leash):
+    with pytest.raises(ValueError, match="positive"):
+        ActiveConstraintProjector(SKILL, FRAMES, period, leash)

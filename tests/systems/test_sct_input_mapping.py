@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
+from guiderail.models.skills import load_skill
+from guiderail.systems.sct_input_mapping import SctInputMapping
+
+PERIOD = 0.01
+FRAMES = {"mug_tip": RigidTransform([0.1, 0.0, 0.0])}
+POSE = np.array([0.1, -0.06, 0.06, 0.0, 0.0, -1.2])
+
+
+@pytest.fixture(scope="module")
+def skill():
+    return load_skill("pouring")
+
+
+@pytest.fixture
+def system(skill):
+    return SctInputMapping(skill, FRAMES, PERIOD)
+
+
+def requested(system, action, state, pose=POSE, frames=None):
+    context = system.CreateDefaultContext()
+    system.get_action_input_port().FixValue(context, action)
+    system.get_pose_input_port().FixValue(context, pose)
+    system.get_state_input_port().FixValue(context, [state])
+    if frames:
+        system.frames.set(context, frames)
+    return system.get_requested_pose_output_port().Eval(context)
+
+
+def test_ports(system):
+    assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == ["action", "pose", "state"]
+    assert system.get_action_input_port().size() == 3
+    assert system.get_output_port().get_name() == "requested_pose"
+
+
+@pytest.mark.parametrize("state", [0, 1, 2])
+def test_displaces_as_the_law_says(system, skill, state):
+    action = np.array([0.3, 0.9, -0.4])
+    X_WE = pose_to_transform(POSE)
+    expected = skill.displace(X_WE, skill.map(state, action, X_WE, FRAMES, PERIOD))
+    np.testing.assert_allclose(requested(system, action, state), transform_to_pose(expected), atol=1e-15)
+
+
+def test_the_state_decides_what_an_input_does(system):
+    towards = np.array([0.0, 1.0, 0.0])
+    moved = requested(system, towards, 1) - POSE
+    tilted = requested(system, towards, 2) - POSE
+    np.testing.assert_allclose(moved, [0.0, 0.15 * PERIOD, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(tilted, [0.0, 0.0, 0.0, 0.0, 0.0, -0.8 * PERIOD], atol=1e-12)
+
+
+def test_a_reset_can_move_an_object(system):
+    # With the mug beside instead of ahead, the same input points across the bearing and tilts nothing.
+    aside = requested(system, np.array([0.0, 1.0, 0.0]), 2, frames={"mug_tip": RigidTransform([0.5, -0.06, 0.0])})
+    np.testing.assert_allclose(aside, POSE, atol=1e-12)
+
+
+@pytest.mark.parametrize("period", [0.0, -1.0, float("nan")])
+def test_refuses_what_makes_no_sense(skill, period):
+    with pytest.raises(ValueError, match="period"):
+        SctInputMapping(skill, FRAMES, period)
+    with pytest.raises(ValueError, match="mug_tip"):
+        SctInputMapping(skill, {}, PERIOD)

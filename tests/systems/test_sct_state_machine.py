@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.skills import load_skill
+from guiderail.systems.sct_state_machine import SctStateMachine
+
+PERIOD = 2.0**-7
+FRAMES = {"mug_tip": RigidTransform([0.0, 0.1, 0.0])}
+
+
+def at(distance):
+    """A pose `distance` in front of the mug."""
+    return np.array([0.0, 0.1 - distance, 0.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def skill():
+    return load_skill("pouring")
+
+
+class Rig:
+    def __init__(self, skill, start):
+        self.system = SctStateMachine(skill, FRAMES, PERIOD)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.system.get_initial_pose_input_port().FixValue(self.context, at(start))
+        self.pose = self.system.get_pose_input_port().FixValue(self.context, at(start))
+        self.simulator.Initialize()
+        self.steps = 0
+
+    def step(self, distance):
+        """The state after the events of the instant at which `distance` is seen."""
+        self.pose.GetMutableData().set_value(at(distance))
+        self.steps += 1
+        self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
+        return self.state()
+
+    def state(self):
+        return int(self.system.get_state_output_port().Eval(self.context)[0])
+
+
+def test_ports(skill):
+    system = SctStateMachine(skill, FRAMES, PERIOD)
+    names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
+    assert names == ["state", "transition_distance", "progress"]
+
+
+def test_the_state_never_feeds_through(skill):
+    system = SctStateMachine(skill, FRAMES, PERIOD)
+    state = system.get_state_output_port().get_index()
+    assert not any(system.HasDirectFeedthrough(i, state) for i in range(2))
+    progress = system.get_progress_output_port().get_index()
+    assert not system.HasDirectFeedthrough(system.get_initial_pose_input_port().get_index(), progress)
+
+
+@pytest.mark.parametrize(("start", "state"), [(0.4, 0), (0.2, 1), (0.05, 2)])
+def test_begins_where_the_initial_pose_is(skill, start, state):
+    assert Rig(skill, start).state() == state
+
+
+def test_goes_there_and_back_with_hysteresis(skill):
+    rig = Rig(skill, 0.4)
+    assert [rig.step(d) for d in (0.26, 0.24, 0.26, 0.28, 0.24, 0.10, 0.07, 0.10, 0.40)] == [0, 1, 1, 0, 1, 1, 2, 2, 2]
+
+
+def test_one_transition_an_instant(skill):
+    rig = Rig(skill, 0.4)
+    assert [rig.step(0.05) for _ in range(3)] == [1, 2, 2]
+
+
+def test_distance_and_progress_are_the_skills(skill):
+    rig = Rig(skill, 0.4)
+    rig.step(0.24)
+    X_WE = RigidTransform(at(0.24)[:3])
+    assert rig.system.get_transition_distance_output_port().Eval(rig.context)[0] == pytest.approx(0.24)
+    progress = rig.system.get_progress_output_port().Eval(rig.context)[0]
+    assert progress == pytest.approx(skill.progress(1, X_WE, FRAMES))
+    # 5 per metre, from 0.40 m on: the same in both states where one hands over to the other.
+    assert progress == pytest.approx(5.0 * (0.40 - 0.24))
+
+
+def test_refuses_what_makes_no_sense(skill):
+    with pytest.raises(ValueError, match="period"):
+        SctStateMachine(skill, FRAMES, 0.0)
+    with pytest.raises(ValueError, match="mug_tip"):
+        SctStateMachine(skill, {}, PERIOD)
