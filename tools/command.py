@@ -173,7 +173,7 @@ def bench(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Where the run goes; an earlier demo there is replaced.")] = Path("demo"),
-    episodes: Annotated[int, typer.Option(help="How many to learn from.")] = 40,
+    episodes: Annotated[int, typer.Option(help="How many to learn from.")] = 32,
     seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
 ) -> None:
     """Watch sKGRL learn to avoid an obstacle in a narrow passage, in a minute or two."""

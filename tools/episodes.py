@@ -14,6 +14,7 @@ from guiderail.models.errors import InputError
 
 # Guidance in which an action of zero is the demonstration, so that step-0 success can be stated.
 DEMONSTRATED = ("kmp", "residual", "safe_residual", "kgrl", "skgrl")
+START_DEVIATION = 0.01  # m, of a held-out start from the usual one
 # What the safety ledger counts.
 COUNTS = ("collisions", "collision_steps", "saturations", "fallbacks")
 
@@ -117,14 +118,21 @@ def split_jerk(poses: np.ndarray, period: float) -> dict[str, float]:
 
 
 def reset_held_out(env: gymnasium.Env, seed: int) -> np.ndarray:
-    """Starts an episode with conditions that training never drew; a task in which every episode is alike has none."""
-    options = {"held_out": True}
+    """Starts an episode with conditions that training never drew.
+
+    A task draws them itself, by its reset option `held_out`. One in which every episode starts from the same place is
+    started a little beside it instead.
+    """
     try:
-        return env.reset(seed=seed, options=options)[0]
+        return env.reset(seed=seed, options={"held_out": True})[0]
     except InputError as error:
         if "held_out" not in str(error):
             raise
-        return env.reset(seed=seed)[0]
+    observation, drawn = env.reset(seed=seed)
+    if "start" not in drawn:
+        return observation
+    beside = START_DEVIATION * np.random.default_rng(seed).standard_normal(len(drawn["start"]))
+    return env.reset(seed=seed, options={"start": np.asarray(drawn["start"]) + beside})[0]
 
 
 def run_episode(

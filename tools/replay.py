@@ -12,6 +12,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.episodes import DEMONSTRATED, make_environment, run_episode, standing_still
 from guiderail.tools.files import write_atomically
 from guiderail.tools.policy import Policy
+from guiderail.tools.progress import TOLERANCE
 from guiderail.tools.run_folder import RunConfig, RunFolder
 from guiderail.tools.scenes import scene
 
@@ -123,9 +124,11 @@ def _with_caption(page: str, config: RunConfig, row: dict[str, Any], drawn: set[
     )
     title = f"{config.task} · {config.environment.get('guidance', '')} · {config.learner.algorithm.upper()}"
     outcome = row["termination"] or "running"
+    worst = max(row["worst_violation"], row["worst_measured_violation"])
+    violation = "no constraint violated" if worst <= TOLERANCE else f"worst violation {worst:.1e}"
     numbers = (
         f"{outcome} after {row['steps']} control steps, return {row['return']:.1f}, "
-        f"peak force {row['peak_force']:.1f} N, worst violation {max(row['worst_violation'], 0.0):.1e}"
+        f"peak force {row['peak_force']:.1f} N, {violation}"
     )
     caption = (
         '<div style="position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,.88);'
