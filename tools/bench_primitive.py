@@ -24,7 +24,8 @@ from guiderail.models.primitives.least_norm import SOLVERS
 
 #: O, F, H, P: planar, connector, and something larger than either.
 SIZES = ((2, 1, 40, 10), (6, 4, 40, 10), (6, 12, 100, 20))
-REGIMES = {"slack": 1.3, "grazing": 0.93, "active": 0.5}
+REGIMES = {"slack": 1.3, "grazing": 1.0, "active": 0.5}
+DENSE_SECONDS = 5.0
 STEPS = 20_000
 PERIOD = 0.02
 _MOTION = 400
@@ -132,8 +133,8 @@ def _dual(H: np.ndarray, slack: np.ndarray) -> np.ndarray:
 
 
 def _microseconds(seconds: np.ndarray) -> dict[str, float]:
-    median, p99, p999 = 1e6 * np.percentile(seconds, [50, 99, 99.9])
-    return {"median_us": median, "p99_us": p99, "p999_us": p999, "worst_us": 1e6 * seconds.max()}
+    median, p99, p999, worst = (float(1e6 * t) for t in np.percentile(seconds, [50, 99, 99.9, 100]))
+    return {"median_us": median, "p99_us": p99, "p999_us": p999, "worst_us": worst}
 
 
 def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> dict:
@@ -147,6 +148,8 @@ def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> dict:
     scale = np.abs(p.reference.means).max(axis=0)
     dense_seconds, difference = [], 0.0
     for n, action, history, output in samples[::8][:25]:
+        if sum(dense_seconds) > DENSE_SECONDS:
+            break
         begin = time.perf_counter()
         expected = _dense_step(p, n, action, history)
         dense_seconds.append(time.perf_counter() - begin)
@@ -168,7 +171,7 @@ def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict]:
     actions = authority_gains(first) * np.random.default_rng(2).uniform(-1, 1, (997, first.num_outputs))
     _, _, samples = _Loop(first, actions).run(first.predict, 4 * _MOTION)
     rows = {}
-    for name in SOLVERS:
+    for name in SOLVERS if size != SIZES[2] else ("daqp", "piqp"):  # OSQP needs a second a step at the largest size
         p = _primitive(size, REGIMES["active"], name)
         seconds, failed, difference = [], 0, 0.0
         scale = np.abs(p.reference.means).max(axis=0)
@@ -264,8 +267,8 @@ def _print(report: dict) -> None:
         leaf, factoring = parts["leaf_system"], parts["factoring"]
         console.print(
             f"through the LeafSystem: median {leaf['median_us']:.0f} µs, p99 {leaf['p99_us']:.0f} µs; first prediction "
-            f"{factoring['first_ms']:.1f} ms; a step costs {factoring['step_ms']:.2f} ms and {factoring['step_kB']:.0f} "
-            "kB to factor"
+            f"{factoring['first_ms']:.1f} ms; factoring a step costs {factoring['step_ms']:.2f} ms and "
+            f"{factoring['step_kB']:.0f} kB"
         )
         for name, row in parts["solvers"].items():
             console.print(

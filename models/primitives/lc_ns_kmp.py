@@ -82,7 +82,7 @@ class LcNsKmp:
         history_variance: float = 1e-6,
         constraints: LinearConstraints | None = None,
         solver: str = "daqp",
-        cache_bytes: int = 2**28,
+        cache_bytes: int = 2**29,
     ):
         """
         Args:

@@ -23,12 +23,13 @@ def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
     import daqp
 
     size = rows.shape[1]
-    v, _, flag, info = daqp.solve(
-        _identity(size), np.zeros(size), rows, upper, lower, np.zeros(len(rows), dtype=np.int32), primal_tol=1e-13
-    )
-    if flag < 1:
-        raise UnsolvableError(f"DAQP ended with flag {flag}")
-    return v, info["lam"]
+    problem = _identity(size), np.zeros(size), rows, upper, lower, np.zeros(len(rows), dtype=np.int32)
+    # The tighter the tolerance the nearer a degenerate problem is to cycling: ask for less only then.
+    for tolerance in (1e-12, 1e-10):
+        v, _, flag, info = daqp.solve(*problem, primal_tol=tolerance)
+        if flag >= 1:
+            return v, info["lam"]
+    raise UnsolvableError(f"DAQP ended with flag {flag}")
 
 
 def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,13 +53,15 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
     from scipy import sparse
 
     size = rows.shape[1]
+    # A first-order solver meets a bound up to its tolerance: asked for a little more than the bound, it keeps it.
+    margin = np.minimum(1e-8, (upper - lower) / 4)
     solver = osqp.OSQP()
     solver.setup(
         sparse.eye(size, format="csc"),
         np.zeros(size),
         sparse.csc_matrix(rows),
-        lower,
-        upper,
+        lower + margin,
+        upper - margin,
         verbose=False,
         eps_abs=1e-9,
         eps_rel=1e-9,

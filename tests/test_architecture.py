@@ -1,0 +1,44 @@
+"""The arrows: tools → diagrams → systems → models."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MAY_IMPORT = {
+    "models": {"models"},
+    "systems": {"models", "systems"},
+    "diagrams": {"models", "systems", "diagrams"},
+    "tools": {"models", "systems", "diagrams", "tools"},
+}
+LEARNERS = ("stable_baselines3", "sb3_contrib", "torch")
+
+
+def imports(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: imports are absolute here"
+            yield node.module
+
+
+@pytest.mark.parametrize("folder", MAY_IMPORT)
+def test_arrows_point_one_way(folder):
+    for path in (ROOT / folder).rglob("*.py"):
+        for name in imports(path):
+            parts = name.split(".")
+            if parts[0] == "guiderail" and len(parts) > 1:
+                assert parts[1] in MAY_IMPORT[folder], f"{path.relative_to(ROOT)} imports {name}"
+            if folder == "models":
+                assert not name.startswith("pydrake.systems"), f"{path.relative_to(ROOT)} imports {name}"
+            if folder != "tools":
+                assert parts[0] not in LEARNERS, f"{path.relative_to(ROOT)} imports {name}"
+
+
+def test_systems_know_no_task_and_no_robot():
+    for path in (ROOT / "systems").rglob("*.py"):
+        for name in imports(path):
+            known = ("guiderail.models.robots", "guiderail.models.objects", "guiderail.models.demonstrations")
+            assert not name.startswith(known), f"{path.relative_to(ROOT)} imports {name}"
