@@ -1,0 +1,114 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.stations.arm import controller_model
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.models.errors import InputError
+from guiderail.models.robots.iiwa import READY_POSTURE
+from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.models.robots.pose import pose_to_transform
+from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
+
+START = np.array([0.0, 0.0, 0.02, 0.8, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return controller_model(BncWorkcell())
+
+
+class Commanded:
+    """The controller alone, its joint command started at `START`."""
+
+    def __init__(self, arm, **options):
+        self.plant, model = arm
+        self.q_start = solve_inverse_kinematics(
+            self.plant, model.target, model.tool_centre, pose_to_transform(START), READY_POSTURE
+        )
+        self.system = CartesianPositionController(
+            self.plant, model.target, model.tool_centre, posture=READY_POSTURE, **options
+        )
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.system.get_positions_input_port().FixValue(self.context, self.q_start)
+        self.desired = self.system.get_desired_pose_input_port().FixValue(self.context, START)
+        self.simulator.Initialize()
+
+    def command(self, pose):
+        self.desired.GetMutableData().set_value(pose)
+
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    @property
+    def joints(self):
+        return self.system.get_joint_positions_output_port().Eval(self.context).copy()
+
+    @property
+    def pose(self):
+        return self.system.get_pose_output_port().Eval(self.context).copy()
+
+    @property
+    def stuck(self):
+        return self.system.get_stuck_output_port().Eval(self.context)[0]
+
+
+def test_starts_where_the_arm_is(arm):
+    commanded = Commanded(arm)
+    np.testing.assert_array_equal(commanded.joints, commanded.q_start)
+    np.testing.assert_allclose(commanded.pose, START, atol=1e-8)
+
+
+def test_nothing_feeds_through(arm):
+    assert not Commanded(arm).system.HasAnyDirectFeedthrough()
+
+
+def test_arrives_at_the_desired_pose(arm):
+    commanded = Commanded(arm)
+    goal = START + [0.05, -0.08, 0.06, -0.5, 0.1, -0.2]
+    commanded.command(goal)
+    commanded.advance(2.0)
+    np.testing.assert_allclose(commanded.pose, goal, atol=1e-5)
+    assert commanded.stuck == 0.0
+
+
+def test_is_no_faster_than_its_limits(arm):
+    limits = SpeedLimits(translational=0.1, rotational=0.5)
+    commanded = Commanded(arm, speed_limits=limits)
+    commanded.command(START + [0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
+    velocity_limit = commanded.plant.GetVelocityUpperLimits()
+    commanded.advance(0.005)
+    for _ in range(50):
+        q, pose = commanded.joints, commanded.pose
+        commanded.advance(0.01)
+        assert (np.abs(commanded.joints - q) / 0.01 <= velocity_limit + 1e-6).all()
+        assert np.linalg.norm(commanded.pose[:3] - pose[:3]) / 0.01 <= limits.translational * 1.02
+
+
+def test_out_of_reach_it_stays_within_the_joints_limits(arm):
+    commanded = Commanded(arm, speed_limits=SpeedLimits(translational=2.0, rotational=3.0))
+    commanded.command(START + [2.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    commanded.advance(3.0)
+    assert (commanded.joints >= commanded.plant.GetPositionLowerLimits()).all()
+    assert (commanded.joints <= commanded.plant.GetPositionUpperLimits()).all()
+    assert np.isfinite(commanded.joints).all()
+
+
+def test_what_is_not_a_number_is_no_command(arm):
+    commanded = Commanded(arm)
+    commanded.command(np.full(6, np.nan))
+    commanded.advance(0.1)
+    np.testing.assert_array_equal(commanded.joints, commanded.q_start)
+
+
+@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"posture": np.zeros(3)}, {"posture_gain": -1.0}])
+def test_refuses_what_makes_no_sense(arm, wrong):
+    plant, model = arm
+    with pytest.raises(InputError):
+        CartesianPositionController(plant, model.target, model.tool_centre, **({"posture": READY_POSTURE} | wrong))
+
+
+def test_refuses_speeds_that_make_no_sense():
+    with pytest.raises(InputError):
+        SpeedLimits(translational=0.0)
