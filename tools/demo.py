@@ -116,7 +116,7 @@ def _draw(out: Path, before: list[dict[str, Any]], after: list[dict[str, Any]]) 
     for index, row in enumerate(after):
         plane.plot(*row["path"].T, color=COLOURS["skgrl"], linewidth=1.2, label="" if index else "after learning")
     plane.plot(*before[0]["path"].T, color="black", linewidth=1.2, label="before learning")
-    plane.legend(frameon=False, loc="lower left", fontsize=8)
+    plane.legend(frameon=False, loc="upper left", fontsize=8)
     rows = RunFolder(out).episodes()
     episodes = np.arange(1, len(rows) + 1)
     curve.plot(episodes, [row["return"] for row in rows], "o-", markersize=3, color=COLOURS["skgrl"], label="return")
