@@ -9,6 +9,7 @@ import gymnasium
 TASKS = {
     "BncConnector": "guiderail.diagrams.tasks.bnc_connector:make_env",
     "NarrowPassage": "guiderail.diagrams.tasks.narrow_passage:make_env",
+    "Pouring": "guiderail.diagrams.tasks.pouring:make_env",
 }
 
 

@@ -1,0 +1,272 @@
+"""An iiwa 14 under Cartesian position control that holds a thermos with two balls, and a mug on a table."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from pydrake.geometry import Box, Cylinder, SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    Frame,
+    JointActuator,
+    ModelInstanceIndex,
+    PdControllerGains,
+    RigidBody,
+)
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
+
+from guiderail.diagrams.task import exact_period
+from guiderail.models.errors import InputError
+from guiderail.models.objects.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
+from guiderail.models.robots.iiwa import IIWA_URDF, NUM_JOINTS
+from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.models.robots.pose import pose_to_transform
+from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
+from guiderail.systems.contact_watch import ContactWatch
+from guiderail.systems.measured_pose import MeasuredPose
+from guiderail.systems.relative_poses import RelativePoses
+
+NUM_BALLS = 2
+# Half way between the pourings that the workspace allows, so that a search ends on the same branch for all of them;
+# joint 7 is turned away from its limit by what a tilt of 122 degrees takes.
+POSTURE = np.array([-0.3, 0.6, 0.2, -1.6, -0.2, -0.7, -0.7])  # [rad]
+
+# More than any guidance asks for, so that it is the guidance that says how fast.
+SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
+
+METAL = (0.55, 0.58, 0.62, 1.0)
+WOOD = (0.80, 0.68, 0.50, 1.0)
+BLUE = (0.25, 0.40, 0.65, 0.35)
+CHINA = (0.92, 0.92, 0.88, 0.45)
+ORANGE = (0.95, 0.55, 0.10, 1.0)
+
+
+@dataclass(frozen=True)
+class PouringConfig:
+    """The scene and its clocks.
+
+    Attributes:
+        mug: what is poured into.
+        thermos: what is poured from.
+        ball: each of the two that are poured.
+        p_WStand: m, the point of the table's surface above which the mug nominally stands.
+        stand_height: m, of a stand under the mug: the wrist needs room under a thermos that pours low.
+        grip: m, from the flange to the thermos's axis.
+        grip_height: m, from the thermos's tip down to where it is held.
+        plant_period: s, seconds of a plant step.
+        substeps: plant steps in a control step.
+        gains: Nm/rad, stiffness of the joints' drives; their damping is critical for each joint's typical inertia.
+    """
+
+    mug: Vessel = MUG
+    thermos: Vessel = THERMOS
+    ball: Ball = field(default_factory=Ball)
+    p_WStand: tuple[float, float, float] = (0.76, 0.18, 0.0)
+    stand_height: float = 0.06
+    grip: float = 0.08
+    grip_height: float = 0.045
+    plant_period: float = exact_period(0.005)
+    substeps: int = 2
+    gains: tuple[float, ...] = (2000.0, 2000.0, 2000.0, 1500.0, 1000.0, 800.0, 500.0)
+
+    @property
+    def control_period(self) -> float:
+        """Seconds of a control step."""
+        return self.substeps * self.plant_period
+
+    @cached_property
+    def X_WT(self) -> RigidTransform:
+        """The target frame: the tip of the mug where it nominally stands. All poses of the station are X_TP."""
+        x, y, z = self.p_WStand
+        return RigidTransform([x, y, z + self.stand_height + self.mug.height])
+
+    @cached_property
+    def X_FlangeP(self) -> RigidTransform:
+        """The thermos's tip P at the flange: its axis across the flange's."""
+        R = RotationMatrix(np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]))
+        return RigidTransform(R, [-self.grip_height, 0.0, self.grip])
+
+
+TYPICAL_INERTIA = (4.0, 4.0, 2.0, 2.0, 0.5, 0.3, 0.05)  # [kg m²] about each joint, for its drive's damping
+
+
+class PouringStation(Diagram):
+    """The arm, its position controller, and what it pours.
+
+    .. pydrake_system::
+
+        name: PouringStation
+        input_ports:
+        - desired_pose
+        output_ports:
+        - pose
+        - tip_in_mug
+        - balls_in_mug
+        - balls_in_thermos
+        - collision
+        - touched
+        - contact_force
+        - saturation
+        - query
+
+    ``desired_pose`` and ``pose`` are X_TP of the thermos's tip P as (6,) [x y z Rz Ry Rx], metres and radians; T is the
+    tip of the mug where it nominally stands. ``tip_in_mug`` is the tip's pose in the actual mug's, (6,) [x y z] and a
+    rotation vector; ``balls_in_mug`` and ``balls_in_thermos`` are the balls' poses in the vessels' tip frames in the
+    same form, one after the other. ``collision`` is 1 while the arm or the thermos touches table or mug, ``touched``
+    from the first such plant step on, ``contact_force`` [N] how hard; ``saturation`` is 1 while the controller can't
+    follow; all (1,).
+    """
+
+    def __init__(self, config: PouringConfig):
+        super().__init__()
+        builder = DiagramBuilder()
+        self.config = config
+        plant_config = MultibodyPlantConfig(
+            time_step=config.plant_period,
+            contact_model="point",
+            discrete_contact_approximation="lagged",
+            penetration_allowance=1e-3,
+        )
+        self.plant: MultibodyPlant
+        self.scene_graph: SceneGraph
+        self.plant, self.scene_graph = plant, _ = AddMultibodyPlant(plant_config, builder)
+        self.arm, self._tip = add_arm_with_thermos(plant, config)
+        self._mount = plant.AddFrame(FixedOffsetFrame("mug_mount", plant.world_frame(), config.X_WT))
+        self._mug = add_vessel(plant, "mug", config.mug, CHINA)
+        _add_stand(plant, self._mug, config)
+        plant.WeldFrames(self._mount, self._mug.body_frame())
+        self._balls = [add_ball(plant, f"ball_{i}", config.ball, ORANGE) for i in range(NUM_BALLS)]
+        _add_table(plant, config)
+        plant.Finalize()
+        thermos = plant.GetBodyByName("thermos")
+
+        self._controller_plant = MultibodyPlant(0.0)
+        _, tip = add_arm_with_thermos(self._controller_plant, config)
+        self._target = self._controller_plant.AddFrame(
+            FixedOffsetFrame("target", self._controller_plant.world_frame(), config.X_WT)
+        )
+        self._controller_tip = tip
+        self._controller_plant.Finalize()
+        self.posture = self.solve(np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8]), POSTURE)
+
+        controller = CartesianPositionController(
+            self._controller_plant,
+            self._target,
+            self._controller_tip,
+            posture=self.posture,
+            period=config.control_period,
+            speed_limits=SPEED_LIMITS,
+        )
+        builder.AddNamedSystem("controller", controller)
+        # The drives want a velocity too: without it their damping holds the arm back by centimetres.
+        drives = StateInterpolatorWithDiscreteDerivative(
+            NUM_JOINTS, config.control_period, suppress_initial_transient=True
+        )
+        builder.AddNamedSystem("drives", drives)
+        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(NUM_JOINTS, 2 * NUM_JOINTS)))
+        measured = MeasuredPose(plant, thermos, config.X_WT)
+        builder.AddNamedSystem("pose", measured)
+        links = [plant.get_body(index) for index in plant.GetBodyIndices(self.arm)]
+        period = config.plant_period
+        watch = ContactWatch(plant, [*links, thermos], [plant.world_body(), self._mug], period)
+        builder.AddNamedSystem("contact_watch", watch)
+        seen = [
+            ("tip_in_mug", RelativePoses(plant, [thermos], self._mug)),
+            ("balls_in_mug", RelativePoses(plant, self._balls, self._mug)),
+            ("balls_in_thermos", RelativePoses(plant, self._balls, thermos)),
+        ]
+
+        builder.Connect(plant.get_state_output_port(self.arm), positions.get_input_port())
+        builder.Connect(positions.get_output_port(), controller.get_positions_input_port())
+        builder.Connect(controller.get_joint_positions_output_port(), drives.get_input_port())
+        builder.Connect(drives.get_output_port(), plant.get_desired_state_input_port(self.arm))
+        builder.Connect(plant.get_body_poses_output_port(), measured.get_body_poses_input_port())
+        builder.Connect(plant.get_contact_results_output_port(), watch.get_contact_results_input_port())
+        builder.ExportInput(controller.get_desired_pose_input_port(), "desired_pose")
+        builder.ExportOutput(measured.get_pose_output_port(), "pose")
+        for name, system in seen:
+            builder.AddNamedSystem(name, system)
+            builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
+            builder.ExportOutput(system.get_relative_poses_output_port(), name)
+        builder.ExportOutput(watch.get_collision_output_port(), "collision")
+        builder.ExportOutput(watch.get_touched_output_port(), "touched")
+        builder.ExportOutput(watch.get_contact_force_output_port(), "contact_force")
+        builder.ExportOutput(controller.get_stuck_output_port(), "saturation")
+        builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
+        builder.BuildInto(self)
+
+    def solve(self, pose: np.ndarray, guess: np.ndarray) -> np.ndarray:
+        """Joint positions (7,) with the tip at `pose`, (6,)."""
+        X_TP = pose_to_transform(pose)
+        return solve_inverse_kinematics(self._controller_plant, self._target, self._controller_tip, X_TP, guess)
+
+    def set_mug(self, root_context: Context, X_TMug: RigidTransform) -> None:
+        """Moves the mug: its tip is then at X_TMug."""
+        context = self.plant.GetMyMutableContextFromRoot(root_context)
+        self._mount.SetPoseInParentFrame(context, self.config.X_WT @ X_TMug)
+
+    def set_pose(self, root_context: Context, pose: np.ndarray) -> None:
+        """Puts the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
+        context = self.plant.GetMyMutableContextFromRoot(root_context)
+        self.plant.SetPositions(context, self.arm, self.solve(pose, self.posture))
+        self.plant.SetVelocities(context, self.arm, np.zeros(NUM_JOINTS))
+        X_WP = self._tip.CalcPoseInWorld(context)
+        radius = self.config.ball.diameter / 2
+        # Side by side as far as the thermos is wider than a ball, and then as low as they touch.
+        aside = self.config.thermos.inner_diameter / 2 - radius
+        step = np.sqrt(self.config.ball.diameter**2 - (2 * aside) ** 2)
+        for i, ball in enumerate(self._balls):
+            p_PB = np.array([aside * (-1) ** i, 0.0, -self.config.thermos.depth + radius + i * step])
+            self.plant.SetFloatingBaseBodyPoseInWorldFrame(context, ball, RigidTransform(X_WP @ p_PB))
+
+
+def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[ModelInstanceIndex, Frame]:
+    """Adds the arm at the world's origin, a hand, and the thermos in it; returns the arm and the tip's frame."""
+    (arm,) = Parser(plant).AddModels(str(IIWA_URDF))
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("iiwa_link_0", arm))
+    thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
+    plant.WeldFrames(plant.GetFrameByName("iiwa_flange", arm), thermos.body_frame(), config.X_FlangeP)
+    _add_hand(plant, thermos, config)
+    for model in (arm, thermos.model_instance()):
+        # Weight is compensated by leaving it out, as a position-controlled arm does by its integrators.
+        plant.set_gravity_enabled(model, False)
+    for i, (stiffness, inertia) in enumerate(zip(config.gains, TYPICAL_INERTIA, strict=True)):
+        actuator: JointActuator = plant.GetJointActuatorByName(f"iiwa_motor_{i + 1}", arm)
+        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=2.0 * np.sqrt(stiffness * inertia)))
+    return arm, thermos.body_frame()
+
+
+def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) -> None:
+    """A stub from the flange to the thermos's wall; it counts as the thermos where something touches it."""
+    length = config.grip - config.thermos.outer_radius
+    X_PFlange = config.X_FlangeP.inverse()
+    X_PG = X_PFlange @ RigidTransform([0.0, 0.0, length / 2])
+    add_shape(plant, thermos, "hand", X_PG, Cylinder(0.03, length), METAL)
+
+
+def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> None:
+    """It moves with the mug, and touching it is touching the mug."""
+    if config.stand_height > 0:
+        X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
+        add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)
+
+
+def _add_table(plant: MultibodyPlant, config: PouringConfig) -> None:
+    x, y, z = config.p_WStand
+    # It begins where the arm's foot ends.
+    X_WG = RigidTransform([x + 0.1, y - 0.1, z - 0.05])
+    add_shape(plant, plant.world_body(), "table", X_WG, Box(1.0, 1.6, 0.1), WOOD)
+
+
+def vessel_or_refuse(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
+    """A mug of these sizes, if both balls go in."""
+    if not ball.diameter * 1.25 <= inner_diameter <= 0.2 or not ball.diameter * 1.5 <= depth <= 0.25:
+        raise InputError(
+            f"A mug of {inner_diameter} m inside and {depth} m deep doesn't take the balls or the arm; "
+            f"stay within 0.05 to 0.2 m and 0.06 to 0.25 m."
+        )
+    return Vessel(inner_diameter=inner_diameter, depth=depth)
