@@ -16,8 +16,8 @@ from guiderail.systems.episode_monitor import TERMINATIONS
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
-# What Drake says when the physics, and not the wiring, went wrong.
-_SIMULATION_FAILURE = re.compile(r"failed to converge|\bNaN\b|\bnan\b|not finite|diverg")
+# What Drake says when the physics, and not the wiring, went wrong. Its own assertions arrive in Python as SystemExit.
+_SIMULATION_FAILURE = re.compile(r"failed to converge|\bnan\b|not finite|diverg|AllFinite|isfinite", re.IGNORECASE)
 
 
 class GuidedEnv(DrakeGymEnv):
@@ -97,6 +97,7 @@ class GuidedEnv(DrakeGymEnv):
         self._control_steps = 0
         self._running = False
         self._observation: np.ndarray | None = None
+        self._violations = (-np.inf, -np.inf)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Starts an episode; `options` are the task's own (see its `make_env`)."""
@@ -112,13 +113,11 @@ class GuidedEnv(DrakeGymEnv):
         self.trace.clear()
         self._running = True
         self._observation = self._observe(context)
-        info = self._info(
-            0,
+        self._violations = (
             float(self._commanded_violation_port.Eval(context)[0]),
             float(self._measured_violation_port.Eval(context)[0]),
-            0.0,
-            dict.fromkeys(self.task.reward_terms, 0.0),
         )
+        info = self._info(0, *self._violations, 0.0, dict.fromkeys(self.task.reward_terms, 0.0))
         info.update(drawn)
         return self._observation, info
 
@@ -140,6 +139,7 @@ class GuidedEnv(DrakeGymEnv):
         terms = dict.fromkeys(self.task.reward_terms, 0.0)
         termination = 0
         failure = None
+        first_step = self._control_steps
         for _ in range(self.hold):
             try:
                 # By an integer count: a sum of periods would drift across the plant's steps.
@@ -147,7 +147,7 @@ class GuidedEnv(DrakeGymEnv):
                 pose = self._pose_port.Eval(context)
                 if not np.isfinite(pose).all():
                     failure = "the measured pose is not finite"
-            except RuntimeError as error:
+            except (RuntimeError, SystemExit) as error:
                 if not _SIMULATION_FAILURE.search(str(error)):
                     raise
                 failure = str(error)
@@ -171,6 +171,10 @@ class GuidedEnv(DrakeGymEnv):
         truncated = not terminated and (failure is not None or self._control_steps >= self.task.num_steps)
         if truncated and failure is None:
             termination = _TIME_LIMIT
+        if self._control_steps == first_step:
+            # It failed before there was anything new to read.
+            commanded_violation, measured_violation = self._violations
+        self._violations = commanded_violation, measured_violation
         info = self._info(termination, commanded_violation, measured_violation, peak_force, terms)
         if failure is not None:
             info["simulation_failure"] = failure

@@ -1,0 +1,140 @@
+"""Physics of the plane: the robot goes where it is sent, and walls are walls."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ZeroOrderHold
+
+from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
+from guiderail.models.objects.narrow_passage import NarrowPassage
+
+WORLD, CONFIG = NarrowPassage(), PlaneConfig()
+
+
+class Run:
+    """The station, commanded once a control step."""
+
+    def __init__(self, start):
+        builder = DiagramBuilder()
+        self.station = builder.AddNamedSystem("station", PlaneStation(WORLD, CONFIG))
+        # Samples what a system of ours sees at a control instant.
+        self.sample = builder.AddNamedSystem("sample", ZeroOrderHold(CONFIG.control_period, 2))
+        builder.Connect(self.station.GetOutputPort("pose"), self.sample.get_input_port())
+        builder.ExportInput(self.station.GetInputPort("desired_pose"), "desired_pose")
+        self.simulator = Simulator(builder.Build())
+        self.context = self.simulator.get_mutable_context()
+        self.command = self.simulator.get_system().get_input_port().FixValue(self.context, start)
+        self.station.set_pose(self.context, np.array(start))
+        self.simulator.Initialize()
+        self.steps = 0
+
+    def go(self, desired, steps=1):
+        """Commands a pose for some control steps; returns the pose at the end of every plant step."""
+        self.command.GetMutableData().set_value(desired)
+        path = []
+        for _ in range(steps):
+            for i in range(1, CONFIG.substeps + 1):
+                self.simulator.AdvanceTo((self.steps * CONFIG.substeps + i) * CONFIG.plant_period)
+                path.append(self.read("pose"))
+            self.steps += 1
+        return np.array(path)
+
+    def read(self, port):
+        context = self.station.GetMyContextFromRoot(self.context)
+        return self.station.GetOutputPort(port).Eval(context).copy()
+
+
+def inside_wall(points, depth=0.0):
+    lower, upper = WORLD.walls
+    points = np.asarray(points)[:, None]
+    return ((points > lower + depth) & (points < upper - depth)).all(axis=2).any(axis=1)
+
+
+def test_arrives_within_a_control_step_and_never_overshoots():
+    run = Run([0.3, 0.1])
+    rng = np.random.default_rng(0)
+    pose = np.array([0.3, 0.1])
+    for _ in range(40):
+        desired = np.clip(pose + rng.uniform(-0.1, 0.1, 2), [0.1, 0.0], [0.5, 0.4])
+        path = run.go(desired)
+        assert np.abs(path[-1] - desired).max() < 1e-4
+        low, high = np.minimum(pose, desired) - 1e-4, np.maximum(pose, desired) + 1e-4
+        assert (path > low).all()
+        assert (path < high).all()
+        pose = path[-1]
+    assert run.read("contact_force_magnitude") == 0
+
+
+def test_stands_still_where_it_was_put():
+    run = Run([0.3, 0.2])
+    path = run.go([0.3, 0.2], 5)
+    np.testing.assert_array_equal(path, np.tile([0.3, 0.2], (len(path), 1)))
+
+
+def test_a_wall_stops_the_robots_centre_where_the_world_says():
+    run = Run([0.2, 0.4])
+    path = run.go([0.2, 0.9], 10)
+    assert path[-1] == pytest.approx([0.2, WORLD.wall_y[0]], abs=2e-4)
+    # At full force it presses with what the drive has, and the wall presses back.
+    np.testing.assert_allclose(run.read("contact_force"), [0, -CONFIG.max_force], atol=0.5)
+    assert run.read("saturation")[1] > 0
+    run = Run([0.35, 0.55])
+    path = run.go([0.2, 0.55], 5)
+    assert path[-1] == pytest.approx([WORLD.gap_x[0], 0.55], abs=2e-4)
+
+
+def test_a_robot_pressed_against_a_wall_does_not_slide():
+    run = Run([0.2, 0.45])
+    touching = run.go([0.2, 0.6], 3)[-1]
+    pressed = run.go([0.28, 0.6], 20)[-1]
+    assert np.linalg.norm(pressed - touching) < 3e-3
+    away = run.go([0.25, 0.45], 3)[-1]
+    assert away == pytest.approx([0.25, 0.45], abs=1e-4)
+
+
+def test_the_gap_is_open():
+    run = Run([0.35, 0.4])
+    assert run.go([0.35, 0.8], 5)[-1] == pytest.approx([0.35, 0.8], abs=1e-4)
+    assert run.read("contact_force_magnitude") == 0
+
+
+def test_a_touch_within_a_control_step_is_not_missed():
+    run = Run([0.2, 0.45])
+    # Out and back within one control step: in touch only between two readings.
+    run.command.GetMutableData().set_value([0.2, 0.6])
+    run.simulator.AdvanceTo(5 * CONFIG.plant_period)
+    assert run.read("pose")[1] > 0.499
+    run.command.GetMutableData().set_value([0.2, 0.4])
+    run.simulator.AdvanceTo(10 * CONFIG.plant_period)
+    assert run.read("pose")[1] < 0.41
+    assert run.read("contact_force_magnitude") > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_tunnels_whatever_is_commanded(seed):
+    rng = np.random.default_rng(seed)
+    start = np.array([rng.uniform(-1, 2), 0.3])
+    run, path, side = Run(start), [start], []
+    for _ in range(120):
+        far = rng.uniform([-3, -3], [3, 3]) if rng.random() < 0.5 else [rng.uniform(-1, 2), rng.choice([-3.0, 3.0])]
+        path.extend(run.go(far, int(rng.integers(1, 4))))
+    path = np.array(path)
+    # A plant step ends a little inside a wall at most, and never beyond it other than through the gap.
+    assert not inside_wall(path, depth=CONFIG.max_speed * CONFIG.plant_period + 1e-3).any()
+    middle = sum(WORLD.wall_y) / 2
+    crossing = np.flatnonzero((path[1:, 1] > middle) != (path[:-1, 1] > middle))
+    side = path[crossing, 0]
+    slack = CONFIG.max_speed * CONFIG.plant_period
+    assert ((side > WORLD.gap_x[0] - slack) & (side < WORLD.gap_x[1] + slack)).all()
+
+
+def test_a_system_of_ours_samples_what_the_environment_reads():
+    """With the plant's sampled output ports this would be one plant step later (see `PlaneStation`)."""
+    run = Run([0.3, 0.1])
+    for k in range(5):
+        read = run.go([0.3 + 0.05 * (-1) ** k, 0.35], 1)[-1]
+        run.simulator.AdvanceTo((run.steps * CONFIG.substeps + 0.5) * CONFIG.plant_period)
+        np.testing.assert_array_equal(
+            run.sample.get_output_port().Eval(run.sample.GetMyContextFromRoot(run.context)), read
+        )

@@ -1,0 +1,336 @@
+"""NarrowPassage as a user gets it: through `gymnasium.make`."""
+
+import gc
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check
+from stable_baselines3.common.env_checker import check_env as sb3_check
+
+import guiderail.diagrams  # registers the environments
+from guiderail.diagrams import cameras
+from guiderail.diagrams.guidance import PRIMITIVE_GUIDANCE
+from guiderail.models.errors import InputError
+from guiderail.models.objects.narrow_passage import NarrowPassage
+
+WORLD = NarrowPassage()
+NULL_SPACE = ("kgrl", "skgrl")
+
+
+def make(guidance="skgrl", **arguments):
+    return gymnasium.make("guiderail/NarrowPassage-v0", guidance=guidance, **arguments).unwrapped
+
+
+def play(env, policy, **reset):
+    """Rewards, observations and the last info of an episode; the policy is called with the decision's number."""
+    observation, info = env.reset(**reset)
+    observations, rewards, infos = [observation], [], [info]
+    finished = False
+    while not finished:
+        observation, reward, terminated, truncated, info = env.step(policy(len(rewards)))
+        finished = terminated or truncated
+        observations.append(observation)
+        rewards.append(reward)
+        infos.append(info)
+    return np.array(rewards), np.array(observations), infos
+
+
+def still(_):
+    return np.zeros(2, np.float32)
+
+
+def adversaries():
+    """Largest actions: constant, alternating at several rates, and random."""
+    rng = np.random.default_rng(0)
+    corners = [np.array(c, np.float32) for c in ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0))]
+    yield from (lambda k, c=c: c for c in corners)
+    yield from (lambda k, r=r: np.full(2, (-1.0) ** (k // r), np.float32) for r in (1, 4, 10))
+    for _ in range(4):
+        yield lambda k: rng.uniform(-1, 1, 2).astype(np.float32)
+        yield lambda k: rng.choice([-1.0, 1.0], 2).astype(np.float32)
+
+
+@pytest.mark.parametrize("guidance", PRIMITIVE_GUIDANCE)
+def test_both_env_checkers_pass_without_a_warning(guidance):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = make(guidance)
+        gymnasium_check(env, skip_render_check=True)
+        sb3_check(env, warn=True, skip_render_check=True)
+
+
+def test_both_env_checkers_pass_with_images():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = make("kgrl", observation="image", render_mode="rgb_array")
+        gymnasium_check(env, skip_render_check=True)
+        sb3_check(env, warn=True)
+
+
+@pytest.mark.parametrize("guidance", PRIMITIVE_GUIDANCE)
+def test_same_seed_same_episode_bit_for_bit_fresh_and_after_resets(guidance):
+    rng = np.random.default_rng(1)
+    actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
+
+    def episode(env):
+        rewards, observations, infos = play(env, lambda k: actions[k], seed=5)
+        return rewards, observations, env.trace.measured.copy(), env.trace.force.copy(), infos[-1]["ledger"]
+
+    used = make(guidance)
+    play(used, lambda k: -actions[k], seed=9)
+    used.reset()
+    used.step(actions[0])
+    for first, second in zip(episode(make(guidance)), episode(used), strict=True):
+        np.testing.assert_equal(first, second)
+
+
+@pytest.mark.parametrize("guidance", PRIMITIVE_GUIDANCE)
+def test_the_demonstrations_alone_pass_and_run_into_the_obstacle(guidance):
+    env = make(guidance)
+    rewards, _, infos = play(env, still)
+    assert infos[-1]["is_success"]
+    assert infos[-1]["ledger"]["collisions"] == 0
+    assert sum(info["obstacle_cost"] for info in infos) < -50
+    total = sum(info[name] for info in infos for name in env.task.reward_terms)
+    assert rewards.sum() == pytest.approx(total)
+    assert infos[-1]["terminal_reward"] == 200
+
+
+@pytest.mark.parametrize("hold", [1, 5])
+@pytest.mark.parametrize("guidance", NULL_SPACE)
+def test_no_adversary_makes_null_space_guidance_violate_collide_or_fail(guidance, hold):
+    env = make(guidance, hold=hold)
+    for policy in adversaries():
+        _, _, infos = play(env, policy)
+        ledger = infos[-1]["ledger"]
+        assert ledger["worst_commanded_violation"] <= 1e-9
+        assert ledger["worst_measured_violation"] <= 1e-9
+        assert ledger["collisions"] == 0
+        assert infos[-1]["is_success"]
+        # The ledger and what every step said are two accounts of the same episode.
+        assert ledger["worst_commanded_violation"] == max(info["constraint_violation"] for info in infos[1:])
+        assert ledger["worst_measured_violation"] == max(info["measured_violation"] for info in infos[1:])
+        assert ledger["steps"] == len(env.trace)
+
+
+def test_a_residual_collides_gets_stuck_and_violates_but_never_tunnels():
+    env = make("residual", kappa=3.0)
+    lower, upper = WORLD.walls
+    endings, collisions, violation = set(), 0, -np.inf
+    for policy in adversaries():
+        _, _, infos = play(env, policy)
+        endings.add(infos[-1]["termination"])
+        collisions += infos[-1]["ledger"]["collisions"]
+        violation = max(violation, infos[-1]["ledger"]["worst_measured_violation"])
+        # In a wall at most as deep as it gets in one plant step.
+        path = env.trace.measured[:, None]
+        assert not ((path > lower + 0.021) & (path < upper - 0.021)).all(axis=2).any()
+    assert "blocked" in endings
+    assert collisions > 10
+    assert violation > 0.01
+
+
+def test_the_safe_residual_neither_collides_nor_violates_but_gets_stuck():
+    endings = set()
+    for kappa in (1.0, 3.0):
+        env = make("safe_residual", kappa=kappa)
+        for policy in adversaries():
+            _, _, infos = play(env, policy)
+            endings.add(infos[-1]["termination"])
+            assert infos[-1]["ledger"]["collisions"] == 0
+            assert infos[-1]["ledger"]["worst_measured_violation"] <= -0.02 + 1e-6
+    assert "blocked" in endings
+
+
+def test_smooth_guidance_jerks_far_less():
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
+    jerk = {}
+    for guidance in NULL_SPACE:
+        env = make(guidance)
+        play(env, lambda k: actions[k])
+        jerk[guidance] = guiderail.diagrams.trace.mean_jerk(env.trace.measured, env.trace.period)
+    assert jerk["skgrl"] < jerk["kgrl"] / 10
+
+
+def test_an_episode_lasts_as_long_as_the_thesis_says():
+    env = make("kmp")
+    _, observations, _ = play(env, still)
+    assert observations[0] == -1.0
+    assert (np.diff(observations[:, 0]) > 0).all()
+    assert env.task.num_steps == 400
+    assert env.task.control_period == pytest.approx(0.02, rel=1e-9)
+
+
+def test_shaped_reward_adds_progress_towards_the_goal():
+    sparse, _, _ = play(make("kmp"), still)
+    shaped, _, infos = play(make("kmp", reward="shaped"), still)
+    progress = sum(info["progress"] for info in infos)
+    assert shaped.sum() == pytest.approx(sparse.sum() + progress)
+    start = np.linalg.norm(np.array(WORLD.goal) - infos[0]["start"])
+    assert progress == pytest.approx(100 * (start - WORLD.goal_radius), abs=1.0)
+
+
+@pytest.mark.parametrize("step", [10, 20, 45])
+@pytest.mark.parametrize("push", [(-0.1, 0.0), (0.1, 0.0), (0.0, 0.03)])
+def test_a_pushed_robot_keeps_its_course_without_a_jump(step, push):
+    """5.3.4: with P = 1 the measured pose is the past that the motion goes on from."""
+    if step == 45 and push[1] == 0.0:
+        push = (0.01 * np.sign(push[0]), 0.0)  # in the passage there is no more room
+    env = make("skgrl", history=1, history_source="measured")
+    env.reset()
+    info = {"termination": ""}
+    worst_after = -np.inf
+    for k in range(80):
+        if k == step:
+            before = env.trace.commanded[-1].copy()
+            env.push(push)
+        *_, info = env.step(still(k))
+        if k >= step:
+            worst_after = max(worst_after, info["constraint_violation"])
+        if info["termination"]:
+            break
+    jump = env.trace.commanded[5 * step] - (before + push)
+    assert np.linalg.norm(jump) < 0.03 + max(0.0, before[0] + push[0] - WORLD.zone_x)
+    assert worst_after <= 1e-9
+    assert info["is_success"]
+    assert info["ledger"]["collisions"] == 0
+
+
+def test_a_robot_pushed_out_of_the_allowed_region_is_led_back():
+    env = make("skgrl", history=1, history_source="measured", hold=1)
+    env.reset()
+    for k in range(100):
+        env.step(still(k))
+    env.push([WORLD.zone_x + 0.05 - env.trace.measured[-1, 0], 0.0])
+    *_, info = env.step(still(0))
+    assert info["constraint_violation"] <= 1e-9
+    measured = []
+    for k in range(30):
+        *_, info = env.step(still(k))
+        assert info["constraint_violation"] <= 1e-9
+        measured.append(info["measured_violation"])
+    assert max(measured[1:]) <= 1e-6
+    assert info["termination"] == ""
+
+
+def test_starts_where_it_is_told():
+    env = make("skgrl")
+    _, info = env.reset(options={"start": (0.27, 0.07)})
+    np.testing.assert_allclose(info["start"], [0.27, 0.07])
+    env.step(still(0))
+    assert np.linalg.norm(env.trace.commanded[0] - [0.27, 0.07]) < 0.005
+    for options in ({"begin": 1}, {"start": (0, 0, 0)}, {"start": (np.nan, 0)}, {"start": "here"}):
+        with pytest.raises(InputError, match="start"):
+            env.reset(options=options)
+
+
+def test_a_nan_in_the_plant_ends_the_episode_and_not_the_training():
+    env = make("kmp")
+    env.reset()
+    observation, *_ = env.step(still(0))
+    plant = env.task.diagram.GetSubsystemByName("station").plant
+    state = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context()).get_mutable_discrete_state_vector()
+    state.SetAtIndex(0, np.nan)
+    last, _, terminated, truncated, info = env.step(still(0))
+    assert (terminated, truncated) == (False, True)
+    assert info["simulation_failure"]
+    np.testing.assert_array_equal(last, observation)
+    _, _, infos = play(env, still)
+    assert infos[-1]["is_success"]
+
+
+@pytest.mark.parametrize("guidance", ["kgrl", "skgrl"])
+def test_a_thousand_resets_do_not_grow(guidance):
+    # In a process of its own: what other tests leave behind is none of its business.
+    script = f"""
+import gc, resource
+import gymnasium, numpy as np
+import guiderail.diagrams
+env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="{guidance}").unwrapped
+def run(resets):
+    for k in range(resets):
+        env.reset(seed=k)
+        env.step(np.ones(2, np.float32))
+    gc.collect()
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
+env.reset()
+for k in range(70):
+    env.step(np.zeros(2, np.float32))  # factors every step once
+before = run(200)
+print(run(1000) - before)
+"""
+    grown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert int(grown.stdout) < 1_000_000
+
+
+def test_images_show_the_robot_moving():
+    env = make("kmp", observation="image")
+    first, _ = env.reset()
+    assert (first.shape, first.dtype) == ((110, 144, 3), np.uint8)
+    assert env.observation_space.contains(first)
+    second = first
+    for k in range(20):
+        second, *_ = env.step(still(k))
+    changed = np.abs(first.astype(int) - second).max(axis=2) > 40
+    # The robot is somewhere else, and nothing else moved: two small spots.
+    assert 5 < changed.sum() < 120
+    columns = np.flatnonzero(changed.any(axis=0))
+    assert np.ptp(columns) > 10
+
+
+def test_the_picture_for_people_shows_the_plane():
+    env = make("kmp", render_mode="rgb_array")
+    env.reset()
+    picture = env.render()
+    assert (picture.shape, picture.dtype) == ((640, 480, 3), np.uint8)
+    assert picture.std() > 10
+
+
+def test_the_browser_view_is_local(monkeypatch):
+    monkeypatch.setattr("guiderail.diagrams.env.Simulator.set_target_realtime_rate", lambda *_: None)
+    env = make("kmp", render_mode="human")
+    assert "localhost" in env.task.meshcat.web_url()
+    env.reset()
+    env.step(still(0))
+    env.render()
+    assert env.task.meshcat.HasPath("/drake/visualizer/robot/ball")
+
+
+def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
+    def missing(name):
+        raise OSError(f"{name}: cannot open shared object file")
+
+    monkeypatch.setattr(cameras.ctypes, "CDLL", missing)
+    for arguments in ({"observation": "image"}, {"render_mode": "rgb_array"}):
+        with pytest.raises(InputError, match=r"libEGL\.so\.1.*libegl1"):
+            make("kmp", **arguments)
+    make("kmp")  # needs no picture
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"guidance": "sct"}, "kmp, residual, safe_residual, kgrl, skgrl"),
+        ({"guidance": "none"}, "kmp, residual, safe_residual, kgrl, skgrl"),
+        ({"guidance": "magic"}, "there is no guidance 'magic'"),
+        ({"reward": "dense"}, "'sparse' or 'shaped'"),
+        ({"observation": "smell"}, "'state' or 'image'"),
+        ({"render_mode": "ascii"}, "render mode"),
+        ({"hold": 0}, "hold"),
+        ({"kappa": -1.0}, "kappa"),
+        ({"history": 0}, "history"),
+        ({"history_variance": 0.0}, "history_variance"),
+        ({"history_source": "dreamt"}, "commanded or measured"),
+        ({"gains": (1.0,)}, "one per output"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_sentence(arguments, message):
+    with pytest.raises(InputError, match=message) as error:
+        make(**arguments)
+    assert "\n" not in str(error.value)
+    gc.collect()
