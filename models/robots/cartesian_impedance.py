@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from guiderail.models.robots.vectors import cross
+
 
 @dataclass(frozen=True)
 class JointTorques:
@@ -33,16 +35,22 @@ def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.nd
     """
     generalized = K @ np.concatenate([p_error, 2.0 * epsilon])
     torque = generalized[3:]
-    return np.concatenate([generalized[:3], eta * torque - np.cross(epsilon, torque)])
+    return np.concatenate([generalized[:3], eta * torque - cross(epsilon, torque)])
 
 
-def damping_matrix(K: np.ndarray, Lambda: np.ndarray, damping_ratio: float) -> np.ndarray:
-    """D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ: every mode of the pair (K, Λ) has the damping ratio ζ."""
-    L = np.linalg.cholesky(Lambda)
-    K_normalized = np.linalg.solve(L, np.linalg.solve(L, K).T)
-    eigenvalues, modes = np.linalg.eigh(0.5 * (K_normalized + K_normalized.T))
-    root = (modes * np.sqrt(np.maximum(eigenvalues, 0.0))) @ modes.T
-    return 2.0 * damping_ratio * L @ root @ L.T
+def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: float) -> np.ndarray:
+    """D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ: every mode of the pair (K, Λ) has the damping ratio ζ.
+
+    Args:
+        K: stiffness (6, 6), symmetric, positive definite.
+        Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, the inertia at the tool, inverted.
+        damping_ratio: ζ.
+    """
+    # With Λ⁻¹ = R Rᵀ, L = R⁻ᵀ: nothing but R has to be inverted.
+    R = np.linalg.cholesky(Lambda_inverse)
+    eigenvalues, modes = np.linalg.eigh(R.T @ K @ R)
+    L_modes = np.linalg.solve(R.T, modes)
+    return (L_modes * (2.0 * damping_ratio * np.sqrt(np.maximum(eigenvalues, 0.0)))) @ L_modes.T
 
 
 def impedance_torques(
@@ -85,13 +93,13 @@ def impedance_torques(
     K = R @ K @ R.T
 
     M_inverse_JT = np.linalg.solve(M, J.T)
-    Lambda = np.linalg.inv(J @ M_inverse_JT + 1e-9 * np.eye(6))  # the term keeps a singular arm finite
-    Lambda = 0.5 * (Lambda + Lambda.T)
-    wanted_wrench = spring_wrench(K, p_error, eta, epsilon) - damping_matrix(K, Lambda, damping_ratio) @ (J @ v)
+    Lambda_inverse = J @ M_inverse_JT + 1e-9 * np.eye(6)  # the term keeps a singular arm finite
+    D = damping_matrix(K, Lambda_inverse, damping_ratio)
+    wanted_wrench = spring_wrench(K, p_error, eta, epsilon) - D @ (J @ v)
     along_axes = R.T @ wanted_wrench
     wrench = R @ np.clip(along_axes, -wrench_limits, wrench_limits)
-    null_torque = posture_torque - J.T @ (Lambda @ (M_inverse_JT.T @ posture_torque))
-    wanted_torque = J.T @ wrench + null_torque + gravity_torque
+    leak = np.linalg.solve(Lambda_inverse, M_inverse_JT.T @ posture_torque)  # the tool wrench of the posture's torque
+    wanted_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
     torque = np.clip(wanted_torque, -torque_limits, torque_limits)
     is_saturated = bool((np.abs(along_axes) >= wrench_limits).any() or (torque != wanted_torque).any())
     return JointTorques(torque, wrench, is_saturated)

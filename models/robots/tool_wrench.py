@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from guiderail.models.robots.vectors import cross
+
 
 def external_wrench(
     F_reaction: np.ndarray, M: np.ndarray, V: np.ndarray, A: np.ndarray, gravity: np.ndarray
@@ -25,12 +27,6 @@ def external_wrench(
     omega = V[:3]
     momentum = M[:, :3] @ omega  # I ω, and m ω × p_PCom by the inertia's own coupling block
     wrench = M @ A - M[:, 3:] @ gravity - F_reaction
-    wrench[:3] += _cross(omega, momentum[:3])
-    wrench[3:] += _cross(omega, momentum[3:])
+    wrench[:3] += cross(omega, momentum[:3])
+    wrench[3:] += cross(omega, momentum[3:])
     return wrench
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float]:
-    """a × b; NumPy's own is made for arrays of vectors, and twenty times slower for one."""
-    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
-    return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
