@@ -1,0 +1,135 @@
+"""How fast the connector's simulation is: `guiderail bench simulation`.
+
+CPU time of one core, not wall clock: what else a machine does changes it less. Python's share is the time in callbacks
+of systems written in Python, with what they call.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.recording import DrivenStation, along
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, make_env, make_station
+from guiderail.models.objects.bnc_motion import insert_and_lock
+from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
+from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.recorder import Recorder
+from guiderail.systems.wrench_sensor import WrenchSensor
+
+# Outermost callbacks only: one that is called within another would count twice.
+CALLBACKS: tuple[tuple[type, str], ...] = (
+    (WrenchSensor, "_sample"),
+    (CartesianImpedanceController, "_calc_law"),
+    (CartesianImpedanceController, "_keep_safe_command"),
+    (ImpedanceMonitor, "_calc_contact_force"),
+    (ImpedanceMonitor, "_calc_saturation"),
+    (Recorder, "_record"),
+)
+# From the plug's first touch to its release, locked [s].
+CONTACT = (3.8, 7.6)
+REQUIRED_FACTOR = {"rails": 5.0, "arm": 4.0}
+REQUIRED_SECONDS = 2.0
+
+
+@contextmanager
+def timed_callbacks() -> Iterator[Callable[[], float]]:
+    """While it lasts, systems that are built count the seconds in their own callbacks; yields what reads the count."""
+    spent = [0.0]
+    depth = [0]
+
+    def timed(method):
+        def call(*arguments):
+            depth[0] += 1
+            start = time.process_time()
+            try:
+                return method(*arguments)
+            finally:
+                depth[0] -= 1
+                if depth[0] == 0:
+                    spent[0] += time.process_time() - start
+
+        return call
+
+    originals = [(system, name, getattr(system, name)) for system, name in CALLBACKS]
+    for system, name, method in originals:
+        setattr(system, name, timed(method))
+    try:
+        yield lambda: spent[0]
+    finally:
+        for system, name, method in originals:
+            setattr(system, name, method)
+
+
+def real_time_factor(name: str) -> dict[str, float]:
+    """Simulated seconds per second of CPU time while the plug is seated, turned and locked."""
+    times, poses = insert_and_lock()
+    with timed_callbacks() as spent:
+        station = make_station(name, BncWorkcell())
+        driven = DrivenStation(station, along(times, poses), num_samples=NUM_STEPS)
+        driven.start(poses[0])
+        first, last = (round(t / CONTROL_PERIOD) for t in CONTACT)
+        driven.run(first)
+        python_before, start = spent(), time.process_time()
+        driven.run(last - first)
+        seconds = time.process_time() - start
+        python_seconds = spent() - python_before
+    simulated = (last - first) * CONTROL_PERIOD
+    return {"real_time_factor": simulated / seconds, "python_share": python_seconds / seconds}
+
+
+def env_seconds(guidance: str = "kgrl", episodes: int = 2) -> float:
+    """CPU seconds of 400 control steps of the environment on rails, random actions, after a first episode."""
+    env = make_env(guidance=guidance, uncertainty="disc", hold=5)
+    rng = np.random.default_rng(0)
+    spent, steps = 0.0, 0
+    for episode in range(1 + episodes):
+        env.reset(seed=episode)
+        start, finished, info = time.process_time(), False, {}
+        while not finished:
+            _, _, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+            finished = terminated or truncated
+        if episode > 0:  # the first one also factors the primitive
+            spent += time.process_time() - start
+            steps += info["control_steps"]
+    return spent / steps * NUM_STEPS
+
+
+def measure() -> dict[str, Any]:
+    """All of it, as a program may read it."""
+    results: dict[str, Any] = {name: real_time_factor(name) for name in REQUIRED_FACTOR}
+    results["env_seconds_per_400_steps"] = env_seconds()
+    results["fast_enough"] = (
+        all(results[name]["real_time_factor"] >= factor for name, factor in REQUIRED_FACTOR.items())
+        and results["env_seconds_per_400_steps"] <= REQUIRED_SECONDS
+    )
+    return results
+
+
+def main(as_json: bool = False) -> dict[str, Any]:
+    """Measures, prints, and returns what was measured."""
+    results = measure()
+    if as_json:
+        print(json.dumps(results, indent=2))
+        return results
+    for name, factor in REQUIRED_FACTOR.items():
+        row = results[name]
+        print(
+            f"{name:5s}  {row['real_time_factor']:4.1f} times real time in contact (at least {factor:.0f}), "
+            f"{100 * row['python_share']:.0f} % of it Python"
+        )
+    print(
+        f"env    {results['env_seconds_per_400_steps']:4.2f} s for 400 control steps (at most {REQUIRED_SECONDS:.0f})"
+    )
+    return results
+
+
+if __name__ == "__main__":
+    main()
