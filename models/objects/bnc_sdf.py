@@ -23,7 +23,7 @@ class ContactMaterial:
 
 
 # The lugs are stiffer than the barrel because they are small: the same force must not let one through a slot's wall.
-BARREL = ContactMaterial(friction=0.2, modulus=1e9, resolution=1.0 * MM)
+BARREL = ContactMaterial(friction=0.2, modulus=1e9, resolution=1.5 * MM)
 LUG = ContactMaterial(friction=0.2, modulus=5e9, resolution=0.8 * MM)
 PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket is a spring that slips
 RING = ContactMaterial(friction=0.2)
