@@ -37,6 +37,17 @@ def run_jobs(jobs: Sequence[Job], processes: int = PROCESSES) -> list[dict[str, 
     Raises:
         InputError: if a folder holds another run than the one wanted.
     """
+    for job in jobs:
+        _refuse_another(job)  # before anything starts
+    results = {index: run_job(job) for index, job in enumerate(jobs) if _finished(job) and not job.evaluations}
+    waiting = [index for index in range(len(jobs)) if index not in results]
+    if waiting:
+        results |= _run_in_processes(jobs, waiting, min(processes, len(waiting)))
+    return [results[index] for index in range(len(jobs))]
+
+
+def _run_in_processes(jobs: Sequence[Job], indices: Sequence[int], processes: int) -> dict[int, dict[str, Any]]:
+    """Runs those jobs side by side, and says how far it is."""
     results: dict[int, dict[str, Any]] = {}
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -46,16 +57,16 @@ def run_jobs(jobs: Sequence[Job], processes: int = PROCESSES) -> list[dict[str, 
         Progress(*columns, console=console, disable=not console.is_terminal) as progress,
         ProcessPoolExecutor(max_workers=processes, mp_context=context, initializer=_one_thread) as pool,
     ):
-        bar = progress.add_task("runs", total=len(jobs))
-        waiting = {pool.submit(run_job, job): index for index, job in enumerate(jobs)}
+        bar = progress.add_task("runs", total=len(indices))
+        waiting = {pool.submit(run_job, jobs[index]): index for index in indices}
         for future in as_completed(waiting):
             index = waiting[future]
             results[index] = future.result()
             progress.advance(bar)
             if not console.is_terminal:
                 job = jobs[index]
-                console.print(f"{len(results)}/{len(jobs)} runs: {job.name}, seed {job.config.seed}", soft_wrap=True)
-    return [results[index] for index in range(len(jobs))]
+                console.print(f"{len(results)}/{len(indices)} runs: {job.name}, seed {job.config.seed}", soft_wrap=True)
+    return results
 
 
 def run_job(job: Job) -> dict[str, Any]:
@@ -65,13 +76,8 @@ def run_job(job: Job) -> dict[str, Any]:
     from guiderail.tools.train import train
 
     folder = RunFolder(job.folder)
-    exists = (job.folder / "config.yaml").exists()
-    if exists:
-        _refuse_another(folder.config(), job)
-    if exists and (job.folder / "policy.json").exists():
-        rows = folder.episodes()
-    else:
-        rows = train(folder, job.config, resume=exists)
+    _refuse_another(job)
+    rows = folder.episodes() if _finished(job) else train(folder, job.config, resume=_begun(job))
     result = {"name": job.name, "seed": job.config.seed, **summary(rows), "folder": str(job.folder)}
     if job.evaluations:
         judged = held_out(job.config, Policy.load(job.folder), episodes=job.evaluations, seed=1_000_000)
@@ -149,8 +155,19 @@ def _one_thread() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
 
 
-def _refuse_another(found: RunConfig, job: Job) -> None:
+def _begun(job: Job) -> bool:
+    return (job.folder / "config.yaml").exists()
+
+
+def _finished(job: Job) -> bool:
+    return _begun(job) and (job.folder / "policy.json").exists()
+
+
+def _refuse_another(job: Job) -> None:
     """A folder that holds another run is never trained further as if it were this one."""
+    if not _begun(job):
+        return RunFolder(job.folder).refuse_existing()
+    found = RunFolder(job.folder).config()
     for key in ("task", "environment", "learner", "seed", "episodes"):
         if getattr(found, key) != getattr(job.config, key):
             raise InputError(f"{job.folder} holds a run with another {key}: name another folder with --out")

@@ -11,6 +11,8 @@ from guiderail.models.errors import InputError
 
 
 class Bead(gymnasium.Env):
+    metadata = {"render_modes": ["human"]}  # noqa: RUF012
+
     def __init__(self, guidance="skgrl", reward="shaped", observation="state", hold=1, render_mode=None):
         if guidance not in ("kmp", "skgrl"):
             raise InputError(f"Bead has no guidance {guidance!r}: choose kmp or skgrl")

@@ -1,0 +1,116 @@
+"""The tools on a task of guiderail's own, from training to what a run leaves behind."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.check import check
+from guiderail.tools.episodes import make_environment, reset_held_out
+from guiderail.tools.evaluate import evaluate
+from guiderail.tools.record import record
+from guiderail.tools.replay import tube, write_replay
+from guiderail.tools.run_folder import RunFolder
+from guiderail.tools.study import Job, run_jobs
+from guiderail.tools.train import train
+from guiderail.tools.training import configure
+
+SETTINGS = {"units": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}
+
+
+@pytest.fixture(scope="module")
+def config():
+    return configure("NarrowPassage", {"guidance": "skgrl"}, preset="quick", settings=SETTINGS, episodes=3, seed=1)
+
+
+@pytest.fixture(scope="module")
+def trained(config, tmp_path_factory):
+    folder = RunFolder(tmp_path_factory.mktemp("run") / "run")
+    train(folder, config)
+    return folder
+
+
+def test_training_is_safe_from_the_first_episode_on(trained):
+    for row in trained.episodes():
+        assert row["success"] == 1
+        assert row["collisions"] == 0
+        assert row["worst_violation"] <= 1e-9
+        assert row["worst_measured_violation"] <= 1e-9
+
+
+def test_a_rows_terms_add_up_to_its_return(trained):
+    for row in trained.episodes():
+        terms = sum(value for key, value in row.items() if key.startswith("reward_"))
+        assert row["return"] == pytest.approx(terms, rel=1e-9)
+
+
+def test_a_resumed_simulation_goes_on_bit_for_bit(trained, config, tmp_path):
+    resumed = RunFolder(tmp_path / "run")
+    train(resumed, replace(config, episodes=2))
+    train(resumed, config, resume=True)
+    first, second = (
+        [{k: v for k, v in row.items() if k != "wall_time"} for row in folder.episodes()]
+        for folder in (trained, resumed)
+    )
+    assert first == second
+    a, b = (load_file(folder.path / "policy.safetensors") for folder in (trained, resumed))
+    assert all(np.array_equal(a[key], b[key]) for key in a)
+
+
+def test_evaluation_states_what_the_demonstration_alone_achieves(trained):
+    result = evaluate(trained.path, episodes=2)
+    assert result["demonstration_success_rate"] == 1.0
+    assert result["worst_violation"] <= 1e-9
+
+
+def test_held_out_starts_differ_from_those_of_training_and_from_each_other():
+    env = make_environment("NarrowPassage", {"guidance": "kmp"})
+    env.reset(seed=0)
+    usual = env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy()
+    starts = []
+    for seed in (1, 2, 1):
+        reset_held_out(env, seed)
+        starts.append(env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy())
+    assert not np.array_equal(usual, starts[0])
+    assert not np.array_equal(starts[0], starts[1])
+    np.testing.assert_array_equal(starts[0], starts[2])
+
+
+def test_the_replay_is_one_page_that_needs_nothing_else(trained, tmp_path):
+    page = write_replay(trained.path, tmp_path / "replay.html").read_text()
+    assert "the constraint" in page
+    assert "demonstrations" in page
+    assert "<script src=" not in page
+    assert "https://" not in page.partition("<body>")[0]
+
+
+def test_what_a_policy_does_can_be_demonstrated_again(trained, tmp_path):
+    file = record(trained.path, tmp_path / "again.npz", episodes=2)
+    assert Demonstrations.load(file).num_demonstrations == 2
+    assert check(file)["demonstrations"] == 2
+    with pytest.raises(InputError, match="already exists"):
+        record(trained.path, file, episodes=2)
+
+
+def test_a_study_keeps_finished_runs_and_refuses_other_ones(config, tmp_path):
+    short = replace(config, episodes=1)
+    jobs = [Job("skgrl", short, tmp_path / "run")]
+    first = run_jobs(jobs)
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    assert run_jobs(jobs) == first
+    assert written == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match="another seed"):
+        run_jobs([replace(jobs[0], config=replace(short, seed=2))])
+
+
+def test_a_tube_keeps_its_radius_along_the_path():
+    points = np.column_stack([np.linspace(0, 1, 31), np.sin(np.linspace(0, 3, 31)), np.zeros(31)])
+    vertices, faces = tube(points, 0.01)
+    kept = np.vstack([points[:-1:3], points[-1:]])
+    distance = np.linalg.norm(vertices.reshape(len(kept), -1, 3) - kept[:, None], axis=2)
+    np.testing.assert_allclose(distance, 0.01, rtol=1e-9)
+    assert faces.min() == 0
+    assert faces.max() == len(vertices) - 1
