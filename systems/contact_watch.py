@@ -19,8 +19,8 @@ from pydrake.systems.framework import (
 class ContactWatch(LeafSystem):
     """Says whether any body of one set has touched any body of another since the episode began.
 
-    The plant's contact results are looked at after every plant step: a collision that is shorter than a control step
-    counts.
+    The plant's contact results are looked at in every plant step: a collision that is shorter than a control step
+    counts. They are best those of a plant without sampled output ports; then each step's are seen at its beginning.
 
     .. pydrake_system::
 
@@ -34,7 +34,7 @@ class ContactWatch(LeafSystem):
 
     ``contact_results`` is the plant's. ``collision`` is (1,): 1 while they touch; ``touched`` is (1,): 1 from the first
     touch on; ``contact_force`` is (1,), the norm [N] of the largest force between the sets in this step. Point contact
-    and hydroelastic contact both count. Reading a port between two plant steps sees the newest one.
+    and hydroelastic contact both count.
     """
 
     def __init__(self, plant: MultibodyPlant, ones: Sequence[RigidBody], others: Sequence[RigidBody], period: float):

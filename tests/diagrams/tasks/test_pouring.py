@@ -1,0 +1,196 @@
+"""Pouring as a user sees it: who may do what, and what comes of it."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import guiderail.diagrams  # noqa: F401 (registers the environments)
+from guiderail.diagrams.tasks.pouring import make_env
+from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES, person
+from guiderail.models.errors import InputError
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_env()
+
+
+@pytest.fixture(scope="module")
+def unconstrained():
+    return make_env(active_constraints=False)
+
+
+def run(env, inputs, seed=None, options=None, limit=150, watch=None):
+    """An episode: how it ended, its return, and its actions."""
+    observation, info = env.reset(seed=seed, options=options)
+    total, actions = 0.0, []
+    for _ in range(limit):
+        action = inputs(observation)
+        actions.append(action)
+        observation, reward, terminated, truncated, info = env.step(action)
+        total += reward
+        if watch:
+            watch(env, info)
+        if terminated or truncated:
+            break
+    return info, total, actions
+
+
+def test_is_registered():
+    made = gymnasium.make("guiderail/Pouring-v0", guidance="none", reward="sparse")
+    assert made.action_space.shape == (6,)
+    assert made.observation_space.shape == (6,)
+
+
+# The corners of where episodes start, and its middle.
+STARTS = [
+    (radius * np.cos(np.deg2rad(azimuth)), radius * np.sin(np.deg2rad(azimuth)), height)
+    for azimuth, radius, height in [(-120, 0.24, 0.08), (-120, 0.30, 0.19), (-75, 0.24, 0.19), (-75, 0.30, 0.08)]
+]
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_persons_three_axes_pour_and_the_constraints_are_why(env, unconstrained, start):
+    info, total, actions = run(env, person, seed=1, options={"start": start})
+    assert info["termination"] == "success"
+    assert total > 200.0
+    assert info["ledger"]["worst_commanded_violation"] <= 1e-9
+    assert info["ledger"]["collisions"] == 0.0
+    # The very same inputs, and then the very same person, who may react: it doesn't depend on which is meant.
+    replay = iter([*actions, *[actions[-1]] * 150])
+    for again in (lambda observation: next(replay), person):
+        info, _, _ = run(unconstrained, again, seed=1, options={"start": start})
+        assert info["termination"] in ("collision", "spill")
+
+
+@pytest.mark.parametrize("adversary", ADVERSARIES)
+def test_nobody_can_collide_or_leave_the_constraints(env, adversary):
+    rng = np.random.default_rng(7)
+    tilts, worst = [], []
+
+    def watch(env, info):
+        context = env.simulator.get_context()
+        state = env.task.diagram.GetOutputPort("state").Eval(context)[0]
+        turn = env.task.diagram.GetOutputPort("observation").Eval(context)[3:]
+        tilts.append((state, np.hypot(turn[0], turn[1])))
+        worst.append(info["constraint_violation"])
+
+    for _ in range(2):
+        info, _, _ = run(env, ADVERSARIES[adversary](rng), seed=int(rng.integers(2**31)), limit=35, watch=watch)
+        assert info["termination"] not in ("collision", "spill")
+    assert max(worst) <= 1e-9
+    # Upright until the tilt is allowed, as far as the arm's drives track.
+    assert max((tilt for state, tilt in tilts if state == 0), default=0.0) < np.deg2rad(3.0)
+
+
+def test_a_velocity_without_a_template_can_do_anything():
+    env = make_env(guidance="none", reward="hand_shaped")
+    info, total, _ = run(env, lambda observation: np.array([0.0, 1.0, -0.6, 0.0, 0.0, 0.0]), seed=0)
+    assert info["termination"] in ("collision", "spill")
+    assert total < 0.0
+
+
+def test_the_constraints_are_a_safety_filter_behind_a_velocity():
+    env = make_env(guidance="none", reward="sparse", active_constraints=True)
+    rng = np.random.default_rng(0)
+    for seed in range(2):
+        held = np.sign(rng.normal(size=6))
+        info, _, _ = run(env, lambda observation, held=held: held, seed=seed, limit=30)
+        assert info["termination"] not in ("collision", "spill")
+        assert info["constraint_violation"] <= 1e-9
+
+
+@pytest.mark.parametrize(
+    ("mug", "position"),
+    [({"mug_inner_diameter": 0.10, "mug_depth": 0.075}, (0.03, -0.03)), ({"mug_inner_diameter": 0.07}, (-0.03, 0.02))],
+)
+def test_the_template_is_the_objects_not_the_episodes(mug, position):
+    env = make_env(**mug)
+    info, _, _ = run(env, person, seed=1, options={"mug_position": position})
+    assert info["termination"] == "success"
+    assert info["ledger"]["worst_commanded_violation"] <= 1e-9
+
+
+def test_starts_are_drawn_and_repeat_with_the_seed(env):
+    first = env.reset(seed=3)[1]["start"]
+    second = env.reset()[1]["start"]
+    assert not np.allclose(first, second)
+    np.testing.assert_array_equal(env.reset(seed=3)[1]["start"], first)
+
+
+def test_an_episode_repeats_to_the_last_bit(env):
+    def episode():
+        observation, _ = env.reset(seed=5)
+        seen = [observation]
+        for _ in range(12):
+            seen.append(env.step(person(seen[-1]))[0])
+        return np.array(seen)
+
+    first = episode()
+    run(env, person, seed=9)
+    np.testing.assert_array_equal(episode(), first)
+
+
+def test_the_balls_stay_in_the_thermos_until_it_is_poured(env):
+    env.reset(seed=0)
+    station = env.task.diagram.GetSubsystemByName("station")
+    for _ in range(10):
+        env.step(np.zeros(3))
+    context = station.GetMyContextFromRoot(env.simulator.get_context())
+    balls = station.GetOutputPort("balls_in_thermos").Eval(context).reshape(2, 6)
+    thermos = station.config.thermos
+    assert all(thermos.contains(p) for p in balls[:, :3])
+    # And they lie there: the lower one on the bottom.
+    assert balls[:, 2].min() == pytest.approx(-thermos.depth + 0.02, abs=2e-3)
+
+
+def test_shaping_is_the_progress_of_the_template(env):
+    """Equation 3.7: over an episode the shaping adds up, whatever the way."""
+    sums = {"shaping": 0.0, "action_cost": 0.0, "terminal_reward": 0.0}
+
+    def watch(env, info):
+        for name in sums:
+            sums[name] += info[name]
+
+    info, total, actions = run(env, person, seed=2, watch=watch)
+    assert sums["terminal_reward"] == 200.0
+    assert total == pytest.approx(sum(sums.values()))
+    # The last action's cost counts for as long as it lasted.
+    cost = [float(a @ a) for a in np.clip(actions, -1.0, 1.0)]
+    assert -sum(cost) - 1e-9 <= sums["action_cost"] <= -sum(cost[:-1]) + 1e-9
+    # From the start's distance to wherever the tilt ended, 5 a metre and 0.0175 a degree, times 200.
+    assert 200.0 * 1.2 < sums["shaping"] < 200.0 * 2.8
+
+
+def test_hand_shaped_reward_is_the_thesiss():
+    env = make_env(guidance="none", reward="hand_shaped")
+    observation, _ = env.reset(seed=0)
+    j = np.linalg.norm(observation[:3] / 5.0)
+    observation, reward, *_, info = env.step(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    j_after = np.linalg.norm(observation[:3] / 5.0)
+    assert info["approach"] == pytest.approx(15.0 * (j - j_after), abs=1e-5)  # float32 observations
+    assert info["tilting"] <= 0.0
+    assert reward == pytest.approx(info["approach"] + info["tilting"] - 1.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"guidance": "kgrl"}, "sct, none"),
+        ({"reward": "dense"}, "hand_shaped"),
+        ({"observation": "image"}, "state"),
+        ({"mug_offset": 1.0}, "between 0 and"),
+        ({"mug_inner_diameter": 0.03}, "take the balls"),
+    ],
+)
+def test_refuses_what_makes_no_sense(arguments, said):
+    with pytest.raises(InputError, match=said):
+        make_env(**arguments)
+
+
+@pytest.mark.parametrize(
+    "options", [{"strat": (0, 0, 0)}, {"start": (0, 0)}, {"start": (np.nan, 0, 0)}, {"mug_position": (0.5, 0.0)}]
+)
+def test_refuses_reset_options_that_make_no_sense(env, options):
+    with pytest.raises(InputError):
+        env.reset(options=options)

@@ -1,0 +1,81 @@
+"""Tries to make the pouring template fail: careless, random and malicious inputs, contacts checked at every plant step.
+
+    python -m guiderail.tools.stress_pouring --steps 100000
+
+A step is one control step (10 ms) of the arm. Exits with 1 if anything touched what it must not, if a commanded pose was
+outside of the active constraints, or if the thermos was commanded to tilt before that is allowed.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.env import GuidedEnv
+from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET, make_env
+from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES
+from guiderail.models.robots.pose import pose_to_transform
+
+TOLERANCE = 1e-9  # [m] or [rad]
+
+
+def stress(steps: int, seed: int = 0, progress: bool = False) -> dict[str, Any]:
+    """Runs whole episodes, the adversaries in turn, until they took so many control steps.
+
+    Returns:
+        What was found: control steps, episodes by how they ended, collisions, the worst commanded and measured
+        violation, and the greatest tilt [rad] that was commanded in the upright state.
+    """
+    env = make_env(mug_offset=MAX_MUG_OFFSET)
+    rng = np.random.default_rng(seed)
+    found: dict[str, Any] = {"steps": 0, "collisions": 0, "commanded": 0.0, "measured": 0.0, "early_tilt": 0.0}
+    endings: Counter[str] = Counter()
+    began = time.perf_counter()
+    while found["steps"] < steps:
+        name = list(ADVERSARIES)[sum(endings.values()) % len(ADVERSARIES)]
+        inputs = ADVERSARIES[name](rng)
+        observation, _ = env.reset(seed=int(rng.integers(2**31)))
+        over = False
+        while not over:
+            observation, _, terminated, truncated, info = env.step(inputs(observation))
+            over = terminated or truncated
+            found["early_tilt"] = max(found["early_tilt"], _early_tilt(env))
+        ledger = info["ledger"]
+        found["steps"] += info["control_steps"]
+        found["collisions"] += int(ledger["collisions"])
+        found["commanded"] = max(found["commanded"], ledger["worst_commanded_violation"])
+        found["measured"] = max(found["measured"], ledger["worst_measured_violation"])
+        endings[f"{name}: {info['termination']}"] += 1
+        if progress:
+            print(f"{found['steps']:7d} steps, {time.perf_counter() - began:5.0f} s, {dict(endings)}", file=sys.stderr)
+    return {**found, "endings": dict(endings)}
+
+
+def _early_tilt(env: GuidedEnv) -> float:
+    """The commanded tilt [rad] while the template is in its first state, where it is upright; 0 in the others."""
+    context = env.simulator.get_context()
+    diagram = env.task.diagram
+    if diagram.GetOutputPort("state").Eval(context)[0] != 0:
+        return 0.0
+    R = pose_to_transform(diagram.GetOutputPort("desired_pose").Eval(context)).rotation().matrix()
+    return float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--steps", type=int, default=100_000, help="control steps in all")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    found = stress(arguments.steps, arguments.seed, progress=True)
+    print(json.dumps(found, indent=2))
+    failed = found["collisions"] > 0 or found["commanded"] > TOLERANCE or found["early_tilt"] > TOLERANCE
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
