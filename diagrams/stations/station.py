@@ -101,6 +101,9 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
         contact_model="hydroelastic_with_fallback",
         discrete_contact_approximation="lagged",
         contact_surface_representation="polygon",
+        # A plant with sampled ports steps by an unrestricted update, which Drake runs *before* the discrete updates of
+        # the same instant: a new command would then reach it one step late.
+        use_sampled_output_ports=False,
     )
     return AddMultibodyPlant(config, builder)
 

@@ -1,0 +1,207 @@
+"""The BNC task as a policy meets it."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+import guiderail.diagrams  # noqa: F401 (registers)
+from guiderail.diagrams.tasks.bnc_connector import (
+    ALIGNMENT,
+    COLLISION_FORCE,
+    MM,
+    NUM_STEPS,
+    make_env,
+    reference_trajectory,
+)
+from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.models.errors import InputError
+from guiderail.tools.bnc_rule import reactive_rule, standing_still, success_rate
+
+
+def play(env, policy, *, seed=None, options=None):
+    """Runs an episode; returns the reset's info, the last step's, the return and the observations."""
+    observation, first = env.reset(seed=seed, options=options)
+    observations, total, finished, info = [observation], 0.0, False, {}
+    while not finished:
+        observation, reward, terminated, truncated, info = env.step(policy(observation))
+        observations.append(observation)
+        total += reward
+        finished = terminated or truncated
+    return first, info, total, np.array(observations)
+
+
+@pytest.fixture(scope="module")
+def kmp():
+    return make_env(guidance="kmp", uncertainty="known")
+
+
+@pytest.fixture(scope="module")
+def kgrl():
+    return make_env(guidance="kgrl", uncertainty="disc")
+
+
+@pytest.fixture(scope="module")
+def skgrl():
+    return make_env(guidance="skgrl", uncertainty="calibration")
+
+
+def test_is_registered():
+    assert "guiderail/BncConnector-v0" in gymnasium.registry
+
+
+def test_spaces(skgrl):
+    assert skgrl.action_space.shape == (2,)
+    assert skgrl.observation_space.shape == (13,)
+    observation, _ = skgrl.reset(seed=0)
+    assert observation in skgrl.observation_space
+    assert observation[0] == -1.0
+
+
+@pytest.mark.parametrize("offset", [(0.3, 0.0), (0.0, -0.3), (-0.2, 0.2)])
+def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
+    _, info, total, _ = play(kmp, standing_still, seed=0, options={"offset": np.array(offset) * MM})
+    assert info["termination"] == "success"
+    assert info["control_steps"] < NUM_STEPS
+    assert total > 50.0
+
+
+def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
+    """On the whole at most one in five; here, none of three."""
+    rate, _ = success_rate(skgrl, standing_still, trials=3)
+    assert rate == 0.0
+
+
+def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
+    rate, worst = success_rate(skgrl, reactive_rule, trials=3)
+    assert rate == 1.0
+    assert worst <= 1e-9
+
+
+def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
+    rate, worst = success_rate(kgrl, reactive_rule, trials=3)
+    assert rate == 1.0
+    assert worst <= 1e-9
+
+
+@pytest.mark.parametrize("guidance", ["kgrl", "skgrl"])
+def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
+    """Corner actions that change at every decision, into every corner of the square."""
+    env = {"kgrl": kgrl, "skgrl": skgrl}[guidance]
+    rng = np.random.default_rng(3)
+    _, info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
+    assert info["ledger"]["worst_commanded_violation"] <= 1e-9
+    assert np.abs(env.trace.commanded[:, :2]).max() <= ALIGNMENT + 1e-9
+    assert np.isfinite(observations).all()
+    assert "simulation_failure" not in info
+
+
+def test_the_same_seed_is_the_same_episode(kgrl):
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (12, 2))
+    runs = []
+    for _ in range(2):
+        observation, drawn = kgrl.reset(seed=11)
+        steps = [observation] + [kgrl.step(action)[0] for action in actions]
+        runs.append((np.array(steps), drawn["jack_offset"]))
+    np.testing.assert_array_equal(runs[0][0], runs[1][0])
+    np.testing.assert_array_equal(runs[0][1], runs[1][1])
+
+
+def test_a_hard_push_is_a_collision():
+    """A residual that commands 25 mm sideways against the jack's side, which no constraint keeps from it."""
+    env = make_env(guidance="residual", uncertainty="disc", explored=(0, 1, 2), kappa=20.0)
+    _, info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
+    assert info["termination"] == "collision"
+    assert info["contact_force"] > COLLISION_FORCE
+    assert info["ledger"]["collisions"] == 1
+    assert total < -45.0
+
+
+def test_reward_is_the_sum_of_its_terms(kgrl):
+    kgrl.reset(seed=2)
+    action = np.array([0.5, -1.0])
+    _, reward, _, _, info = kgrl.step(action)
+    assert reward == pytest.approx(info["action_cost"] + info["force_cost"] + info["terminal_reward"])
+    assert info["action_cost"] == pytest.approx(-0.01 * 5 * action @ action)
+
+
+def test_shaped_reward_adds_the_depth_gained():
+    env = make_env(guidance="kmp", reward="shaped", uncertainty="known", hold=10)
+    env.reset(seed=0)
+    start = reference_trajectory().means[0, 2]
+    depth = 0.0
+    for _ in range(12):
+        depth += env.step(np.zeros(2))[4]["depth"]
+    assert depth == pytest.approx((start - env.trace.measured[-1, 2]) / MM, abs=0.1)
+
+
+def test_the_same_policy_drives_rails_and_arm():
+    """One rule object, both stations; the arm is slower to follow, and locks too."""
+    for station in ("rails", "arm"):
+        env = make_env(guidance="kgrl", uncertainty="disc", station=station)
+        _, info, _, _ = play(env, reactive_rule, seed=4, options={"offset": (0.0009, -0.0008)})
+        assert info["is_success"], station
+
+
+def test_a_push_moves_the_robot(kgrl):
+    kgrl.reset(seed=0)
+    kgrl.step(np.zeros(2))
+    before = kgrl.trace.measured[-1].copy()
+    kgrl.push(np.array([0.0, 0.0, 0.004, 0.0, 0.0, 0.0]))
+    kgrl.step(np.zeros(2))
+    assert kgrl.trace.measured[5, 2] > before[2] + 0.001
+
+
+class TestUncertainty:
+    def test_calibration_keeps_its_hidden_offset_for_a_run(self):
+        uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(0)
+        draws = [uncertainty.draw(rng, {}) for _ in range(20)]
+        jacks, grasps = (np.array(column) for column in zip(*draws, strict=True))
+        assert (jacks == jacks[0]).all()
+        assert 1.0 * MM <= np.linalg.norm(jacks[0]) <= 1.5 * MM
+        assert len({tuple(grasp) for grasp in grasps}) == 20
+        assert np.linalg.norm(grasps, axis=1).max() <= 0.3 * MM
+
+    def test_a_new_run_has_another_one(self):
+        uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(0)
+        first, _ = uncertainty.draw(rng, {})
+        second, _ = uncertainty.draw(rng, {"new_run": True})
+        assert (first != second).any()
+
+    def test_held_out_keeps_the_run_and_draws_apart(self):
+        uncertainty = BncUncertainty("calibration")
+        jack, grasp = uncertainty.draw(np.random.default_rng(7), {})
+        jack_held_out, grasp_held_out = uncertainty.draw(np.random.default_rng(7), {"held_out": True})
+        np.testing.assert_array_equal(jack, jack_held_out)
+        assert (grasp != grasp_held_out).any()
+
+    def test_disc_fills_the_disc(self):
+        uncertainty, rng = BncUncertainty("disc"), np.random.default_rng(1)
+        radii = np.array([np.linalg.norm(uncertainty.draw(rng, {})[0]) for _ in range(2000)])
+        assert radii.max() <= 1.5 * MM
+        # The density is the same everywhere: half the area lies within 1/√2 of the radius.
+        assert np.mean(radii < 1.5 * MM / np.sqrt(2)) == pytest.approx(0.5, abs=0.04)
+
+    @pytest.mark.parametrize(
+        "options", [{"ofset": 1}, {"offset": (1, 2, 3)}, {"offset": "far"}, {"offset": (0, np.nan)}]
+    )
+    def test_refuses_options_that_make_no_sense(self, options):
+        with pytest.raises(InputError):
+            BncUncertainty("disc").draw(np.random.default_rng(0), options)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"guidance": "sct"},
+        {"guidance": "safe_residual"},
+        {"reward": "dense"},
+        {"observation": "image"},
+        {"uncertainty": "none"},
+        {"station": "hardware"},
+        {"explored": (0, 6)},
+    ],
+)
+def test_refuses_what_makes_no_sense(wrong):
+    with pytest.raises(InputError):
+        make_env(**wrong)

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from pydrake.multibody.tree import JacobianWrtVariable
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.stations.arm import controller_model
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.models.errors import InputError
+from guiderail.models.robots.iiwa import READY_POSTURE
+from guiderail.systems.joint_torque_wrench import JointTorqueWrench
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return controller_model(BncWorkcell())
+
+
+def estimate(arm, wrench, seconds=0.005, **options):
+    """What is estimated from the joint torques that a wrench (6,), force first, causes."""
+    plant, model = arm
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, READY_POSTURE)
+    J = plant.CalcJacobianSpatialVelocity(
+        context, JacobianWrtVariable.kV, model.tool_centre, np.zeros(3), model.target, model.target
+    )
+    system = JointTorqueWrench(
+        plant, model.target, model.tool_centre, **({"period": 0.01, "time_constant": 0.0} | options)
+    )
+    simulator = Simulator(system)
+    system.get_positions_input_port().FixValue(simulator.get_mutable_context(), READY_POSTURE)
+    torque = J.T @ np.concatenate([wrench[3:], wrench[:3]])
+    system.get_external_torque_input_port().FixValue(simulator.get_mutable_context(), torque)
+    simulator.AdvanceTo(seconds)
+    assert not system.HasAnyDirectFeedthrough()
+    return system.get_wrench_output_port().Eval(simulator.get_context()).copy()
+
+
+def test_gives_back_the_wrench_that_the_joints_feel(arm):
+    wrench = np.array([5.0, -3.0, 12.0, 0.2, -0.1, 0.3])
+    np.testing.assert_allclose(estimate(arm, wrench, damping=0.0), wrench, atol=1e-9)
+    np.testing.assert_allclose(estimate(arm, wrench), wrench, rtol=0.05, atol=0.05)
+
+
+def test_filter_is_a_first_order_low_pass(arm):
+    wrench = np.array([0.0, 0.0, 10.0, 0.0, 0.0, 0.0])
+    filtered = estimate(arm, wrench, seconds=0.045, time_constant=0.1, damping=0.0)  # events at 0, 10, 20, 30, 40 ms
+    np.testing.assert_allclose(filtered, wrench * (1.0 - np.exp(-0.5)), atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"time_constant": -1.0}, {"damping": -1.0}])
+def test_refuses_what_makes_no_sense(arm, wrong):
+    with pytest.raises(InputError):
+        estimate(arm, np.zeros(6), **wrong)

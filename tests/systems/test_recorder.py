@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
+from pydrake.trajectories import PiecewisePolynomial
+
+from guiderail.models.errors import InputError
+from guiderail.systems.recorder import Recorder
+
+PERIOD = 0.25  # exact in binary: events fall on the same instants
+
+
+@pytest.fixture
+def ramp():
+    """A command that counts its periods (0, 1, 2, …), held, and the time itself."""
+    builder = DiagramBuilder()
+    line = PiecewisePolynomial.FirstOrderHold([0.0, 100.0], np.array([[0.0, 400.0]]))
+    source = builder.AddSystem(TrajectorySource(line))
+    hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
+    recorder = builder.AddSystem(Recorder({"command": 1, "measured": 1}, num_samples=4, period=PERIOD))
+    builder.Connect(source.get_output_port(), hold.get_input_port())
+    builder.Connect(hold.get_output_port(), recorder.get_signal_input_port("command"))
+    builder.Connect(source.get_output_port(), recorder.get_signal_input_port("measured"))
+    return Simulator(builder.Build()), recorder
+
+
+def read(simulator, recorder):
+    return recorder.recording(recorder.GetMyContextFromRoot(simulator.get_context()))
+
+
+def test_a_row_is_a_command_and_what_it_led_to(ramp):
+    simulator, recorder = ramp
+    simulator.AdvanceTo(3.5 * PERIOD)
+    recording = read(simulator, recorder)
+    np.testing.assert_array_equal(recording["command"][:, 0], [0, 1, 2])
+    np.testing.assert_allclose(recording["measured"][:, 0], [1, 2, 3])
+    np.testing.assert_allclose(recording.times, [0, PERIOD, 2 * PERIOD])
+
+
+def test_stops_when_it_is_full(ramp):
+    simulator, recorder = ramp
+    simulator.AdvanceTo(20 * PERIOD)
+    assert len(read(simulator, recorder).times) == 4
+
+
+def test_a_reset_clears_it(ramp):
+    simulator, recorder = ramp
+    pristine = simulator.get_context().Clone()
+    simulator.AdvanceTo(3.5 * PERIOD)
+    simulator.get_mutable_context().SetTimeStateAndParametersFrom(pristine)
+    assert len(read(simulator, recorder).times) == 0
+
+
+def test_what_was_read_is_a_copy(ramp):
+    simulator, recorder = ramp
+    simulator.AdvanceTo(2.5 * PERIOD)
+    first = read(simulator, recorder)
+    first["command"][:] = -1.0
+    assert (read(simulator, recorder)["command"] >= 0.0).all()
+
+
+@pytest.mark.parametrize("arguments", [({}, 1, 0.1), ({"a": 0}, 1, 0.1), ({"a": 1}, 0, 0.1), ({"a": 1}, 1, 0.0)])
+def test_refuses_what_makes_no_sense(arguments):
+    with pytest.raises(InputError):
+        Recorder(*arguments)

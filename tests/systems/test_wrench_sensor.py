@@ -1,0 +1,111 @@
+"""The sensor on a tool that hangs on a moving wrist: it must feel what touches the tool and nothing else."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInertia, UnitInertia
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from guiderail.models.errors import InputError
+from guiderail.systems.wrench_sensor import WrenchSensor
+
+PERIOD = 0.001
+R_WAXES = RotationMatrix(RollPitchYaw(0.3, -0.2, 0.9))
+
+
+class SwingingTool:
+    """A pendulum whose bob is welded to its rod by the wrist, with a centre of compliance off its centre of mass."""
+
+    def __init__(self, time_constant=0.0):
+        builder = DiagramBuilder()
+        self.plant = plant = builder.AddSystem(MultibodyPlant(PERIOD))
+        plant.SetUseSampledOutputPorts(False)
+        rod = plant.AddRigidBody("rod", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
+        self.joint = plant.AddJoint(RevoluteJoint("swing", plant.world_frame(), rod.body_frame(), [0.0, 1.0, 0.0]))
+        self.tool = plant.AddRigidBody(
+            "tool", SpatialInertia(0.7, [0.02, 0.01, -0.05], UnitInertia(0.01, 0.012, 0.008))
+        )
+        wrist = plant.WeldFrames(
+            rod.body_frame(), self.tool.body_frame(), RigidTransform(RollPitchYaw(0.4, 0.1, -0.3), [0.0, 0.1, -0.4])
+        )
+        self.X_ToolP = RigidTransform(RollPitchYaw(0.2, 0.5, 0.1), [0.01, -0.03, -0.12])
+        centre = plant.AddFrame(FixedOffsetFrame("P", self.tool.body_frame(), self.X_ToolP))
+        plant.Finalize()
+        self.sensor = builder.AddSystem(WrenchSensor(plant, wrist, [self.tool], centre, R_WAXES, PERIOD, time_constant))
+        self.sensor.connect(builder, plant)
+        self.simulator = Simulator(builder.Build())
+        self.context = self.simulator.get_mutable_context()
+        self.plant_context = plant.GetMyMutableContextFromRoot(self.context)
+        self.centre = centre
+
+    def push(self, force, torque):
+        applied = ExternallyAppliedSpatialForce()
+        applied.body_index = self.tool.index()
+        applied.p_BoBq_B = self.X_ToolP.translation()
+        applied.F_Bq_W = SpatialForce(tau=np.array(torque), f=np.array(force))
+        self.plant.get_applied_spatial_force_input_port().FixValue(self.plant_context, Value([applied]))
+
+    @property
+    def wrench(self):
+        return self.sensor.get_wrench_output_port().Eval(self.sensor.GetMyContextFromRoot(self.context)).copy()
+
+
+def test_swinging_freely_it_feels_nothing():
+    """Weight, centripetal force and angular acceleration are all the tool's own."""
+    swinging = SwingingTool()
+    swinging.joint.set_angle(swinging.plant_context, 1.0)
+    swinging.joint.set_angular_rate(swinging.plant_context, 2.0)
+    for step in range(1, 400, 40):
+        swinging.simulator.AdvanceTo(step * PERIOD)
+        np.testing.assert_allclose(swinging.wrench, np.zeros(6), atol=1e-9)
+
+
+def test_swinging_and_pushed_it_feels_the_push_at_the_centre():
+    swinging = SwingingTool()
+    swinging.joint.set_angle(swinging.plant_context, 0.5)
+    force, torque = np.array([1.0, -2.0, 3.0]), np.array([0.1, 0.2, -0.3])
+    swinging.push(force, torque)
+    swinging.simulator.AdvanceTo(0.2)
+    R = R_WAXES.matrix().T
+    np.testing.assert_allclose(swinging.wrench, np.concatenate([R @ force, R @ torque]), atol=1e-9)
+
+
+def test_filter_is_a_first_order_low_pass():
+    """A step of force arrives by 1 − e^(−t/τ)."""
+    swinging = SwingingTool(time_constant=0.05)
+    swinging.joint.Lock(swinging.plant_context)
+    swinging.simulator.AdvanceTo(0.01)
+    np.testing.assert_allclose(swinging.wrench, np.zeros(6), atol=1e-9)
+    swinging.push([0.0, 0.0, 2.0], [0.0, 0.0, 0.0])
+    swinging.simulator.AdvanceTo(0.06 + 0.5 * PERIOD)
+    samples = 51  # the events at 10 … 60 ms
+    expected = 2.0 * (1.0 - np.exp(-samples * PERIOD / 0.05))
+    assert np.linalg.norm(swinging.wrench[:3]) == pytest.approx(expected, rel=1e-6)
+
+
+def test_starts_at_zero_and_never_feeds_through():
+    swinging = SwingingTool()
+    np.testing.assert_array_equal(swinging.wrench, np.zeros(6))
+    assert not swinging.sensor.HasAnyDirectFeedthrough()
+    names = [swinging.sensor.get_input_port(i).get_name() for i in range(swinging.sensor.num_input_ports())]
+    assert names == ["reaction_forces", "body_poses", "body_spatial_velocities", "body_spatial_accelerations"]
+
+
+@pytest.mark.parametrize(("period", "time_constant"), [(0.0, 0.1), (0.01, -1.0), (0.01, np.inf)])
+def test_refuses_what_makes_no_sense(period, time_constant):
+    swinging = SwingingTool()
+    wrist = swinging.plant.GetJointByName("rod_welds_to_tool")
+    with pytest.raises(InputError):
+        WrenchSensor(swinging.plant, wrist, [swinging.tool], swinging.centre, R_WAXES, period, time_constant)
+
+
+def test_refuses_a_tool_that_hangs_elsewhere():
+    swinging = SwingingTool()
+    rod = swinging.plant.GetBodyByName("rod")
+    wrist = swinging.plant.GetJointByName("rod_welds_to_tool")
+    with pytest.raises(InputError, match="child of"):
+        WrenchSensor(swinging.plant, wrist, [rod], swinging.centre, R_WAXES, PERIOD, 0.0)

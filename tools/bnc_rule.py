@@ -1,0 +1,73 @@
+"""What a BNC policy has to beat, and that it can be beaten: `python -m guiderail.tools.bnc_rule --trials 100`.
+
+Two policies without learning: the demonstrations alone, and a hand-written rule that moves against the contact torque
+while the plug stands on the rim. The first must mostly fail where the jack is not where it should be, the second must
+not: then there is something to learn, and it can be learned from what a policy sees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import numpy as np
+
+from guiderail.diagrams.env import GuidedEnv
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, POSE_CENTRE, POSE_SCALE, make_env
+from guiderail.models.objects.bnc_motion import MM, RIM
+
+GAIN = 1.5  # of the action per scaled contact torque
+# While the demonstrations search the rim, control steps.
+SEARCH = (60, 185)
+PUSHING = 0.2  # scaled force along z from which the plug counts as standing on something
+# Where [time, pose, wrench] lie in an observation.
+TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y = 0, 3, 9, 10, 11
+
+
+def reactive_rule(observation: np.ndarray) -> np.ndarray:
+    """Moves in x and y against the torque, which says on which side of its mouth the plug stands; (2,)."""
+    step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
+    on_rim = observation[Z] > (RIM - 1.2 * MM - POSE_CENTRE[2]) / POSE_SCALE[2]
+    if not (SEARCH[0] < step < SEARCH[1] and on_rim and observation[FORCE_Z] > PUSHING):
+        return np.zeros(2)
+    return np.clip(GAIN * np.array([-observation[TORQUE_Y], observation[TORQUE_X]]), -1.0, 1.0)
+
+
+def standing_still(observation: np.ndarray) -> np.ndarray:
+    """The demonstrations alone."""
+    return np.zeros(2)
+
+
+def success_rate(env: GuidedEnv, policy, trials: int, seed: int = 1_000_000) -> tuple[float, float]:
+    """Part of `trials` held-out episodes that end locked, each with an offset of its own, and their worst violation."""
+    successes, worst = 0, -np.inf
+    for trial in range(trials):
+        observation, _ = env.reset(seed=seed + trial, options={"held_out": True, "new_run": True})
+        finished, info = False, {}
+        while not finished:
+            observation, _, terminated, truncated, info = env.step(policy(observation))
+            finished = terminated or truncated
+            worst = max(worst, info["constraint_violation"])
+        successes += info["is_success"]
+    return successes / trials, worst
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Prints the rates."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("--trials", type=int, default=40)
+    parser.add_argument("--station", default="rails")
+    parser.add_argument("--guidance", default="kgrl", help="what the rule acts through")
+    options = parser.parse_args(arguments)
+    rates = {}
+    for uncertainty in ("known", "calibration", "disc"):
+        env = make_env(guidance=options.guidance, uncertainty=uncertainty, station=options.station)
+        rates[uncertainty] = {
+            "demonstration": success_rate(env, standing_still, options.trials)[0],
+            "rule": success_rate(env, reactive_rule, options.trials)[0],
+        }
+        print(json.dumps({uncertainty: rates[uncertainty], "trials": options.trials}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
