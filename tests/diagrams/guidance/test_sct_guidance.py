@@ -1,0 +1,158 @@
+"""The sct guidance without an arm: a robot that is where it was told to be one period ago."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
+
+from guiderail.diagrams.guidance.sct import ActiveConstraintFilter, SctGuidance
+from guiderail.diagrams.task import exact_period
+from guiderail.models.skills import load_skill
+
+PERIOD = exact_period(0.01)
+MUG = {"mug_tip": RigidTransform()}
+START = np.array([0.0, -0.28, 0.12, 0.0, 0.0, 0.0])
+
+
+class Rig:
+    def __init__(self, guidance, start=START):
+        self.guidance = guidance
+        builder = DiagramBuilder()
+        builder.AddSystem(guidance)
+        self.robot = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
+        builder.Connect(guidance.GetOutputPort("desired_pose"), self.robot.get_input_port())
+        builder.Connect(self.robot.get_output_port(), guidance.GetInputPort("pose"))
+        for name in ("action", "wrench"):
+            builder.ExportInput(guidance.GetInputPort(name), name)
+        self.diagram = builder.Build()
+        self.simulator = Simulator(self.diagram)
+        self.context = self.simulator.get_mutable_context()
+        self.robot.GetMyMutableContextFromRoot(self.context).SetDiscreteState(start)
+        self.diagram.GetInputPort("wrench").FixValue(self.context, np.zeros(6))
+        self.action = self.diagram.GetInputPort("action").FixValue(
+            self.context, np.zeros(guidance.GetInputPort("action").size())
+        )
+        self.steps = 0
+
+    def initialize(self):
+        self.simulator.Initialize()
+        return self
+
+    def step(self, action):
+        self.action.GetMutableData().set_value(action)
+        self.steps += 1
+        self.simulator.AdvanceTo(self.steps * PERIOD)
+        return self.value("desired_pose")
+
+    def value(self, name):
+        port = self.guidance.GetOutputPort(name)
+        return port.Eval(self.guidance.GetMyContextFromRoot(self.context)).copy()
+
+
+@pytest.fixture
+def skill():
+    return load_skill("pouring")
+
+
+def test_has_the_ports_of_all_guidance(skill):
+    guidance = SctGuidance(skill, MUG, PERIOD)
+    inputs = [guidance.get_input_port(i).get_name() for i in range(guidance.num_input_ports())]
+    outputs = [guidance.get_output_port(i).get_name() for i in range(guidance.num_output_ports())]
+    assert inputs == ["action", "pose", "wrench"]
+    assert outputs[:2] == ["desired_pose", "fallback"]
+    assert {"state", "transition_distance", "progress"} <= set(outputs)
+
+
+def test_starts_where_the_robot_is_and_stays_there_without_an_input(skill):
+    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+    for _ in range(5):
+        np.testing.assert_allclose(rig.step(np.zeros(3)), START, atol=1e-9)
+
+
+def test_an_action_counts_from_the_next_instant_on_for_a_whole_period(skill):
+    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+    first = rig.step(np.array([0.0, 1.0, 0.0]))
+    np.testing.assert_allclose(first - START, [0, 0.15 * PERIOD, 0, 0, 0, 0], atol=1e-9)
+    for k in range(2, 8):
+        moved = rig.step(np.array([0.0, 1.0, 0.0])) - START
+        np.testing.assert_allclose(moved[1], k * 0.15 * PERIOD, atol=1e-9)
+
+
+def test_goes_through_all_states_and_says_how_far_it_is(skill):
+    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+    states, progress, worst = [], [], 0.0
+    for _ in range(600):
+        rig.step(np.array([0.0, 0.9, -0.3]))
+        states.append(int(rig.value("state")[0]))
+        progress.append(rig.value("progress")[0])
+        worst = max(worst, rig.value("commanded_violation")[0])
+    assert sorted(set(states)) == [0, 1, 2]
+    assert worst <= 1e-9
+    assert rig.value("transition_distance")[0] == pytest.approx(0.0, abs=0.02)
+    assert progress[-1] == pytest.approx(sum(s.weight * (s.starts_at - s.ends_at) for s in skill.states), abs=0.02)
+
+
+def test_objects_can_be_moved_at_a_reset(skill):
+    """Everything happens relative to the object: the same inputs draw the same path elsewhere."""
+    paths = []
+    for shift in (np.zeros(3), np.array([0.1, -0.2, 0.05])):
+        guidance = SctGuidance(skill, MUG, PERIOD)
+        rig = Rig(guidance, START + np.concatenate([shift, np.zeros(3)]))
+        guidance.set_frames(rig.context, {"mug_tip": RigidTransform(shift)})
+        rig.initialize()
+        path = np.array([rig.step(np.array([0.2, 0.9, -0.3])) for _ in range(300)])
+        path[:, :3] -= shift
+        paths.append(path)
+    np.testing.assert_allclose(paths[0], paths[1], atol=1e-9)
+
+
+def test_without_active_constraints_it_does_what_it_is_asked(skill):
+    rig = Rig(SctGuidance(skill, MUG, PERIOD, active_constraints=False)).initialize()
+    for _ in range(200):
+        desired = rig.step(np.array([0.0, 0.0, -1.0]))
+    assert desired[2] < 0.12 - 0.25  # through the table
+
+
+def test_a_velocity_is_filtered_like_anything_else(skill):
+    velocity = load_skill("end_effector_velocity")
+    rig = Rig(SctGuidance(skill, MUG, PERIOD, input_mapping=velocity)).initialize()
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        rig.step(rng.choice([-1.0, 1.0], 6))
+        assert rig.value("commanded_violation")[0] <= 1e-9
+
+
+def test_the_filter_takes_requests_from_anyone(skill):
+    """Behind a source that has nothing to do with a template: a constant pose inside the mug."""
+    builder = DiagramBuilder()
+    safe = builder.AddSystem(ActiveConstraintFilter(skill, MUG, PERIOD))
+    wish = builder.AddSystem(ConstantVectorSource(np.array([0.0, 0.0, -0.05, 0.0, 0.0, 2.0])))
+    robot = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
+    builder.Connect(wish.get_output_port(), safe.GetInputPort("requested_pose"))
+    builder.Connect(robot.get_output_port(), safe.GetInputPort("pose"))
+    builder.Connect(safe.GetOutputPort("desired_pose"), robot.get_input_port())
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    robot.GetMyMutableContextFromRoot(context).SetDiscreteState(START)
+    simulator.Initialize()
+    for k in range(1, 400):
+        simulator.AdvanceTo(k * PERIOD)
+        assert safe.GetOutputPort("commanded_violation").Eval(safe.GetMyContextFromRoot(context))[0] <= 1e-9
+    desired = safe.GetOutputPort("desired_pose").Eval(safe.GetMyContextFromRoot(context))
+    assert np.linalg.norm(desired[:3]) < 0.09  # as near as it is allowed
+
+
+def test_a_persons_device_and_a_policy_differ_in_one_connection(skill):
+    """Figure 3.1: whoever is connected to `action` drives."""
+    diagrams = []
+    for source in (ConstantVectorSource(np.array([0.0, 1.0, 0.0])), ZeroOrderHold(PERIOD, 3)):
+        builder = DiagramBuilder()
+        guidance = builder.AddSystem(SctGuidance(skill, MUG, PERIOD))
+        device = builder.AddSystem(source)
+        builder.Connect(device.get_output_port(), guidance.GetInputPort("action"))
+        builder.ExportInput(guidance.GetInputPort("pose"), "pose")
+        diagrams.append(builder.Build())
+    assert all(diagram.HasInputPort("pose") for diagram in diagrams)
