@@ -1,5 +1,6 @@
 """A linearly constrained null-space movement primitive in a diagram (thesis, equations 4.21 and 5.1)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,14 +36,17 @@ class LcNsKmpSystem(LeafSystem):
         input_ports:
         - null_space_action
         - history
+        - history_length
         output_ports:
         - output
         - constraint_violation
         - fallback
 
     ``null_space_action`` (O,) is the policy's, in [−1, 1] per output, held for a control step; ``history`` (P*O,) is
-    row-major, oldest output first (`HistoryBuffer`), and there is no such port where P = 0. ``output`` (O,) is what to
-    command. ``constraint_violation`` (1,) is max(c − G y) of that command: negative is slack, −1e30 where there is no
+    row-major, oldest output first (`HistoryBuffer`), and there is no such port where P = 0. ``history_length`` (1,) is
+    there only where there are primitives with shorter histories: which of them speaks (`HistoryLengthSchedule`). Each
+    is given the newest part of the one history, so that whichever speaks begins where the last command ended.
+    ``output`` (O,) is what to command. ``constraint_violation`` (1,) is max(c − G y) of that command: negative is slack, −1e30 where there is no
     constraint. ``fallback`` (1,) is 1 where no window within the constraints was found and the last safe command is
     repeated.
 
@@ -53,22 +57,32 @@ class LcNsKmpSystem(LeafSystem):
     #: What `constraint_violation` says where there is no constraint: finite, so that it can be logged and reduced.
     UNCONSTRAINED = -1e30
 
-    def __init__(self, primitive: LcNsKmp, gain: np.ndarray | None, period: float):
+    def __init__(
+        self,
+        primitive: LcNsKmp,
+        gain: np.ndarray | None,
+        period: float,
+        shorter: Sequence[tuple[LcNsKmp, np.ndarray]] = (),
+    ):
         """
         Args:
             primitive: O outputs, P past outputs.
             gain: (O,), what an action of one is worth in raw null-space units (`models.primitives.gains`); ones unless
                 given.
             period: seconds between control steps, positive: the reference's own clock.
+            shorter: primitives of the same motion and constraints with histories of 1 … P − 1 outputs, and their gains.
 
         Raises:
-            InputError: if the gain has the wrong shape or is not finite, or the period is not positive.
+            InputError: if a gain has the wrong shape or is not finite, the period is not positive, or a shorter history
+                is not shorter.
         """
         super().__init__()
         outputs = primitive.num_outputs
-        self._gain = np.ones(outputs) if gain is None else np.array(gain, dtype=float)
-        if self._gain.shape != (outputs,) or not np.isfinite(self._gain).all():
-            raise InputError(f"the gain must be {outputs} finite numbers, not {gain}")
+        if any(not 0 < other.history < primitive.history for other, _ in shorter):
+            raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
+        self._voices = {
+            voice.history: (voice, _checked_gain(one, outputs)) for voice, one in [(primitive, gain), *shorter]
+        }
         if not period > 0:
             raise InputError(f"the control period must be positive, not {period} s")
         self._primitive, self._period = primitive, period
@@ -77,6 +91,7 @@ class LcNsKmpSystem(LeafSystem):
         self._history_port = (
             self.DeclareVectorInputPort("history", primitive.history * outputs) if primitive.history else None
         )
+        self._length_port = self.DeclareVectorInputPort("history_length", 1) if shorter else None
         self._step = self.DeclareDiscreteState(1)
         start = primitive.constraints.nearest(primitive.reference.means[0])
         self._last_safe = self.DeclareDiscreteState(start)
@@ -87,8 +102,7 @@ class LcNsKmpSystem(LeafSystem):
             self.discrete_state_ticket(self._step),
             self.discrete_state_ticket(self._last_safe),
         }
-        if self._history_port is not None:
-            sources.add(self._history_port.ticket())
+        sources |= {port.ticket() for port in (self._history_port, self._length_port) if port is not None}
         self._command = self.DeclareCacheEntry(
             "command", ValueProducer(allocate=Value[object], calc=self._calc_command), sources
         )
@@ -110,6 +124,16 @@ class LcNsKmpSystem(LeafSystem):
         if self._history_port is None:
             raise InputError("this primitive has no history (P = 0), hence no such port")
         return self._history_port
+
+    def get_history_length_input_port(self) -> InputPort:
+        """Which of the histories is used, (1,).
+
+        Raises:
+            InputError: if there is only one.
+        """
+        if self._length_port is None:
+            raise InputError("this system has one primitive, hence no such port: give it shorter ones")
+        return self._length_port
 
     def get_output_output_port(self) -> OutputPort:
         """What to command, (O,)."""
@@ -133,12 +157,14 @@ class LcNsKmpSystem(LeafSystem):
 
     def _calc_command(self, context: Context, value: Value) -> None:
         step = int(context.get_discrete_state(self._step).value()[0])
-        action = self._gain * self._action_port.Eval(context)
+        length = self._primitive.history if self._length_port is None else int(self._length_port.Eval(context)[0])
+        primitive, gain = self._voices[length]
+        action = gain * self._action_port.Eval(context)
         history = None
         if self._history_port is not None:
-            history = self._history_port.Eval(context).reshape(self._primitive.history, self._primitive.num_outputs)
+            history = self._history_port.Eval(context).reshape(-1, primitive.num_outputs)[-length:]
         try:
-            output, fallback = self._primitive.predict(step, action, history).output, 0.0
+            output, fallback = primitive.predict(step, action, history).output, 0.0
         except UnsolvableError:
             output, fallback = np.array(context.get_discrete_state(self._last_safe).value()), 1.0
         value.set_value(_Command(step, output, fallback))
@@ -153,3 +179,10 @@ class LcNsKmpSystem(LeafSystem):
 
     def _calc_fallback(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._command.Eval(context).fallback)
+
+
+def _checked_gain(gain: np.ndarray | None, outputs: int) -> np.ndarray:
+    checked = np.ones(outputs) if gain is None else np.array(gain, dtype=float)
+    if checked.shape != (outputs,) or not np.isfinite(checked).all():
+        raise InputError(f"the gain must be {outputs} finite numbers, not {gain}")
+    return checked

@@ -6,6 +6,7 @@ from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
 
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
 from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 from guiderail.systems.residual import Residual
 from guiderail.systems.safety_filter import SafetyFilter
@@ -116,7 +117,12 @@ class KgrlGuidance(PrimitiveGuidance):
 
 
 class SkgrlGuidance(PrimitiveGuidance):
-    """sKGRL (equations 5.1-5.3): KGRL whose motion passes through where it has been."""
+    """sKGRL (equations 5.1-5.3): KGRL whose motion passes through where it has been.
+
+    With an adaptive history it passes through less of it in contact, so that it answers to forces as quickly as KGRL
+    there, and is as smooth as ever elsewhere. The shortest history is one output, never none: every command still
+    begins where the last one ended, whatever the length does.
+    """
 
     def __init__(self, skill: PrimitiveSkill):
         super().__init__()
@@ -124,7 +130,19 @@ class SkgrlGuidance(PrimitiveGuidance):
         action, pose = self._export_inputs(builder, skill)
         primitive = skill.primitive(history=True)
         gains = skill.null_space_gains(primitive)
-        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, skill.control_period))
+        shorter = [
+            (one, skill.null_space_gains(one)) for one in map(skill.primitive_of_length, skill.shorter_histories)
+        ]
+        kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, skill.control_period, shorter))
+        if shorter:
+            schedule = builder.AddNamedSystem(
+                "history_length",
+                HistoryLengthSchedule(
+                    (skill.history, *skill.shorter_histories), skill.control_period, wrench_size=skill.wrench_size
+                ),
+            )
+            builder.ConnectInput("wrench", schedule.get_wrench_input_port())
+            builder.Connect(schedule.get_history_length_output_port(), kmp.get_history_length_input_port())
         history = builder.AddNamedSystem(
             "history", HistoryBuffer(skill.num_outputs, skill.history, skill.control_period)
         )

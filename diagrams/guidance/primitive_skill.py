@@ -1,6 +1,6 @@
 """A skill learned from demonstrations: what every guidance made of a movement primitive is built from."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,7 @@ class PrimitiveSkill:
         control_period: s, seconds between control steps.
         history: P, past outputs that sKGRL's motion passes through.
         history_variance: ρ [output²], how exactly it does.
+        adaptive_history: whether sKGRL's history halves, down to a single output, while the robot touches something.
         history_source: "commanded" or "measured": what counts as the past. Commanded under impedance control (else the
             command follows the robot, and the push dies); measured where a person may push a robot that tracks well.
         horizon: H, future points that constraints are kept at.
@@ -43,6 +44,7 @@ class PrimitiveSkill:
     history: int = 10
     history_variance: float = 1e-6
     history_source: str = "commanded"
+    adaptive_history: bool = False
     horizon: int = 40
     lambda_: float = 6.0
     beta: float = 6.0
@@ -85,6 +87,19 @@ class PrimitiveSkill:
     def selection(self) -> np.ndarray:
         """(O, A): puts an action's entries where the outputs that it moves are."""
         return np.eye(self.num_outputs)[:, list(self.explored_outputs)]
+
+    @property
+    def shorter_histories(self) -> tuple[int, ...]:
+        """The lengths that an adaptive history has beside P: P/2, P/4, … 1."""
+        lengths, length = [], self.history
+        while self.adaptive_history and length > 1:
+            length //= 2
+            lengths.append(length)
+        return tuple(lengths)
+
+    def primitive_of_length(self, history: int) -> LcNsKmp:
+        """sKGRL's movement primitive with another history."""
+        return replace(self, history=history).primitive(history=True)
 
     def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
         """The movement primitive of sKGRL (with history), KGRL (without) or the demonstrations alone."""

@@ -83,6 +83,7 @@ def make_env(
     history: int = 10,
     history_variance: float = 1e-8,
     history_source: str = "commanded",
+    adaptive_history: bool = False,
     gains: tuple[float, ...] | None = None,
 ) -> GuidedEnv:
     """`gymnasium.make("guiderail/BncConnector-v0", ...)`.
@@ -96,7 +97,7 @@ def make_env(
         render_mode: None, "human" (a browser view) or "rgb_array".
         hold: control steps per decision.
         explored: which of x, y, z, Rz, Ry, Rx an action moves, by number.
-        kappa, history, history_variance, history_source, gains: see `PrimitiveSkill`; the histories are sKGRL's.
+        kappa, history, history_variance, history_source, adaptive_history, gains: see `PrimitiveSkill`; the histories are sKGRL's.
     """
     check_guidance(guidance, SENSIBLE_GUIDANCE, "BncConnector")
     if reward not in ("sparse", "shaped"):
@@ -113,6 +114,7 @@ def make_env(
         history=history,
         history_variance=history_variance,
         history_source=history_source,
+        adaptive_history=adaptive_history,
         gains=None if gains is None else tuple(gains),
         isotropic_groups=((0, 1, 2), (3, 4, 5)),
     )

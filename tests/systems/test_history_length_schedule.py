@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.errors import InputError
+from guiderail.systems.history_length_schedule import HistoryLengthSchedule
+
+PERIOD = 0.125
+
+
+def lengths_under(forces, **arguments):
+    """The history length after each control step with these forces."""
+    system = HistoryLengthSchedule([1, 2, 5, 10], PERIOD, **arguments)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    wrench = system.get_wrench_input_port().FixValue(context, np.zeros(6))
+    simulator.Initialize()
+    lengths = []
+    for n, force in enumerate(forces, start=1):
+        wrench.GetMutableData().set_value([0.0, 0.0, force, 9.0, 9.0, 9.0])
+        simulator.AdvanceTo((n + 0.5) * PERIOD)
+        lengths.append(int(system.get_history_length_output_port().Eval(context)[0]))
+    return lengths
+
+
+def test_shrinks_in_contact_and_grows_back_patiently_without_skipping():
+    lengths = lengths_under([0, 0, 3, 3, 3, 3] + [0] * 9, patience=3)
+    assert lengths == [10, 10, 5, 2, 1, 1, 1, 1, 2, 2, 2, 5, 5, 5, 10]
+
+
+def test_noise_about_a_threshold_changes_nothing():
+    noisy = 1.5 + 0.4 * np.array([1, -1] * 20)
+    assert set(lengths_under(noisy)) == {10}
+    assert lengths_under([3.0, 3.0, 3.0, *noisy], patience=1)[3:] == [1] * 40
+
+
+def test_a_touch_in_between_starts_the_waiting_anew():
+    assert lengths_under([3, 3, 3, 0, 0, 3, 0, 0], patience=3)[2:] == [1] * 6
+
+
+def test_torques_are_no_contact():
+    assert lengths_under([0.0] * 5) == [10] * 5
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"touch": 1.0, "release": 2.0}, {"patience": 0}, {"wrench_size": 0}, {"lengths": []}, {"lengths": [0, 3]}],
+)
+def test_what_makes_no_sense_is_refused(arguments):
+    with pytest.raises(InputError):
+        HistoryLengthSchedule(arguments.pop("lengths", [1, 2]), PERIOD, **arguments)
