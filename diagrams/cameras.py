@@ -73,8 +73,17 @@ def check_rendering() -> None:
 
 
 def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> tuple[Meshcat, MeshcatVisualizer]:
-    """Adds a browser view, on this machine only: Meshcat would listen on every interface by default."""
-    meshcat = Meshcat(MeshcatParams(host="localhost"))
+    """Adds a browser view, on this machine only: Meshcat would listen on every interface by default.
+
+    Raises:
+        InputError: if the environment forbids Drake to open a port at all.
+    """
+    try:
+        meshcat = Meshcat(MeshcatParams(host="localhost"))
+    except RuntimeError as error:
+        raise InputError(
+            f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"
+        ) from error
     parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=1 / 50)
     visualizer = builder.AddNamedSystem("meshcat", MeshcatVisualizer(meshcat, parameters))
     builder.Connect(query, visualizer.query_object_input_port())
