@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
+from pydrake.geometry import Box, CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -21,6 +21,8 @@ FILTERED_PAIRS = [
     (("lug_0", "lug_1", "barrel"), ("seat",)),
 ]
 
+# The task board is seen and not touched; the locked plug's mouth lies a little below the jack's bottom.
+BOARD, BOARD_CLEARANCE, BOARD_COLOUR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]  # [m]
 LOCKED_HEIGHT = 0.6e-3  # [m]
 LOCKED_ANGLE = np.deg2rad(4.0)
 
@@ -55,10 +57,13 @@ class BncWorkcell:
         return self.X_WJ @ self.X_JT
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
-        """Adds the jack, on a frame that `set_jack_offset` moves."""
+        """Adds the jack, on a frame that `set_jack_offset` moves, and a board under it to look at."""
         (model,) = Parser(plant).AddModels(str(JACK_SDF))
         mount = plant.AddFrame(FixedOffsetFrame("jack_mount", plant.world_frame(), self.X_WJ))
         plant.WeldFrames(mount, plant.GetFrameByName("jack", model))
+        depth, width, thickness = BOARD
+        below = RigidTransform(np.array(self.p_WJ) - [0.0, 0.0, BOARD_CLEARANCE + thickness / 2])
+        plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOUR)
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
         """Adds the plug, on a frame that `set_grasp_offset` moves."""
