@@ -97,7 +97,8 @@ def make_env(
         render_mode: None, "human" (a browser view) or "rgb_array".
         hold: control steps per decision.
         explored: which of x, y, z, Rz, Ry, Rx an action moves, by number.
-        kappa, history, history_variance, history_source, adaptive_history, gains: see `PrimitiveSkill`; the histories are sKGRL's.
+        kappa, history, history_variance, history_source, adaptive_history, gains: see `PrimitiveSkill`; the histories
+            are sKGRL's.
     """
     check_guidance(guidance, SENSIBLE_GUIDANCE, "BncConnector")
     if reward not in ("sparse", "shaped"):
@@ -327,9 +328,9 @@ def _add_view(
     return None
 
 
-def view_of_jack(workcell: BncWorkcell, distance: float = 0.14, height: float = 0.05) -> RigidTransform:
+def view_of_jack(workcell: BncWorkcell, distance: float = 0.16, height: float = 0.06) -> RigidTransform:
     """A camera that looks slightly down at the jack from the side that faces away from the arm."""
-    target = np.array(workcell.p_WJ) + [0.0, 0.0, 0.012]
+    target = np.array(workcell.p_WJ) + [0.0, 0.0, 0.02]
     eye = target + [0.8 * distance, -0.6 * distance, height]
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
