@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
+from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
 from guiderail.systems.caching import declare_array_cache
 from guiderail.systems.skill_frames import SkillFrames

@@ -10,9 +10,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem, ValueProducer
 
+from guiderail.models.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.errors import InputError
-from guiderail.models.robots.cartesian_impedance import JointTorques, impedance_torques
-from guiderail.models.robots.pose import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.models.pose_coordinates import orientation_error, pose_to_transform, transform_to_pose
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class CartesianImpedanceController(LeafSystem):
     """Lets a tool centre P give way around a desired pose as a spring and a damper would.
 
     τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits; the law is in
-    `models.robots.cartesian_impedance`. K may be given in the axes of any frame. The orientation's error is a
+    `models.cartesian_impedance`. K may be given in the axes of any frame. The orientation's error is a
     quaternion's, so that no orientation is singular. D follows from K and the arm's inertia at its present posture.
 
     The watchdog. A desired pose counts while it is finite and no older than `timeout`. Where it doesn't, the last one

@@ -16,7 +16,7 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem, ValueProducer
 
 from guiderail.models.errors import InputError
-from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
+from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
+from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
 from guiderail.systems.skill_frames import SkillFrames
 

@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
 
-from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
+from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
 
 

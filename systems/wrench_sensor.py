@@ -11,14 +11,14 @@ from pydrake.multibody.tree import Frame, Joint, RigidBody
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from guiderail.models.errors import InputError
-from guiderail.models.robots.tool_wrench import external_wrench
+from guiderail.models.tool_wrench import external_wrench
 
 
 class WrenchSensor(LeafSystem):
     """The wrench of the surroundings on a tool at its centre of compliance, low-pass filtered.
 
     Behind a wrist (a joint) hangs a rigid tool. What the wrist feels contains the tool's weight and inertia; the sensor
-    removes them (Newton and Euler, `models.robots.tool_wrench`), moves the rest to the centre of compliance P, turns it
+    removes them (Newton and Euler, `models.tool_wrench`), moves the rest to the centre of compliance P, turns it
     into the axes of a frame that is fixed in the world, and filters it by y' = (u − y)/τ, sampled at `period`.
 
     .. pydrake_system::

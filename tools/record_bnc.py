@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +63,8 @@ def record(seeds: range) -> dict[str, np.ndarray]:
 
 def main(path: Path = PATH) -> None:
     """Writes the file."""
-    np.savez_compressed(path, **record(range(100)))
+    arrays: dict[str, Any] = record(range(100))
+    np.savez_compressed(path, **arrays)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import numpy as np
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET, make_env
 from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES
-from guiderail.models.robots.pose import pose_to_transform
+from guiderail.models.pose_coordinates import pose_to_transform
 
 TOLERANCE = 1e-9  # [m] or [rad]
 

@@ -19,9 +19,9 @@ from guiderail.diagrams.stations.station import (
     export_simulation_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.robots.iiwa import CONNECTOR_TOOL_URDF, IIWA_URDF, NUM_JOINTS, READY_POSTURE
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
-from guiderail.models.robots.pose import pose_to_transform
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.wrench_sensor import WrenchSensor

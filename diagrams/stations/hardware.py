@@ -22,9 +22,9 @@ from guiderail.diagrams.stations.arm import add_arm, controller_model, impedance
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance, Station, add_contact_plant
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.robots.iiwa import NUM_JOINTS, READY_POSTURE
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
-from guiderail.models.robots.pose import pose_to_transform
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench

@@ -22,9 +22,9 @@ from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscrete
 from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.robots.iiwa import IIWA_URDF, NUM_JOINTS
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
-from guiderail.models.robots.pose import pose_to_transform
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 from guiderail.systems.contact_watch import ContactWatch
 from guiderail.systems.measured_pose import MeasuredPose

@@ -19,7 +19,7 @@ from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.pouring_rewards import REWARDS, reward_terms
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, Ball
-from guiderail.models.robots.pose import transform_to_pose
+from guiderail.models.pose_coordinates import transform_to_pose
 from guiderail.models.skills import Skill, load_skill
 from guiderail.systems.episode_monitor import Condition, EpisodeMonitor
 from guiderail.systems.reward_system import RewardSystem

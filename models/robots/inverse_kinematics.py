@@ -36,7 +36,9 @@ def solve_inverse_kinematics(
         J = plant.CalcJacobianSpatialVelocity(
             context, JacobianWrtVariable.kV, tool_centre, np.zeros(3), reference, reference
         )
-        error[:3] *= min(1.0, 0.3 / max(np.linalg.norm(error[:3]), 1e-12))  # a large turn in one step goes astray
+        error[:3] *= min(
+            1.0, 0.3 / max(float(np.linalg.norm(error[:3])), 1e-12)
+        )  # a large turn in one step goes astray
         q = q + J.T @ np.linalg.solve(J @ J.T + 1e-8 * np.eye(6), error)
     else:
         raise InputError(f"the arm can't reach {X.translation().round(3)} m: move the workcell nearer")

@@ -3,7 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.robots.pose import pose_to_transform
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.skills import parse_skill
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 

@@ -5,9 +5,9 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.models.errors import InputError
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.robots.iiwa import READY_POSTURE
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
-from guiderail.models.robots.pose import pose_to_transform
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 
 START = np.array([0.0, 0.0, 0.02, 0.8, 0.0, 0.0])

@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
-from guiderail.models.robots.pose import pose_to_transform
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.relative_poses import RelativePoses
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from guiderail.models.robots.pose import pose_to_transform, transform_to_pose
+from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills import load_skill
 from guiderail.systems.sct_input_mapping import SctInputMapping
 

@@ -5,7 +5,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointIndex
 
 from guiderail.models.robots.iiwa import CONNECTOR_TOOL_URDF, IIWA_URDF, READY_POSTURE
-from guiderail.models.robots.tool_wrench import external_wrench
+from guiderail.models.tool_wrench import external_wrench
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from guiderail.models.robots.vectors import cross
+from guiderail.models.vectors import cross
 
 
 def external_wrench(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from guiderail.models.robots.vectors import cross
+from guiderail.models.vectors import cross
 
 
 @dataclass(frozen=True)
