@@ -12,8 +12,8 @@ DEMONSTRATIONS = (".npz", ".csv")
 SKILLS = (".yaml", ".yml")
 
 
-def check(file: Path) -> dict[str, Any]:
-    """Reads a file as what its ending says it is.
+def check(file: Path, draw: Path | None = None) -> dict[str, Any]:
+    """Reads a file as what its ending says it is; `draw` is where a skill's state machine is drawn.
 
     Raises:
         InputError: if it is neither, or what it holds makes no sense.
@@ -23,7 +23,7 @@ def check(file: Path) -> dict[str, Any]:
     if file.suffix in DEMONSTRATIONS:
         return check_demonstrations(file)
     if file.suffix in SKILLS:
-        return check_skill(file)
+        return check_skill(file, draw)
     raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv, a skill is .yaml")
 
 
@@ -48,18 +48,33 @@ def check_demonstrations(file: Path) -> dict[str, Any]:
     }
 
 
-def check_skill(file: Path) -> dict[str, Any]:
-    """What a skill holds; reading it is what finds its faults."""
+def check_skill(file: Path, draw: Path | None = None) -> dict[str, Any]:
+    """What a skill holds, and what is odd about it; reading it is what finds most of its faults.
+
+    Args:
+        file: the skill.
+        draw: where its state machine is drawn: .png, .svg, .pdf or .dot.
+
+    Raises:
+        InputError: if the skill cannot be used.
+    """
     from guiderail.models.skills import load_skill  # it needs Drake, which demonstrations don't
+    from guiderail.models.skills.drawing import draw as draw_skill
+    from guiderail.models.skills.validate import validate
 
     skill = load_skill(file)
+    findings = validate(skill)
+    errors = [finding.message for finding in findings if finding.is_error]
+    if errors:
+        raise InputError(f"{file}: " + "; ".join(message.rstrip(".") for message in errors))
+    if draw is not None:
+        draw_skill(skill, draw)
     return {
         "file": str(file),
         "skill": skill.name,
         "inputs": skill.inputs,
         "frames": list(skill.frames),
         "states": [state.name for state in skill.states],
-        "transitions": [
-            f"{state.name} → {t.to} below {t.below:g}" for state in skill.states for t in state.transitions
-        ],
+        "transitions": [f"{s.name} → {t.to} below {t.below:g}" for s in skill.states for t in s.transitions],
+        "remarks": [finding.message for finding in findings if not finding.is_error],
     }

@@ -1,6 +1,7 @@
 """The `guiderail` command: what a person types, checked, and handed to the tool that does it."""
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -105,12 +106,13 @@ def record(
 @app.command()
 def check(
     file: Annotated[Path, typer.Argument(help="Demonstrations (.npz, .csv) or a skill (.yaml).")],
+    draw: Annotated[Path | None, typer.Option(help="Draw a skill's state machine (.png, .svg, .pdf, .dot).")] = None,
     as_json: Json = False,
 ) -> None:
     """Check a file of demonstrations or a skill before anything is learned from it."""
     from guiderail.tools.check import check as check_file
 
-    _print(check_file(file), as_json)
+    _print(check_file(file, draw), as_json)
 
 
 @app.command()
@@ -184,6 +186,8 @@ def demo(
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command and ends the process: 0 for success, 2 for what a person gave wrong, in one sentence."""
+    # Matrices here are small: threads that wait for each other cost more than they give, and runs go side by side.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         code = app(args=arguments, prog_name="guiderail", standalone_mode=False)
     except InputError as error:

@@ -56,4 +56,32 @@ def _narrow_passage() -> Scene:
     )
 
 
-SCENES: dict[str, Callable[[], Scene]] = {"NarrowPassage": _narrow_passage}
+def _bnc_connector() -> Scene:
+    from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+    from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
+    from guiderail.models.demonstrations import bnc_connector
+
+    X_WT = BncWorkcell().X_WT
+
+    def to_world(poses: np.ndarray) -> np.ndarray:
+        return X_WT.multiply(np.asarray(poses)[:, :3].T).T
+
+    square = ALIGNMENT * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    rings = [np.column_stack([square, np.full(5, height)]) for height in (0.0, 0.015)]
+    edges = [np.array([[x, y, 0.0], [x, y, 0.015]]) for x, y in square[:4]]
+    eye, target = to_world(np.array([[0.025, -0.035, 0.022], [0.0, 0.0, 0.008]]))
+    return Scene(
+        to_world=to_world,
+        demonstrations=tuple(bnc_connector.load().outputs),
+        constraint=tuple(to_world(line) for ring in rings for line in _sides(ring)) + tuple(to_world(e) for e in edges),
+        camera=(tuple(eye), tuple(target)),
+        line_radius=0.0001,
+    )
+
+
+def _sides(corners: np.ndarray) -> list[np.ndarray]:
+    """The straight lines between corners (k, 3): a path that turns sharply is drawn side by side."""
+    return [corners[i : i + 2] for i in range(len(corners) - 1)]
+
+
+SCENES: dict[str, Callable[[], Scene]] = {"BncConnector": _bnc_connector, "NarrowPassage": _narrow_passage}
