@@ -6,7 +6,6 @@ from pydrake.common.value import Value
 from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import (
-    BasicVector,
     Context,
     DiscreteValues,
     EventStatus,
@@ -20,7 +19,8 @@ class ContactWatch(LeafSystem):
     """Says whether any body of one set has touched any body of another since the episode began.
 
     The plant's contact results are looked at in every plant step: a collision that is shorter than a control step
-    counts. They are best those of a plant without sampled output ports; then each step's are seen at its beginning.
+    counts. What was seen is state: whoever reads a port between two plant steps sees the last of them, and costs the
+    plant nothing.
 
     .. pydrake_system::
 
@@ -33,7 +33,7 @@ class ContactWatch(LeafSystem):
         - contact_force
 
     ``contact_results`` is the plant's. ``collision`` is (1,): 1 while they touch; ``touched`` is (1,): 1 from the first
-    touch on; ``contact_force`` is (1,), the norm [N] of the largest force between the sets in this step. Point contact
+    touch on; ``contact_force`` is (1,), the norm [N] of the largest force between the sets. Point contact
     and hydroelastic contact both count.
     """
 
@@ -61,23 +61,10 @@ class ContactWatch(LeafSystem):
             for geometry in plant.GetCollisionGeometriesForBody(body)
         }
         self._results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        self._state = self.DeclareDiscreteState(1)
-        results = self._results_port.ticket()
-        self._collision_port = self.DeclareVectorOutputPort(
-            "collision",
-            1,
-            lambda context, output: output.SetAtIndex(0, float(self._force(context) is not None)),
-            prerequisites_of_calc={results},
-        )
-        self._touched_port = self.DeclareVectorOutputPort(
-            "touched", 1, self._calc_touched, prerequisites_of_calc={results, self.discrete_state_ticket(self._state)}
-        )
-        self._force_port = self.DeclareVectorOutputPort(
-            "contact_force",
-            1,
-            lambda context, output: output.SetAtIndex(0, self._force(context) or 0.0),
-            prerequisites_of_calc={results},
-        )
+        self._collision, self._touched, self._largest_force = (self.DeclareDiscreteState(1) for _ in range(3))
+        self._collision_port = self.DeclareStateOutputPort("collision", self._collision)
+        self._touched_port = self.DeclareStateOutputPort("touched", self._touched)
+        self._force_port = self.DeclareStateOutputPort("contact_force", self._largest_force)
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -118,15 +105,15 @@ class ContactWatch(LeafSystem):
     def _forbidden(self, a: int, b: int) -> bool:
         return (a in self._ones and b in self._others) or (b in self._ones and a in self._others)
 
-    def _calc_touched(self, context: Context, output: BasicVector) -> None:
-        touched = context.get_discrete_state(self._state).value()[0] > 0
-        output.SetAtIndex(0, float(touched or self._force(context) is not None))
-
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value([0.0])
+        for index in (self._collision, self._touched, self._largest_force):
+            discrete_state.set_value(index, [0.0])
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        if context.get_discrete_state(self._state).value()[0] == 0 and self._force(context) is not None:
-            discrete_state.set_value([1.0])
+        force = self._force(context)
+        discrete_state.set_value(self._collision, [float(force is not None)])
+        discrete_state.set_value(self._largest_force, [force or 0.0])
+        if force is not None:
+            discrete_state.set_value(self._touched, [1.0])
         return EventStatus.Succeeded()
