@@ -14,10 +14,14 @@ FIGURES = {
     "4.5": ("baselines", "figure_4_5"),
     "4.6": ("baselines", "figure_4_6"),
     "4.7": ("image", "figure_4_7"),
+    "4.8": ("connector", "figure_4_8"),
     "5.2": ("smoothness", "figure_5_2"),
     "5.4": ("perturbations", "figure_5_4"),
     "5.5": ("smoothness", "figure_5_5"),
     "5.6": ("learning", "figure_5_6"),
+    "5.8": ("connector", "figure_5_8"),
+    "5.9": ("connector", "figure_5_9"),
+    "5.10": ("connector", "figure_5_10"),
 }
 
 

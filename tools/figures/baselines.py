@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.tools.episodes import make_environment, run_episode
-from guiderail.tools.figures import passage
+from guiderail.tools.figures import passage, runs
 from guiderail.tools.pictures import COLOURS, NAMES, new_figure, save_figure
 from guiderail.tools.study import write_table
 
@@ -80,9 +80,9 @@ def figure_4_5(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
         ),
         strict=True,
     ):
-        passage.draw_learning(axis, results, METHODS, column, label)
+        runs.draw_learning(axis, results, METHODS, column, label)
     axes[0, 0].legend(frameon=False)
-    rows = [_learned(result) for result in results]
+    rows = [passage.learned(result) for result in results]
     return {
         "picture": str(save_figure(figure, out / "figure_4_5.png")),
         "table": str(write_table(out / "figure_4_5", rows)),
@@ -96,11 +96,11 @@ def figure_4_6(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
     """Collisions with the walls and violations of the constraint, per episode of learning."""
     results = passage.train_all(out, METHODS, seeds=seeds, episodes=episodes)
     figure, (axes,) = new_figure(1, 2, (10, 4))
-    passage.draw_learning(axes[0], results, METHODS, "collisions", "wall collisions per episode", window=1)
-    passage.draw_learning(axes[1], results, METHODS, "worst_measured_violation", "worst violation [m]", window=1)
+    runs.draw_learning(axes[0], results, METHODS, "collisions", "wall collisions per episode", window=1)
+    runs.draw_learning(axes[1], results, METHODS, "worst_measured_violation", "worst violation [m]", window=1)
     axes[1].axhline(0, color="firebrick", linewidth=0.8)
     axes[0].legend(frameon=False)
-    rows = [_learned(result) for result in results]
+    rows = [passage.learned(result) for result in results]
     return {
         "picture": str(save_figure(figure, out / "figure_4_6.png")),
         "table": str(write_table(out / "figure_4_6", rows)),
@@ -113,16 +113,7 @@ def figure_4_6(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
     }
 
 
-def _learned(result: dict[str, Any]) -> dict[str, Any]:
-    """A run's row: everything of its summary, and from when on it avoided the obstacle."""
-    shown = {key: value for key, value in result.items() if key not in ("rows", "name", "folder")}
-    return {"method": result["name"], **shown, "avoids_obstacle_from": passage.avoided_from(result["rows"])}
-
-
 def _success(rows: list[dict[str, Any]]) -> dict[str, str]:
     return {
-        f"{NAMES[kind]}, success of each seed": ", ".join(
-            f"{row['success']:.0%}" for row in rows if row["method"] == kind
-        )
-        for kind in METHODS
+        f"{NAMES[kind]}, success of each seed": runs.of_each_seed(rows, kind, "success", "{:.0%}") for kind in METHODS
     }

@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from guiderail.tools.figures import passage
-from guiderail.tools.figures.baselines import _learned
+from guiderail.tools.figures import passage, runs
 from guiderail.tools.pictures import new_figure, save_figure
 from guiderail.tools.study import write_table
 
@@ -16,12 +15,12 @@ def figure_4_7(out: Path, seeds: int = 3, episodes: int = 30) -> dict[str, Any]:
     for axis, (column, label) in zip(
         axes, (("return", "return"), ("reward_obstacle_cost", "obstacle cost"), ("success", "success")), strict=True
     ):
-        passage.draw_learning(axis, results, ("kgrl",), column, label)
-    rows = [_learned(result) for result in results]
+        runs.draw_learning(axis, results, ("kgrl",), column, label)
+    rows = [passage.learned(result) for result in results]
     return {
         "picture": str(save_figure(figure, out / "figure_4_7.png")),
         "table": str(write_table(out / "figure_4_7", rows)),
-        "success of each seed": ", ".join(f"{row['success']:.0%}" for row in rows),
-        "obstacle avoided from episode": ", ".join(str(row["avoids_obstacle_from"] or "never") for row in rows),
+        "success of each seed": runs.of_each_seed(rows, "kgrl", "success", "{:.0%}"),
+        "obstacle avoided from episode": runs.of_each_seed(rows, "kgrl", "avoids_obstacle_from"),
         "condition": f"an action lasts {passage.HOLD} control steps; pixels are averaged five by five",
     }

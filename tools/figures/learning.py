@@ -3,10 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from guiderail.tools.figures import passage
-from guiderail.tools.figures.baselines import EPISODES, _learned
+from guiderail.tools.figures import passage, runs
+from guiderail.tools.figures.baselines import EPISODES
 from guiderail.tools.pictures import NAMES, new_figure, save_figure
 from guiderail.tools.study import write_table
 
@@ -27,20 +25,18 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
         ),
         strict=True,
     ):
-        passage.draw_learning(axis, results, METHODS, column, label)
+        runs.draw_learning(axis, results, METHODS, column, label)
     axes[1, 1].set_yscale("log")
     axes[0, 0].legend(frameon=False)
-    rows = [_learned(result) for result in results]
-    returns = {kind: _mean_of_last(results, kind, "return") for kind in METHODS}
-    actions = {kind: _mean_of_last(results, kind, "reward_action_cost") for kind in METHODS}
+    rows = [passage.learned(result) for result in results]
+    returns = {kind: runs.mean_of_last(results, kind, "return") for kind in METHODS}
+    actions = {kind: runs.mean_of_last(results, kind, "reward_action_cost") for kind in METHODS}
     higher = max(returns, key=lambda kind: returns[kind])
     return {
         "picture": str(save_figure(figure, out / "figure_5_6.png")),
         "table": str(write_table(out / "figure_5_6", rows)),
         **{
-            f"{NAMES[kind]}, obstacle avoided from episode": ", ".join(
-                str(row["avoids_obstacle_from"] or "never") for row in rows if row["method"] == kind
-            )
+            f"{NAMES[kind]}, obstacle avoided from episode": runs.of_each_seed(rows, kind, "avoids_obstacle_from")
             for kind in METHODS
         },
         **{f"{NAMES[kind]}, return of the last ten": returns[kind] for kind in METHODS},
@@ -50,7 +46,3 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
         else "does not hold here",
         "condition": f"an action lasts {passage.HOLD} control steps; the obstacle's cost is part of the return",
     }
-
-
-def _mean_of_last(results: list[dict[str, Any]], kind: str, column: str) -> float:
-    return float(np.mean([run[-10:] for run in passage.runs_of(results, kind, column)]))

@@ -10,10 +10,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from guiderail.models.demonstrations import narrow_passage
 from guiderail.models.objects.narrow_passage import NarrowPassage
-from guiderail.tools.pictures import COLOURS, NAMES, draw_runs
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.study import Job, run_jobs
-from guiderail.tools.training import configure
+from guiderail.tools.figures import runs
 
 TASK = "NarrowPassage"
 HOLD = 5  # control steps of an action, unless a figure says otherwise
@@ -21,39 +18,16 @@ PRESET = "quick"
 
 
 def train_all(
-    out: Path,
-    guidance: Sequence[str],
-    *,
-    seeds: int,
-    episodes: int,
-    hold: int = HOLD,
-    preset: str = PRESET,
-    observation: str = "state",
+    out: Path, guidance: Sequence[str], *, seeds: int, episodes: int, observation: str = "state"
 ) -> list[dict[str, Any]]:
-    """One row for each guidance and seed; `rows` in it are the run's episodes. Runs that are there are used again."""
-    jobs = []
-    for kind in guidance:
-        for seed in range(seeds):
-            environment = {"guidance": kind, "hold": hold, "observation": observation}
-            config = configure(TASK, environment, preset=preset, episodes=episodes, seed=seed)
-            folder = out / "runs" / f"{kind}-{observation}-hold{hold}-{preset}-{episodes}-{seed}"
-            jobs.append(Job(kind, config, folder))
-    results = run_jobs(jobs)
-    return [result | {"rows": RunFolder(result["folder"]).episodes()} for result in results]
+    """Runs in the narrow passage (see `runs.train_all`)."""
+    environment = {"hold": HOLD, "observation": observation}
+    return runs.train_all(out, TASK, guidance, seeds=seeds, episodes=episodes, preset=PRESET, environment=environment)
 
 
-def runs_of(results: Sequence[dict[str, Any]], kind: str, column: str) -> list[list[float]]:
-    """A column of `episodes.csv` of every run of one guidance."""
-    return [[row[column] for row in result["rows"]] for result in results if result["name"] == kind]
-
-
-def draw_learning(
-    axis: Axes, results: Sequence[dict[str, Any]], guidance: Sequence[str], column: str, label: str, window: int = 5
-) -> None:
-    """One curve a guidance: the mean over seeds, with their range."""
-    for kind in guidance:
-        draw_runs(axis, runs_of(results, kind, column), colour=COLOURS[kind], label=NAMES[kind], window=window)
-    axis.set(xlabel="episode", ylabel=label)
+def learned(result: dict[str, Any]) -> dict[str, Any]:
+    """A run's row in a table, with the episode from which it avoided the obstacle."""
+    return runs.table_row(result, avoids_obstacle_from=avoided_from(result["rows"]))
 
 
 def draw_world(axis: Axes, demonstrations: bool = True) -> None:
