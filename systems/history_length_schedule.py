@@ -31,8 +31,8 @@ class HistoryLengthSchedule(LeafSystem):
         output_ports:
         - history_length
 
-    ``wrench`` (W,) is measured, its first three numbers a force [N] (both, where there are only two). ``history_length`` (1,) is P; it is state, and
-    begins with the longest.
+    ``wrench`` (W,) is measured, its first three numbers a force [N] (both, where there are only two).
+    ``history_length`` (1,) is P; it is state, and begins with the longest.
     """
 
     def __init__(

@@ -46,9 +46,9 @@ class LcNsKmpSystem(LeafSystem):
     row-major, oldest output first (`HistoryBuffer`), and there is no such port where P = 0. ``history_length`` (1,) is
     there only where there are primitives with shorter histories: which of them speaks (`HistoryLengthSchedule`). Each
     is given the newest part of the one history, so that whichever speaks begins where the last command ended.
-    ``output`` (O,) is what to command. ``constraint_violation`` (1,) is max(c − G y) of that command: negative is slack, −1e30 where there is no
-    constraint. ``fallback`` (1,) is 1 where no window within the constraints was found and the last safe command is
-    repeated.
+    ``output`` (O,) is what to command. ``constraint_violation`` (1,) is max(c − G y) of that command: negative is
+    slack, −1e30 where there is no constraint. ``fallback`` (1,) is 1 where no window within the constraints was found
+    and the last safe command is repeated.
 
     The step is state and counts control periods since time zero; the output is a pure function of step, action and
     history, evaluated once a control step (see CONTRIBUTING.md, "Rates and the order of events").

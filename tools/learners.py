@@ -46,6 +46,8 @@ class Preset:
     learning_starts: int = 100  # decisions drawn uniformly before the first training
     entropy: str = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     units: tuple[int, ...] = (256, 256)  # of the hidden layers
+    steady_episodes: int = 0  # the first ones, in which one action drawn uniformly is kept all the time
+    practise_every: int = 0  # of so many episodes, one is acted without exploring; 0 for none
     averaging: float = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
 
 
@@ -103,6 +105,9 @@ def _check(preset: Preset) -> None:
     for key in ("train_every", "gradient_steps", "batch_size", "buffer_size", "learning_starts"):
         if getattr(preset, key) < 1:
             raise InputError(f"the learner's {key} must be at least 1, not {getattr(preset, key)}")
+    for key in ("steady_episodes", "practise_every"):
+        if getattr(preset, key) < 0:
+            raise InputError(f"the learner's {key} must not be negative, not {getattr(preset, key)}")
     if not (np.isfinite(preset.learning_rate) and preset.learning_rate > 0):
         raise InputError(f"the learner's learning_rate must be positive, not {preset.learning_rate}")
     for key, low in (("discount", 0.0), ("soft_update", 0.0), ("averaging", -1e-300)):
@@ -174,14 +179,36 @@ class Learner:
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.random = np.random.default_rng(seed)
         self.averaged = copy.deepcopy(self.model.actor) if preset.averaging else None
+        self.episodes = 0
+        self._practises = False
+        self._steady: np.ndarray | None = None
+
+    def begin(self) -> None:
+        """Begins an episode, and decides how it explores."""
+        self.episodes += 1
+        every = self.preset.practise_every
+        self._practises = every > 0 and self.episodes % every == 0
+        self._steady = self._uniform() if self.episodes <= self.preset.steady_episodes else None
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """An exploring action: uniform until learning starts, then drawn from the policy."""
+        """An exploring action: uniform until learning starts, then drawn from the policy.
+
+        White actions blur what an action is worth: on the connector they find the hole by wiggling, whatever the policy
+        wants. Episodes that keep to one action, or to the policy's mean, say what that action or that mean is worth.
+        """
+        if self._steady is not None:
+            return self._steady
+        if self.decisions < self.preset.learning_starts:
+            return self._uniform()
+        if not self._practises:
+            return self.model.predict(observation, deterministic=False)[0]
+        with torch.no_grad():
+            return self.actor()._predict(self.model.policy.obs_to_tensor(observation)[0], deterministic=True)[0].numpy()
+
+    def _uniform(self) -> np.ndarray:
         space = self.model.action_space
         assert isinstance(space, spaces.Box)
-        if self.decisions < self.preset.learning_starts:
-            return self.random.uniform(space.low, space.high).astype(space.dtype)
-        return self.model.predict(observation, deterministic=False)[0]
+        return self.random.uniform(space.low, space.high).astype(space.dtype)
 
     def remember(self, observation, action, reward: float, following, terminated: bool, truncated: bool) -> None:
         """Takes one decision and what followed into the replay buffer. A time limit is not an end of the task."""
@@ -239,6 +266,7 @@ class Learner:
         arrays["random/numpy"] = np.asarray(keys)
         return arrays, {
             "decisions": self.decisions,
+            "episodes": self.episodes,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
             "numpy": [kind, *rest],
@@ -267,6 +295,7 @@ class Learner:
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
+        self.episodes = values["episodes"]
         torch.set_rng_state(tensors["random/torch"])
         kind, *rest = values["numpy"]
         np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002

@@ -53,6 +53,7 @@ def train(
     for episode in range(len(rows), config.episodes):
         started = time.perf_counter()
         observation, _ = env.reset()
+        learner.begin()
         record = EpisodeRecord(env)
         finished = False
         while not finished:
