@@ -149,6 +149,7 @@ class ArmStation(Station):
         builder.ExportOutput(sensor.get_wrench_output_port(), "wrench")
         builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
         builder.ExportOutput(controller.get_saturation_output_port(), "saturation")
+        builder.ExportOutput(controller.get_holding_output_port(), "holding")
         export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 

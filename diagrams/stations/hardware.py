@@ -124,6 +124,7 @@ class HardwareStation(Station):
         builder.ExportOutput(wrench.get_wrench_output_port(), "wrench")
         builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
         builder.ExportOutput(controller.get_saturation_output_port(), "saturation")
+        builder.ExportOutput(controller.get_holding_output_port(), "holding")
         builder.BuildInto(self)
 
     def start(self, simulator: Simulator) -> None:

@@ -28,6 +28,7 @@ from guiderail.diagrams.stations.station import (
     export_simulation_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.wrench_sensor import WrenchSensor
 
@@ -79,6 +80,7 @@ class RailsStation(Station):
         plant.Finalize()
         workcell.filter_contacts(plant, self.scene_graph)
 
+        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(time_step))
         # The desired pose is the desired state's first half; the desired velocity is zero, so that damping damps.
         desired_state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
         pose = builder.AddNamedSystem("pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)))
@@ -96,14 +98,18 @@ class RailsStation(Station):
             ),
         )
         sensor.connect(builder, plant)
+        builder.Connect(watchdog.get_safe_pose_output_port(), desired_state.get_input_port())
+        builder.Connect(pose.get_output_port(), watchdog.get_pose_input_port())
         builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(self.rails))
         builder.Connect(plant.get_state_output_port(self.rails), pose.get_input_port())
         builder.Connect(plant.get_net_actuation_output_port(self.rails), monitor.get_impedance_wrench_input_port())
-        builder.ExportInput(desired_state.get_input_port(), "desired_pose")
+        builder.ExportInput(watchdog.get_desired_pose_input_port(), "desired_pose")
+        builder.ExportInput(watchdog.get_command_time_input_port(), "command_time")
         builder.ExportOutput(pose.get_output_port(), "pose")
         builder.ExportOutput(sensor.get_wrench_output_port(), "wrench")
         builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
         builder.ExportOutput(monitor.get_saturation_output_port(), "saturation")
+        builder.ExportOutput(watchdog.get_holding_output_port(), "holding")
         export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 

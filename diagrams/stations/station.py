@@ -17,6 +17,7 @@ output             size   meaning
                           without the tool's own weight and inertia, low-pass filtered
 `contact_force`    1      size of the force with which the impedance pushes [N]: what a collision is judged by
 `saturation`       1      1 while the controller is at a limit of force or torque, otherwise 0
+`holding`          1      1 while commands have stopped, or are no numbers, and the last safe pose is held
 =================  =====  ==========================================================================================
 
 A simulated station also has `query` (the scene graph's) and `body_poses` (the plant's): for cameras, and for judging
@@ -71,6 +72,10 @@ class Station(Diagram):
         """Where the tool centre shall be, (6,)."""
         return self.GetInputPort("desired_pose")
 
+    def get_command_time_input_port(self):
+        """When the desired pose was given, (1,) [s]; optional."""
+        return self.GetInputPort("command_time")
+
     def get_pose_output_port(self):
         """Where the tool centre is, (6,)."""
         return self.GetOutputPort("pose")
@@ -86,6 +91,10 @@ class Station(Diagram):
     def get_saturation_output_port(self):
         """1 while the controller is at a limit, (1,)."""
         return self.GetOutputPort("saturation")
+
+    def get_holding_output_port(self):
+        """1 while the last safe pose is held, (1,)."""
+        return self.GetOutputPort("holding")
 
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:

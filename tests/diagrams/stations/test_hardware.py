@@ -102,12 +102,14 @@ def test_a_real_arm_is_not_put_anywhere():
 
 def test_all_stations_have_the_same_ports():
     stations = [RailsStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, DrakeLcm("memq://"))]
+    simulated_only = {"query", "body_poses"}
     for station in stations:
-        assert station.get_desired_pose_input_port().size() == 6
-        assert station.get_pose_output_port().size() == 6
-        assert station.get_wrench_output_port().size() == 6
-        assert station.get_contact_force_output_port().size() == 1
-        assert station.get_saturation_output_port().size() == 1
+        inputs = {station.get_input_port(i).get_name(): station.get_input_port(i).size() for i in range(2)}
+        assert inputs == {"desired_pose": 6, "command_time": 1}
+        ports = [station.get_output_port(i) for i in range(station.num_output_ports())]
+        outputs = {port.get_name(): port.size() for port in ports if port.get_name() not in simulated_only}
+        assert outputs == {"pose": 6, "wrench": 6, "contact_force": 1, "saturation": 1, "holding": 1}
+        assert station.num_input_ports() == 2
 
 
 @pytest.mark.parametrize(
