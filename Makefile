@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-export DRAKE_ALLOW_NETWORK := none
+export DRAKE_ALLOW_NETWORK := meshcat
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test lint bench clean
