@@ -96,7 +96,7 @@ class RunFolder:
             settings = {key: value for key, value in learner.items() if key != "algorithm"}
             config = RunConfig(
                 task=str(values["task"]),
-                environment=dict(values["environment"]),
+                environment=as_arguments(values["environment"]),
                 learner=resolve_preset(values["preset"], learner["algorithm"], settings),
                 preset=values["preset"],
                 episodes=int(values["episodes"]),
@@ -120,6 +120,11 @@ class RunFolder:
             InputError: if the file is missing or no such table.
         """
         return read_table(self.path / "episodes.csv")
+
+
+def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """An environment's arguments as they are passed: YAML knows lists only, arguments are tuples."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in dict(environment).items()}
 
 
 def table_text(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -9,7 +9,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.episodes import check_environment
 from guiderail.tools.learners import resolve_preset
 from guiderail.tools.progress import TrainingProgress
-from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after, installed_versions
+from guiderail.tools.run_folder import RunConfig, RunFolder, as_arguments, converged_after, installed_versions
 from guiderail.tools.train import train
 
 DEFAULTS: dict[str, Any] = {"guidance": "skgrl", "algorithm": "tqc", "preset": "robust", "episodes": 60, "seed": 0}
@@ -36,7 +36,7 @@ def configure(
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, {"guidance": DEFAULTS["guidance"], **environment})
-    return RunConfig(task, resolved, learner, preset, episodes, seed, installed_versions())
+    return RunConfig(task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions())
 
 
 def run(

@@ -1,0 +1,120 @@
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learners import PRESETS, Learner, resolve_preset
+
+
+class Spaces(gymnasium.Env):
+    observation_space = spaces.Box(-1, 1, (3,))
+    action_space = spaces.Box(-1, 1, (2,))
+
+
+@pytest.fixture
+def preset():
+    settings = {"units": "8", "batch_size": 4, "learning_starts": 6, "train_every": 4, "gradient_steps": 2}
+    return resolve_preset("robust", "tqc", settings)
+
+
+def make(preset, hold=1, seed=0):
+    return Learner(preset, Spaces(), hold=hold, seed=seed, decisions=50)
+
+
+def live(learner, decisions, seed=0):
+    """So many decisions of random experience."""
+    random = np.random.default_rng(seed)
+    for _ in range(decisions):
+        observation, following = random.uniform(-1, 1, (2, 3)).astype(np.float32)
+        learner.remember(observation, learner.act(observation), random.normal(), following, False, False)
+        learner.learn()
+
+
+def weights(learner):
+    return torch.nn.utils.parameters_to_vector(learner.model.actor.parameters()).detach().numpy().copy()
+
+
+def test_presets_are_the_tables_of_the_thesis():
+    simulation, robot = PRESETS["table_4_1_simulation"], PRESETS["table_4_1_robot"]
+    for table, tau, discount, entropy in ((simulation, 0.02, 0.99, "auto"), (robot, 0.01, 0.995, "auto_0.1")):
+        assert (table.learning_rate, table.train_every, table.gradient_steps) == (1e-3, 8, 8)
+        assert (table.soft_update, table.discount, table.entropy) == (tau, discount, entropy)
+        assert (table.batch_size, table.buffer_size, table.units) == (256, 10**6, (256, 256))
+    for name, rate, discount in (("table_3_2_iiwa", 8e-4, 0.95), ("table_3_2_sara", 1e-3, 0.98)):
+        table = PRESETS[name]
+        assert (table.learning_rate, table.discount, table.soft_update) == (rate, discount, 0.02)
+        assert (table.train_every, table.gradient_steps, table.learning_starts) == (8, 8, 1000)
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_makes_a_learner_of_every_algorithm(name, algorithm):
+    learner = make(replace(resolve_preset(name, algorithm), units=(4,)))
+    assert learner.act(np.zeros(3, np.float32)).shape == (2,)
+
+
+def test_a_longer_hold_discounts_a_decision_more(preset):
+    assert make(preset, hold=5).model.gamma == pytest.approx(make(preset).model.gamma ** 5)
+
+
+def test_training_follows_the_count_of_decisions(preset):
+    learner = make(preset)
+    untrained = weights(learner)
+    live(learner, 7)
+    np.testing.assert_array_equal(weights(learner), untrained)
+    live(learner, 1)
+    assert not np.array_equal(weights(learner), untrained)
+    assert learner.model._n_updates == 2
+    live(learner, 12)
+    assert learner.model._n_updates == 8
+
+
+def test_the_averaged_actor_lags_behind_the_learning_one(preset):
+    learner = make(preset)
+    start = weights(learner)
+    live(learner, 40)
+    averaged = torch.nn.utils.parameters_to_vector(learner.averaged.parameters()).detach().numpy()
+    moved = np.linalg.norm(averaged - start)
+    assert 0 < moved < np.linalg.norm(weights(learner) - start)
+    assert learner.actor() is learner.averaged
+    plain = make(replace(preset, averaging=0.0))
+    assert plain.actor() is plain.model.actor
+
+
+def test_a_time_limit_is_no_end_of_the_task(preset):
+    learner = make(preset)
+    seen = np.zeros(3, np.float32)
+    for terminated, truncated in ((True, False), (False, True), (False, False)):
+        learner.remember(seen, np.zeros(2), 0.0, seen, terminated, truncated)
+    buffer = learner.model.replay_buffer
+    bootstrapped = buffer.dones[:3, 0] * (1 - buffer.timeouts[:3, 0])
+    np.testing.assert_array_equal(bootstrapped, [1, 0, 0])
+
+
+def test_a_restored_learner_goes_on_as_the_first_would_have(preset):
+    first = make(preset)
+    live(first, 23)
+    arrays, values = (part.copy() for part in first.state())
+    arrays = {key: value.copy() for key, value in arrays.items()}
+    live(first, 17, seed=1)
+    expected = weights(first)
+    second = make(preset, seed=99)
+    second.restore(arrays, values)
+    live(second, 17, seed=1)
+    np.testing.assert_array_equal(weights(second), expected)
+
+
+def test_a_checkpoint_of_another_network_does_not_fit(preset):
+    arrays, values = make(preset).state()
+    with pytest.raises((KeyError, RuntimeError, ValueError)):
+        make(replace(preset, units=(16,))).restore(arrays, values)
+
+
+@pytest.mark.parametrize("settings", [{"discount": 1.5}, {"units": ""}, {"entropy": "much"}, {"batch_size": 2.5}])
+def test_refuses_what_no_learner_can_use(settings):
+    with pytest.raises(InputError):
+        resolve_preset("robust", "tqc", settings)
