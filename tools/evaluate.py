@@ -3,6 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
+from rich.progress import track
+
 from guiderail.models.errors import InputError
 from guiderail.tools.episodes import DEMONSTRATED, make_environment, run_episode, standing_still
 from guiderail.tools.policy import Policy
@@ -59,6 +62,9 @@ def held_out(config: RunConfig, policy: Policy | None, *, episodes: int, seed: i
     try:
         act = standing_still(env) if policy is None else policy
         env.reset(seed=config.seed)  # what is hidden and constant in the run is drawn as it was for training
-        return [run_episode(env, act, held_out_seed=seed + index, episode=index) for index in range(episodes)]
+        console = Console(stderr=True)
+        words = "demonstration alone" if policy is None else "held-out episodes"
+        indices = track(range(episodes), words, console=console, transient=True, disable=not console.is_terminal)
+        return [run_episode(env, act, held_out_seed=seed + index, episode=index) for index in indices]
     finally:
         env.close()

@@ -160,7 +160,8 @@ def _begun(job: Job) -> bool:
 
 
 def _finished(job: Job) -> bool:
-    return _begun(job) and (job.folder / "policy.json").exists()
+    complete = _begun(job) and (job.folder / "policy.json").exists()
+    return complete and len(RunFolder(job.folder).episodes()) == job.config.episodes
 
 
 def _refuse_another(job: Job) -> None:

@@ -11,7 +11,7 @@ from guiderail.tools.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.episodes import EpisodeRecord, make_environment, most_decisions
 from guiderail.tools.learners import Learner
 from guiderail.tools.policy import Policy
-from guiderail.tools.run_folder import RunConfig, RunFolder
+from guiderail.tools.run_folder import RunConfig, RunFolder, table_text
 
 # Checkpoints cost at most this part of the time: small ones are written after every episode, a large one now and then.
 CHECKPOINT_SHARE = 0.05
@@ -81,22 +81,24 @@ def train(
 
 
 def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any) -> None:
-    """The table first: a checkpoint never knows of an episode that the table does not."""
-    folder.write_episodes(rows)
+    """The checkpoint first: it holds the table too, and whoever is killed between the two loses nothing."""
     arrays, values = learner.state()
     drawn = env.unwrapped.np_random.bit_generator.state
-    save_checkpoint(folder.checkpoint, arrays, {"episodes": len(rows), "learner": values, "environment": drawn})
+    save_checkpoint(folder.checkpoint, arrays, {"rows": rows, "learner": values, "environment": drawn})
+    folder.write_episodes(rows)
 
 
 def _resume(folder: RunFolder, learner: Learner, env: Any) -> list[dict[str, Any]]:
     """Puts learner and environment back to the last checkpoint; returns the rows up to it."""
-    if not folder.checkpoint.exists() and not (folder.path / "episodes.csv").exists():
+    table = folder.path / "episodes.csv"
+    if not folder.checkpoint.exists() and not table.exists():
         return []  # it was killed in its first episode
     arrays, values = load_checkpoint(folder.checkpoint)
-    rows = folder.episodes()[: values["episodes"]]
-    if len(rows) < values["episodes"]:
+    rows = values["rows"]
+    written = folder.episodes() if table.exists() else []
+    if table_text(written) != table_text(rows[: len(written)]):
         raise InputError(
-            f"{folder.path / 'episodes.csv'} ends before the checkpoint: restore it, or start anew elsewhere"
+            f"{table} is not the table of its checkpoint: restore it, or remove it to have it rewritten"
         )
     try:
         learner.restore(arrays, values["learner"])

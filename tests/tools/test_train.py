@@ -91,7 +91,7 @@ def test_a_run_never_replaces_another(bead_config, tmp_path):
         lambda folder: (folder.path / "config.yaml").write_text("task: [Bead\n"),
         lambda folder: (folder.path / "config.yaml").write_text("task: Bead\nepisodes: many\n"),
     ],
-    ids=["truncated checkpoint", "no checkpoint", "short table", "broken yaml", "incomplete yaml"],
+    ids=["truncated checkpoint", "no checkpoint", "another table", "broken yaml", "incomplete yaml"],
 )
 def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
     folder = RunFolder(tmp_path / "run")
@@ -101,6 +101,24 @@ def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
     with pytest.raises(InputError):
         run(None, folder.path, environment={}, episodes=4, resume=True)
     assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+
+
+def test_a_run_killed_between_checkpoint_and_table_loses_nothing(bead_config, tmp_path):
+    whole, torn = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "torn")
+    train(whole, bead_config)
+    train(torn, replace(bead_config, episodes=4))
+    lines = (torn.path / "episodes.csv").read_text().splitlines(keepends=True)
+    (torn.path / "episodes.csv").write_text("".join(lines[:-1]))
+    train(torn, bead_config, resume=True)
+    assert_same_run(whole, torn)
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_again(bead_config, tmp_path):
+    whole, begun = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "begun")
+    train(whole, bead_config)
+    begun.create(bead_config)
+    train(begun, bead_config, resume=True)
+    assert_same_run(whole, begun)
 
 
 def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
