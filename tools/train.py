@@ -97,9 +97,7 @@ def _resume(folder: RunFolder, learner: Learner, env: Any) -> list[dict[str, Any
     rows = values["rows"]
     written = folder.episodes() if table.exists() else []
     if table_text(written) != table_text(rows[: len(written)]):
-        raise InputError(
-            f"{table} is not the table of its checkpoint: restore it, or remove it to have it rewritten"
-        )
+        raise InputError(f"{table} is not the table of its checkpoint: restore it, or remove it to have it rewritten")
     try:
         learner.restore(arrays, values["learner"])
     except (KeyError, ValueError, RuntimeError) as error:
