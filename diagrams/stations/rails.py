@@ -12,9 +12,9 @@ from pydrake.multibody.tree import (
     PdControllerGains,
     PrismaticJoint,
     RevoluteJoint,
-    RigidBody,
     SpatialInertia,
     UnitInertia,
+    WeldJoint,
 )
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
@@ -73,9 +73,10 @@ class RailsStation(Station):
         builder = DiagramBuilder()
         self.plant, self.scene_graph = plant, _ = add_contact_plant(builder, time_step)
         workcell.add_fixture(plant)
-        self.rails, tool_centre = _add_rails(plant, workcell, impedance)
-        self.workpiece = workcell.add_workpiece(plant, tool_centre)
-        for model in (self.rails, self.workpiece.model_instance()):
+        self.rails, wrist = _add_rails(plant, workcell, impedance)
+        tool = wrist.child_body()
+        workpiece = workcell.add_workpiece(plant, tool.body_frame())
+        for model in (self.rails, workpiece.model_instance()):
             plant.set_gravity_enabled(model, False)
         plant.Finalize()
         workcell.filter_contacts(plant, self.scene_graph)
@@ -89,9 +90,9 @@ class RailsStation(Station):
             "wrench_sensor",
             WrenchSensor(
                 plant,
-                _weld_of(plant, self.workpiece),
-                [self.workpiece],
-                self.workpiece.body_frame(),
+                wrist,
+                [tool, workpiece],
+                tool.body_frame(),
                 workcell.X_WT.rotation(),
                 time_step,
                 wrench_time_constant,
@@ -120,7 +121,8 @@ class RailsStation(Station):
         self.plant.SetVelocities(plant_context, self.rails, np.zeros(POSE_SIZE))
 
 
-def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) -> tuple[ModelInstanceIndex, Frame]:
+def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) -> tuple[ModelInstanceIndex, WeldJoint]:
+    """Adds the rails and, behind a wrist that the sensor measures at, the tool; returns their model and the wrist."""
     model = plant.AddModelInstance("rails")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
@@ -128,25 +130,11 @@ def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) 
     for (name, joint_type, axis), stiffness, damping, limit in zip(
         RAILS, impedance.stiffness, dampings, impedance.limits, strict=True
     ):
-        is_carriage = name == RAILS[-1][0]
-        link = plant.AddRigidBody("tool_centre" if is_carriage else f"{name}_link", model, _inertia(is_carriage))
+        link = plant.AddRigidBody(f"{name}_link", model, SpatialInertia.SolidSphereWithMass(LINK_MASS, LINK_RADIUS))
         joint = plant.AddJoint(joint_type(name, parent, link.body_frame(), axis))
         actuator: JointActuator = plant.AddJointActuator(f"{name}_motor", joint, limit)
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
         parent = link.body_frame()
-    return model, parent
-
-
-def _inertia(is_carriage: bool) -> SpatialInertia:
-    if not is_carriage:
-        return SpatialInertia.SolidSphereWithMass(LINK_MASS, LINK_RADIUS)
-    return SpatialInertia(CARRIAGE_MASS, np.zeros(3), UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS)))
-
-
-def _weld_of(plant: MultibodyPlant, body: RigidBody):
-    (weld,) = (
-        plant.get_joint(index)
-        for index in plant.GetJointIndices()
-        if plant.get_joint(index).child_body().index() == body.index()
-    )
-    return weld
+    inertia = UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS))
+    tool = plant.AddRigidBody("tool_centre", model, SpatialInertia(CARRIAGE_MASS, np.zeros(3), inertia))
+    return model, plant.WeldFrames(parent, tool.body_frame())
