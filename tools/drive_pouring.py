@@ -34,8 +34,10 @@ def drive(env, driver: Callable[[np.ndarray], np.ndarray], episodes: int) -> lis
 def main() -> None:
     """Until somebody has had enough."""
     env = make_env(render_mode="human")
-    device = MeshcatDevice(env.task.meshcat, AXES, KEYS, env.task.control_period)
-    print(f"drive at {env.task.meshcat.web_url()}")
+    meshcat = env.task.meshcat
+    assert meshcat is not None
+    device = MeshcatDevice(meshcat, AXES, KEYS, env.task.control_period)
+    print(f"drive at {meshcat.web_url()}")
     while True:
         print(*drive(env, lambda observation: device.read(), episodes=1))
 
