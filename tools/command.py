@@ -117,18 +117,23 @@ def check(
 
 @app.command()
 def study(
-    task: Annotated[str, typer.Argument(help="What is learned.")],
+    task: Annotated[str, typer.Argument(help="What is learned; or smoothness, which compares ways to explore.")],
     out: Annotated[Path, typer.Option(help="The folder of the study; finished runs in it are kept.")],
     guidance: Annotated[str, typer.Option(help="One or several, separated by commas.")] = "residual,kgrl,skgrl",
     algorithm: Annotated[str, typer.Option(help="One or several, separated by commas.")] = "tqc",
     seeds: Annotated[int, typer.Option(help="Runs of each.")] = 3,
-    episodes: Annotated[int, typer.Option(help="Of each run.")] = 60,
+    episodes: Annotated[int | None, typer.Option(help="Of each run.  [default: 60; smoothness: 4]")] = None,
     preset: Annotated[str, typer.Option(help="The learner's settings.")] = "robust",
     hold: Annotated[int | None, typer.Option(help="Control steps that an action lasts.")] = None,
     evaluations: Annotated[int, typer.Option(help="Held-out episodes of each run.")] = 20,
     as_json: Json = False,
 ) -> None:
-    """Train and evaluate several guidances or learners over seeds, two runs at a time."""
+    """Train and evaluate several guidances or learners over seeds, or compare how smoothly one can explore."""
+    if task == "smoothness":
+        from guiderail.tools.smoothness import smoothness
+
+        _print(smoothness(out, episodes=4 if episodes is None else episodes), as_json)
+        return
     from guiderail.tools.study import study as run_study
 
     result = run_study(
@@ -137,7 +142,7 @@ def study(
         guidance=guidance.split(","),
         algorithms=algorithm.split(","),
         seeds=seeds,
-        episodes=episodes,
+        episodes=60 if episodes is None else episodes,
         preset=preset,
         hold=hold,
         evaluations=evaluations,

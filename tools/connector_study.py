@@ -1,0 +1,202 @@
+"""Who learns the connector, on which seed, how soon and how safely: `python -m guiderail.tools.connector_study`.
+
+Learned policies, the demonstrations alone and a rule written by hand meet the same held-out offsets. Each seed has a
+row of its own: what failed on one is not averaged away. A study that was interrupted goes on where it was.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+from guiderail.tools.bnc_rule import reactive_rule
+from guiderail.tools.episodes import make_environment, run_episode
+from guiderail.tools.files import write_atomically
+from guiderail.tools.policy import Policy
+from guiderail.tools.run_folder import RunConfig, RunFolder, read_table, table_text
+from guiderail.tools.study import write_table
+from guiderail.tools.train import train
+from guiderail.tools.training import configure
+
+TASK = "BncConnector"
+LEARNED = ("kgrl", "skgrl", "skgrl_adaptive", "residual")
+UNLEARNED = ("demonstration", "rule")
+HELD_OUT_SEED = 1_000_000
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method, one seed."""
+
+    method: str
+    uncertainty: str
+    seed: int
+    marks: tuple[int, ...]  # training episodes after which it is judged
+    evaluations: int
+    station: str = "rails"  # that it is judged on; it learns on rails
+
+    def config(self, episodes: int, station: str = "rails") -> RunConfig:
+        """The run of so many episodes."""
+        guidance = {"demonstration": "kmp", "rule": "kgrl", "skgrl_adaptive": "skgrl"}.get(self.method, self.method)
+        environment: dict[str, Any] = {"guidance": guidance, "uncertainty": self.uncertainty, "station": station}
+        if self.method == "skgrl_adaptive":
+            environment["adaptive_history"] = True
+        return configure(TASK, environment, episodes=episodes, seed=self.seed)
+
+
+def connector_study(
+    out: Path,
+    *,
+    methods: Sequence[str] = (*UNLEARNED, "kgrl", "skgrl"),
+    uncertainty: str = "calibration",
+    seeds: Sequence[int] = range(10, 15),
+    marks: Sequence[int] = (40,),
+    evaluations: int = 100,
+    station: str = "rails",
+    report: Callable[[dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
+    """Trains, judges, and writes `connector-<uncertainty>-<station>.csv` and `.md`.
+
+    Args:
+        out: the folder; runs in it are used again.
+        methods: of `LEARNED` and `UNLEARNED`.
+        uncertainty: "calibration" or "disc".
+        seeds: of the runs, and with them of the hidden offsets.
+        marks: after how many training episodes a policy is judged.
+        evaluations: held-out episodes each time.
+        station: "rails", or "arm" for how a policy that learned on rails does on the arm.
+        report: called with each row.
+
+    Raises:
+        InputError: for an unknown method, or a number out of range.
+    """
+    unknown = [method for method in methods if method not in (*LEARNED, *UNLEARNED)]
+    if unknown:
+        raise InputError(f"there is no method {unknown[0]!r}: choose of {', '.join((*UNLEARNED, *LEARNED))}")
+    if not marks or min(marks) < 1 or evaluations < 1 or not seeds:
+        raise InputError("a study of the connector needs seeds, training episodes and held-out episodes: at least one")
+    rows = []
+    for method in methods:
+        for seed in seeds:
+            cell = Cell(method, uncertainty, seed, tuple(sorted(marks)), evaluations, station)
+            for row in judge(cell, out):
+                rows.append(row)
+                if report is not None:
+                    report(row)
+    table = write_table(out / f"connector-{uncertainty}-{station}", rows)
+    last = [row for row in rows if row["episodes"] in (0, max(marks))]
+    return {"table": str(table), "rows": len(rows)} | {
+        f"{method}, held-out success of each seed": ", ".join(
+            f"{row['held_out_success']:.0%}" for row in last if row["method"] == method
+        )
+        for method in methods
+    }
+
+
+def judge(cell: Cell, out: Path) -> list[dict[str, Any]]:
+    """A row for every mark of a cell; one for a method that doesn't learn."""
+    folder = RunFolder(out / f"{cell.method}-{cell.uncertainty}-{cell.seed}")
+    if cell.method in UNLEARNED:
+        act = reactive_rule if cell.method == "rule" else _still
+        return [_row(cell, 0, [], _held_out(cell, folder, 0, act))]
+    rows = []
+    for mark in cell.marks:
+        trained = _trained(folder)
+        if len(trained) < mark:
+            trained = train(folder, cell.config(mark), resume=bool(trained))
+        elif len(trained) > mark and not _file(folder, cell, mark).exists():
+            continue  # the policy of back then is gone: it went on learning
+        judged = _held_out(cell, folder, mark, None)
+        rows.append(_row(cell, mark, trained[:mark], judged))
+    return rows
+
+
+def _trained(folder: RunFolder) -> list[dict[str, Any]]:
+    return folder.episodes() if (folder.path / "episodes.csv").exists() else []
+
+
+def _file(folder: RunFolder, cell: Cell, mark: int) -> Path:
+    return folder.path / f"held_out-{cell.station}-{mark}-{cell.evaluations}.csv"
+
+
+def _held_out(
+    cell: Cell, folder: RunFolder, mark: int, act: Callable[[np.ndarray], np.ndarray] | None
+) -> list[dict[str, Any]]:
+    """Rows of held-out episodes, from the file where they are known already."""
+    file = _file(folder, cell, mark)
+    if file.exists():
+        return read_table(file)
+    config = cell.config(max(mark, 1), cell.station)
+    env = make_environment(config.task, config.environment)
+    env.reset(seed=cell.seed)  # the hidden offset of this run
+    policy = Policy.load(folder.path) if act is None else act
+    rows = [run_episode(env, policy, held_out_seed=HELD_OUT_SEED + i, episode=i) for i in range(cell.evaluations)]
+    env.close()
+    write_atomically(file, table_text(rows).encode())
+    return rows
+
+
+def _row(cell: Cell, mark: int, trained: Sequence[dict[str, Any]], judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def mean(rows: Sequence[dict[str, Any]], key: str) -> float | None:
+        return float(np.mean([row[key] for row in rows])) if rows else None
+
+    def worst(rows: Sequence[dict[str, Any]], key: str) -> float | None:
+        return float(np.max([row[key] for row in rows])) if rows else None
+
+    return {
+        "method": cell.method,
+        "uncertainty": cell.uncertainty,
+        "station": cell.station,
+        "seed": cell.seed,
+        "episodes": mark,
+        "held_out_success": mean(judged, "success"),
+        "held_out_return": mean(judged, "return"),
+        "held_out_mean_force": mean(judged, "mean_force"),
+        "held_out_peak_force": worst(judged, "peak_force"),
+        "held_out_steps": mean(judged, "steps"),
+        "training_success": mean(trained, "success"),
+        "training_collisions": sum(row["termination"] == "collision" for row in trained) if trained else None,
+        "training_mean_force": mean(trained, "mean_force"),
+        "training_peak_force": worst(trained, "peak_force"),
+        "worst_violation": worst([*trained, *judged], "worst_violation"),
+        "jerk_commanded_linear": mean(trained[:10], "jerk_commanded_linear"),
+        "jerk_commanded_angular": mean(trained[:10], "jerk_commanded_angular"),
+        "training_seconds": float(sum(row["wall_time"] for row in trained)) if trained else None,
+    }
+
+
+def _still(observation: np.ndarray) -> np.ndarray:
+    return np.zeros(2)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Prints a line for every row, and what they come to."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="the folder; runs in it are used again")
+    parser.add_argument("--methods", default="demonstration,rule,kgrl,skgrl", help="separated by commas")
+    parser.add_argument("--uncertainty", default="calibration", help="calibration or disc")
+    parser.add_argument("--seeds", default="10,11,12,13,14", help="separated by commas")
+    parser.add_argument("--marks", default="40", help="training episodes after which a policy is judged")
+    parser.add_argument("--evaluations", type=int, default=100, help="held-out episodes each time")
+    parser.add_argument("--station", default="rails", help="rails, or arm: what policies are judged on")
+    given = parser.parse_args(arguments)
+    result = connector_study(
+        given.out,
+        methods=given.methods.split(","),
+        uncertainty=given.uncertainty,
+        seeds=[int(seed) for seed in given.seeds.split(",")],
+        marks=[int(mark) for mark in given.marks.split(",")],
+        evaluations=given.evaluations,
+        station=given.station,
+        report=lambda row: print(json.dumps(row), flush=True),
+    )
+    print(json.dumps(result, indent=2, ensure_ascii=False))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,237 @@
+"""`guiderail study smoothness`: what exploring does to the motion, all ways at the same exploration RMS.
+
+Each method explores the connector's skill with random actions, in free space (the jack is somewhere else) and on the
+connector: KGRL and sKGRL through their null space, everything else as a residual on the demonstrations. One table, one
+picture.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
+from guiderail.models.errors import InputError
+from guiderail.models.primitives.gains import exploration_rms, rms_gains
+from guiderail.models.smoothness import log_dimensionless_jerk, spectral_arc_length
+from guiderail.tools.episodes import EpisodeRecord, make_environment
+from guiderail.tools.exploration import Actions, drawn, low_pass, ornstein_uhlenbeck, pink, state_dependent, white
+from guiderail.tools.pictures import COLOURS, new_figure, save_figure
+from guiderail.tools.study import write_table
+
+TASK = "BncConnector"
+PLACES = ("free", "connector")
+ELSEWHERE = (0.3, 0.3)  # m: where the jack is while the robot moves in free space
+OUTPUTS = {"all": (0, 1, 2, 3, 4, 5), "xy": (0, 1)}
+
+Explore = Callable[[np.random.Generator, int, int], Actions]
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to explore."""
+
+    name: str
+    guidance: str
+    explore: Explore
+    hold: int = 1  # of the actions' drawing; the environment itself takes one at every control step
+    environment: dict[str, Any] = field(default_factory=dict)
+
+
+def _white(hold: int = 1) -> Explore:
+    return lambda rng, steps, size: drawn(white, rng, steps, size, hold=hold)
+
+
+def methods() -> list[Method]:
+    """Everything that is compared."""
+    listed = [Method("KGRL", "kgrl", _white())]
+    for history, variance in ((10, 1e-8), (10, 1e-10), (5, 1e-10), (2, 1e-10), (20, 1e-10)):
+        settings = {"history": history, "history_variance": variance}
+        listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", _white(), 1, settings))
+    adaptive = {"history": 10, "history_variance": 1e-10, "adaptive_history": True}
+    listed.append(Method("sKGRL adaptive ρ=1e-10", "skgrl", _white(), 1, adaptive))
+    listed.append(Method("KGRL repeat 5", "kgrl", _white(5), 5))
+    listed.append(
+        Method("sKGRL P=10 ρ=1e-10 repeat 5", "skgrl", _white(5), 5, {"history": 10, "history_variance": 1e-10})
+    )
+    listed.append(Method("residual white", "residual", _white()))
+    listed += [Method(f"residual repeat {n}", "residual", _white(n)) for n in (5, 20)]
+    listed += [Method(f"residual gSDE {n}", "residual", _state_dependent(n)) for n in (1, 8, 64, 400)]
+    listed.append(Method("residual pink", "residual", lambda rng, steps, size: drawn(pink, rng, steps, size)))
+    listed.append(
+        Method("residual OU", "residual", lambda rng, steps, size: drawn(ornstein_uhlenbeck, rng, steps, size))
+    )
+    listed += [Method(f"residual low-pass {f:g} Hz", "residual", _low_pass(f)) for f in (2.0, 1.0, 0.5)]
+    return listed
+
+
+def _state_dependent(interval: int) -> Explore:
+    return lambda rng, steps, size: state_dependent(rng, size, interval)
+
+
+def _low_pass(cutoff: float) -> Explore:
+    return lambda rng, steps, size: drawn(low_pass, rng, steps, size, cutoff=cutoff)
+
+
+def smoothness(
+    out: Path, *, episodes: int = 4, kappa: float = 0.5, outputs: str = "all", seed: int = 0
+) -> dict[str, Any]:
+    """Runs the benchmark; writes `smoothness.csv`, `smoothness.md` and `smoothness.png`.
+
+    Args:
+        out: the folder.
+        episodes: of each method, in free space and on the connector alike.
+        kappa: the common exploration RMS, in demonstration standard deviations.
+        outputs: "all" six, as in the thesis, or "xy", which the connector is learned with.
+        seed: of the random actions and of the connector's offsets (a new one in every episode).
+
+    Raises:
+        InputError: if a number is out of range.
+    """
+    if episodes < 1 or not kappa > 0 or outputs not in OUTPUTS:
+        raise InputError(
+            f"give at least one episode, a positive kappa and outputs {' or '.join(OUTPUTS)}, "
+            f"not {episodes}, {kappa} and {outputs!r}"
+        )
+    quiet = _quiet()
+    rows = []
+    for method in methods():
+        rows += _measure(method, OUTPUTS[outputs], quiet, episodes=episodes, kappa=kappa, seed=seed)
+    for row in rows:
+        kgrl = next(one for one in rows if one["method"] == "KGRL" and one["place"] == row["place"])
+        for part in ("linear", "angular"):
+            row[f"times_below_kgrl_{part}"] = kgrl[f"jerk_commanded_{part}"] / row[f"jerk_commanded_{part}"]
+    return {
+        "table": str(write_table(out / "smoothness", rows)),
+        "picture": str(_draw(rows, out / "smoothness.png")),
+        "exploration_rms": f"{kappa:g} demonstration standard deviations, {outputs} outputs",
+        **_claims(rows),
+    }
+
+
+def _quiet() -> np.ndarray:
+    """The commands of the demonstrations alone, (N, 6)."""
+    env: Any = make_environment(TASK, {"guidance": "kmp", "hold": 1, "uncertainty": "known"})
+    _episode(env, lambda observation: np.zeros(env.action_space.shape), {"offset": ELSEWHERE}, seed=0)
+    commands = env.unwrapped.trace.commanded.copy()
+    env.close()
+    return commands
+
+
+def _measure(
+    method: Method, explored: tuple[int, ...], quiet: np.ndarray, *, episodes: int, kappa: float, seed: int
+) -> list[dict[str, Any]]:
+    """A row for free space and one for the connector."""
+    arguments = {"guidance": method.guidance, "uncertainty": "disc", "hold": 1, "explored": explored}
+    arguments |= method.environment | _strength(method, explored, kappa)
+    env: Any = make_environment(TASK, arguments)
+    deviation = np.sqrt(np.mean(reference_trajectory().standard_deviations ** 2, axis=0))
+    rows = []
+    for place in PLACES:
+        seen, moved, smooth = [], [], []
+        for index in range(episodes):
+            rng = np.random.default_rng([seed, index])
+            act = method.explore(rng, len(quiet), len(explored))
+            options = {"offset": ELSEWHERE} if place == "free" else {"held_out": True}
+            seen.append(_episode(env, act, options, seed=seed + index))
+            trace = env.unwrapped.trace
+            moved.append((trace.commanded - quiet[: len(trace)])[:, list(explored)] / deviation[list(explored)])
+            smooth.append(_shape(trace))
+        rows.append(_row(method, place, seen, np.concatenate(moved), smooth))
+    env.close()
+    return rows
+
+
+def _strength(method: Method, explored: tuple[int, ...], kappa: float) -> dict[str, Any]:
+    """Arguments with which random actions have an RMS of κ standard deviations where no constraint is in the way."""
+    if method.guidance == "residual":
+        return {"kappa": kappa}
+    # Built once more, only for its primitive: what the environment would explore with at κ = 1.
+    from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+    from guiderail.diagrams.stations.station import CONTROL_PERIOD
+    from guiderail.diagrams.tasks.bnc_connector import alignment_constraints
+
+    known = {key: method.environment[key] for key in ("history", "history_variance") if key in method.environment}
+    skill = PrimitiveSkill(reference_trajectory(), alignment_constraints(), CONTROL_PERIOD, **known)
+    primitive = skill.primitive(history=method.guidance == "skgrl")
+    indices = np.array(explored)
+    if not method.environment.get("adaptive_history"):
+        return {"gains": tuple(rms_gains(primitive, kappa, method.hold, indices).tolist())}
+    # Each length of an adaptive history has gains of its own, which one κ sets: it is the longest that is free.
+    reached = exploration_rms(primitive, skill.null_space_gains(primitive), method.hold)[indices]
+    return {"kappa": kappa / float(np.sqrt(np.mean(reached**2)))}
+
+
+def _episode(env: Any, act: Actions, options: dict[str, Any], seed: int) -> dict[str, Any]:
+    observation, _ = env.reset(seed=seed, options=options)
+    record, finished = EpisodeRecord(env), False
+    while not finished:
+        observation, reward, terminated, truncated, info = env.step(act(observation))
+        record.add(float(reward), info)
+        finished = terminated or truncated
+    return record.row(seed)
+
+
+def _shape(trace: Any) -> dict[str, float]:
+    shape = {}
+    for which, poses in (("commanded", trace.commanded), ("measured", trace.measured)):
+        for part, columns in (("linear", slice(0, 3)), ("angular", slice(3, 6))):
+            shape[f"ldlj_{which}_{part}"] = log_dimensionless_jerk(poses[:, columns], trace.period)
+            shape[f"sparc_{which}_{part}"] = spectral_arc_length(poses[:, columns], trace.period)
+    return shape
+
+
+def _row(
+    method: Method, place: str, seen: list[dict[str, Any]], moved: np.ndarray, smooth: list[dict[str, float]]
+) -> dict[str, Any]:
+    kinds = [f"jerk_{which}_{part}" for which in ("commanded", "measured") for part in ("linear", "angular")]
+    return {
+        "method": method.name,
+        "place": place,
+        "episodes": len(seen),
+        "rms_in_deviations": float(np.sqrt(np.mean(moved**2))),
+        **{kind: float(np.mean([row[kind] for row in seen])) for kind in kinds},
+        **{key: float(np.mean([one[key] for one in smooth])) for key in smooth[0]},
+        "peak_force": float(np.max([row["peak_force"] for row in seen])),
+        "mean_force": float(np.mean([row["mean_force"] for row in seen])),
+        "success": float(np.mean([row["success"] for row in seen])) if place == "connector" else None,
+        "collisions": int(sum(row["termination"] == "collision" for row in seen)),
+        "worst_violation": float(np.max([row["worst_violation"] for row in seen])),
+    }
+
+
+def _claims(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """sKGRL (P = 10, ρ = 1e-10) against KGRL, and against the smoothest of the others."""
+    free = {row["method"]: row for row in rows if row["place"] == "free"}
+    ours = free["sKGRL P=10 ρ=1e-10"]
+    others = [row for name, row in free.items() if name.startswith("residual")]
+    claims = {}
+    for part in ("linear", "angular"):
+        best = min(others, key=lambda row: row[f"jerk_commanded_{part}"])
+        times = best[f"jerk_commanded_{part}"] / ours[f"jerk_commanded_{part}"]
+        claims[f"sKGRL's commanded {part} jerk below KGRL's"] = f"{ours[f'times_below_kgrl_{part}']:.0f} times"
+        claims[f"sKGRL's commanded {part} jerk below the smoothest other"] = f"{times:.2g} times ({best['method']})"
+    return claims
+
+
+def _draw(rows: list[dict[str, Any]], path: Path) -> Path:
+    """Jerk of every method, commanded and measured, and what it leads to on the connector."""
+    figure, axes = new_figure(1, 4, (17, 0.32 * len(rows) / 2 + 2))
+    free = [row for row in rows if row["place"] == "free"][::-1]
+    contact = [row for row in rows if row["place"] == "connector"][::-1]
+    height = np.arange(len(free))
+    kinds = {"residual": COLOURS["residual"], "sKGRL": COLOURS["skgrl"], "KGRL": COLOURS["kgrl"]}
+    colours = [next(colour for name, colour in kinds.items() if row["method"].startswith(name)) for row in free]
+    for axis, part, unit in zip(axes[0], ("linear", "angular"), ("m/s³", "rad/s³"), strict=False):
+        axis.barh(height + 0.2, [row[f"jerk_commanded_{part}"] for row in free], 0.4, color=colours)
+        axis.barh(height - 0.2, [row[f"jerk_measured_{part}"] for row in free], 0.4, color=colours, alpha=0.4)
+        axis.set(xscale="log", xlabel=f"{part} jerk in free space [{unit}]", title="commanded, measured (pale)")
+    axes[0, 2].barh(height, [row["success"] for row in contact], 0.7, color=colours)
+    axes[0, 2].set(xlabel="success on the connector, exploring")
+    axes[0, 3].barh(height, [row["peak_force"] for row in contact], 0.7, color=colours)
+    axes[0, 3].set(xlabel="peak force on the connector [N]")
+    for index, axis in enumerate(axes[0]):
+        axis.set_yticks(height, [row["method"] for row in free] if index == 0 else [""] * len(free))
+    return save_figure(figure, path)
