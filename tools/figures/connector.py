@@ -18,7 +18,7 @@ EPISODES, PRESET, EVALUATIONS = 45, "robust", 25
 ENVIRONMENT = {"uncertainty": "calibration"}
 CONDITION = (
     "in simulation, on rails; a hidden offset of 1.0 to 1.5 mm per run and a few tenths per episode; the robust "
-    "preset, actions in x and y held five control steps"
+    "preset, actions in x and y held ten control steps"
 )
 
 
@@ -68,7 +68,7 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
         "picture": str(save_figure(figure, out / "figure_5_8.png")),
         "table": str(write_table(out / "figure_5_8", rows)),
         "demonstrations": len(bnc_connector.load().outputs),
-        "condition": "random actions in x and y, held five control steps, gains calibrated by authority",
+        "condition": "random actions in x and y, held ten control steps, gains calibrated by authority",
     }
 
 
