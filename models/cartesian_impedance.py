@@ -11,6 +11,8 @@ import numpy as np
 
 from guiderail.models.vectors import cross
 
+_REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
+
 
 @dataclass(frozen=True)
 class JointTorques:
@@ -58,7 +60,7 @@ def impedance_torques(
     K: np.ndarray,
     damping_ratio: float,
     wrench_limits: np.ndarray,
-    R_axes: np.ndarray,
+    R_axes: np.ndarray | None,
     p_error: np.ndarray,
     eta: float,
     epsilon: np.ndarray,
@@ -79,7 +81,7 @@ def impedance_torques(
         K: stiffness (6, 6) in the axes of the stiffness frame.
         damping_ratio: ζ of every mode.
         wrench_limits: (6,) along the axes of the stiffness frame [N, Nm].
-        R_axes: from the stiffness frame's axes to those of everything else, (3, 3).
+        R_axes: from the stiffness frame's axes to those of everything else, (3, 3); None where they are the same.
         p_error, eta, epsilon: see `spring_wrench`.
         J: geometric Jacobian of the tool centre, (6, n).
         M: mass matrix with the rotors' reflected inertia, (n, n).
@@ -88,18 +90,26 @@ def impedance_torques(
         gravity_torque: what holds the arm's weight, (n,).
         torque_limits: (n,) [Nm].
     """
-    R = np.zeros((6, 6))
-    R[:3, :3] = R[3:, 3:] = R_axes
-    K = R @ K @ R.T
+    if R_axes is not None:
+        R = np.zeros((6, 6))
+        R[:3, :3] = R[3:, 3:] = R_axes
+        K = R @ K @ R.T
 
     M_inverse_JT = np.linalg.solve(M, J.T)
-    Lambda_inverse = J @ M_inverse_JT + 1e-9 * np.eye(6)  # the term keeps a singular arm finite
+    Lambda_inverse = J @ M_inverse_JT + _REGULARIZATION
     D = damping_matrix(K, Lambda_inverse, damping_ratio)
     wanted_wrench = spring_wrench(K, p_error, eta, epsilon) - D @ (J @ v)
-    along_axes = R.T @ wanted_wrench
-    wrench = R @ np.clip(along_axes, -wrench_limits, wrench_limits)
+    along_axes = wanted_wrench if R_axes is None else R.T @ wanted_wrench
+    wrench = _clipped(along_axes, wrench_limits)
+    if R_axes is not None:
+        wrench = R @ wrench
     leak = np.linalg.solve(Lambda_inverse, M_inverse_JT.T @ posture_torque)  # the tool wrench of the posture's torque
     wanted_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
-    torque = np.clip(wanted_torque, -torque_limits, torque_limits)
+    torque = _clipped(wanted_torque, torque_limits)
     is_saturated = bool((np.abs(along_axes) >= wrench_limits).any() or (torque != wanted_torque).any())
     return JointTorques(torque, wrench, is_saturated)
+
+
+def _clipped(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    # Twice as fast as np.clip on a handful of numbers; this runs at every step of a plant.
+    return np.minimum(np.maximum(values, -limits), limits)

@@ -110,7 +110,7 @@ class CartesianImpedanceController(LeafSystem):
         if np.shape(gains.posture) != (num_joints,):
             raise InputError(f"an impedance's posture must have {num_joints} joints, not {np.shape(gains.posture)}")
         self._plant, self._target, self._tool_centre, self._gains = plant, target, tool_centre, gains
-        self._stiffness_frame = stiffness_frame or target
+        self._stiffness_frame = stiffness_frame
         self._compensate_gravity = compensate_gravity
         self._timeout = timeout
         self._torque_limits = plant.GetEffortUpperLimits()
@@ -204,7 +204,9 @@ class CartesianImpedanceController(LeafSystem):
         target = self._desired_pose.Eval(context) if self._is_sound(context) else self._held(context)
         X_TPd = pose_to_transform(target)
         X_TP = self._tool_centre.CalcPose(plant_context, self._target)
-        R_TAxes = self._stiffness_frame.CalcPose(plant_context, self._target).rotation().matrix()
+        R_TAxes = None
+        if self._stiffness_frame is not None:
+            R_TAxes = self._stiffness_frame.CalcPose(plant_context, self._target).rotation().matrix()
         eta, epsilon = orientation_error(X_TPd.rotation(), X_TP.rotation())
         J = plant.CalcJacobianSpatialVelocity(
             plant_context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._target, self._target
@@ -219,7 +221,7 @@ class CartesianImpedanceController(LeafSystem):
             p_error=X_TPd.translation() - X_TP.translation(),
             eta=eta,
             epsilon=epsilon,
-            J=np.vstack([J[3:], J[:3]]),
+            J=J[[3, 4, 5, 0, 1, 2]],
             M=M,
             v=v,
             posture_torque=gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),

@@ -69,10 +69,15 @@ class WrenchSensor(LeafSystem):
         nominal = plant.CreateDefaultContext()
         self._wrist = int(wrist.index())
         self._tool = int(tool[0].index())
-        self._X_ToolP = centre.CalcPose(nominal, tool[0].body_frame())
-        self._X_ToolWrist = wrist.frame_on_child().CalcPose(nominal, tool[0].body_frame())
-        self._M_ToolP_P = plant.CalcSpatialInertia(nominal, centre, [body.index() for body in tool]).CopyToFullMatrix6()
-        self._R_AxesW = R_WAxes.inverse()
+        X_ToolWrist = wrist.frame_on_child().CalcPose(nominal, tool[0].body_frame())
+        X_ToolP = centre.CalcPose(nominal, tool[0].body_frame())
+        # About the tool's own origin and in its axes, its inertia and the ways to and from there are constant.
+        self._M_Tool = plant.CalcSpatialInertia(
+            nominal, tool[0].body_frame(), [body.index() for body in tool]
+        ).CopyToFullMatrix6()
+        self._wrist_to_tool = _moved(X_ToolWrist.rotation().matrix(), X_ToolWrist.translation())
+        self._tool_to_centre = _moved(np.eye(3), -X_ToolP.translation())
+        self._R_AxesW = R_WAxes.inverse().matrix()
         has_weight = plant.is_gravity_enabled(tool[0].model_instance())
         self._gravity_W = plant.gravity_field().gravity_vector() if has_weight else np.zeros(3)
         self._kept = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
@@ -106,24 +111,22 @@ class WrenchSensor(LeafSystem):
         return EventStatus.Succeeded()
 
     def _measure(self, context: Context) -> np.ndarray:
-        F_WristChild_Wrist = self._reactions.Eval(context)[self._wrist]
-        R_WTool = self._poses.Eval(context)[self._tool].rotation()
-        V_WTool = self._velocities.Eval(context)[self._tool]
-        A_WTool = self._accelerations.Eval(context)[self._tool]
-
-        R_PTool = self._X_ToolP.rotation().inverse()
-        R_PW = R_PTool @ R_WTool.inverse()
-        p_ToolP_W = R_WTool @ self._X_ToolP.translation()
-        p_WristP_Tool = self._X_ToolP.translation() - self._X_ToolWrist.translation()
-        V_WP = V_WTool.Shift(p_ToolP_W)
-        A_WP = A_WTool.Shift(p_ToolP_W, V_WTool.rotational())
-        F_reaction = F_WristChild_Wrist.Rotate(self._X_ToolWrist.rotation()).Shift(p_WristP_Tool).Rotate(R_PTool)
-        torque_force_P = external_wrench(
-            F_reaction.get_coeffs(),
-            self._M_ToolP_P,
-            V_WP.Rotate(R_PW).get_coeffs(),
-            A_WP.Rotate(R_PW).get_coeffs(),
-            R_PW @ self._gravity_W,
+        F_reaction = self._wrist_to_tool @ self._reactions.Eval(context)[self._wrist].get_coeffs()
+        R_WTool = self._poses.Eval(context)[self._tool].rotation().matrix()
+        V_W = self._velocities.Eval(context)[self._tool].get_coeffs()
+        A_W = self._accelerations.Eval(context)[self._tool].get_coeffs()
+        torque_force = external_wrench(
+            F_reaction,
+            self._M_Tool,
+            (V_W.reshape(2, 3) @ R_WTool).ravel(),
+            (A_W.reshape(2, 3) @ R_WTool).ravel(),
+            self._gravity_W @ R_WTool,
         )
-        R_AxesP = (self._R_AxesW @ R_PW.inverse()).matrix()
-        return (torque_force_P.reshape(2, 3)[::-1] @ R_AxesP.T).ravel()
+        at_centre = (self._tool_to_centre @ torque_force).reshape(2, 3)
+        return (at_centre[::-1] @ (self._R_AxesW @ R_WTool).T).ravel()
+
+
+def _moved(R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """What takes a wrench [torque, force] at B in B's axes to A's origin and axes, X_AB = (R, p), (6, 6)."""
+    p_cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
+    return np.block([[R, p_cross @ R], [np.zeros((3, 3)), R]])
