@@ -120,16 +120,17 @@ def split_jerk(poses: np.ndarray, period: float) -> dict[str, float]:
 def reset_held_out(env: gymnasium.Env, seed: int) -> np.ndarray:
     """Starts an episode with conditions that training never drew.
 
-    A task draws them itself, by its reset option `held_out`. One in which every episode starts from the same place is
-    started a little beside it instead.
+    A task draws them by its reset option `held_out`, or at least by the seed, which is none of training's. One in which
+    every episode starts from the same place is started a little beside it instead.
     """
     try:
         return env.reset(seed=seed, options={"held_out": True})[0]
     except InputError as error:
         if "held_out" not in str(error):
             raise
+    usual = env.reset(seed=seed + 1)[1].get("start")
     observation, drawn = env.reset(seed=seed)
-    if "start" not in drawn:
+    if usual is None or not np.array_equal(usual, drawn["start"]):
         return observation
     beside = START_DEVIATION * np.random.default_rng(seed).standard_normal(len(drawn["start"]))
     return env.reset(seed=seed, options={"start": np.asarray(drawn["start"]) + beside})[0]

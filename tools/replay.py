@@ -124,11 +124,13 @@ def _with_caption(page: str, config: RunConfig, row: dict[str, Any], drawn: set[
     )
     title = f"{config.task} · {config.environment.get('guidance', '')} · {config.learner.algorithm.upper()}"
     outcome = row["termination"] or "running"
-    worst = max(row["worst_violation"], row["worst_measured_violation"])
-    violation = "no constraint violated" if worst <= TOLERANCE else f"worst violation {worst:.1e}"
+    violations = (
+        f"{name} {'none' if row[key] <= TOLERANCE else format(row[key], '.1e')}"
+        for name, key in (("commanded", "worst_violation"), ("measured", "worst_measured_violation"))
+    )
     numbers = (
         f"{outcome} after {row['steps']} control steps, return {row['return']:.1f}, "
-        f"peak force {row['peak_force']:.1f} N, {violation}"
+        f"peak force {row['peak_force']:.1f} N, violations: {', '.join(violations)}"
     )
     caption = (
         '<div style="position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,.88);'

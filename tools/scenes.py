@@ -79,9 +79,25 @@ def _bnc_connector() -> Scene:
     )
 
 
+def _pouring() -> Scene:
+    from guiderail.diagrams.stations.pouring import PouringConfig
+
+    X_WT = PouringConfig().X_WT
+    centre = X_WT.translation()
+
+    def to_world(poses: np.ndarray) -> np.ndarray:
+        return X_WT.multiply(np.asarray(poses)[:, :3].T).T
+
+    return Scene(to_world, camera=(tuple(centre + [0.25, -0.5, 0.25]), tuple(centre)), line_radius=0.001)
+
+
 def _sides(corners: np.ndarray) -> list[np.ndarray]:
     """The straight lines between corners (k, 3): a path that turns sharply is drawn side by side."""
     return [corners[i : i + 2] for i in range(len(corners) - 1)]
 
 
-SCENES: dict[str, Callable[[], Scene]] = {"BncConnector": _bnc_connector, "NarrowPassage": _narrow_passage}
+SCENES: dict[str, Callable[[], Scene]] = {
+    "BncConnector": _bnc_connector,
+    "NarrowPassage": _narrow_passage,
+    "Pouring": _pouring,
+}
