@@ -2,8 +2,8 @@
 
     python -m guiderail.tools.stress_pouring --steps 100000
 
-A step is one control step (10 ms) of the arm. Exits with 1 if anything touched what it must not, if a commanded pose was
-outside of the active constraints, or if the thermos was commanded to tilt before that is allowed.
+A step is one control step (10 ms) of the arm. Exits with 1 if anything touched what it must not, if a commanded pose
+was outside of the active constraints, or if the thermos was commanded to tilt before that is allowed.
 """
 
 import argparse
@@ -23,14 +23,14 @@ from guiderail.models.pose_coordinates import pose_to_transform
 TOLERANCE = 1e-9  # [m] or [rad]
 
 
-def stress(steps: int, seed: int = 0, progress: bool = False) -> dict[str, Any]:
+def stress(steps: int, seed: int = 0, progress: bool = False, input_speed: float = 1.0) -> dict[str, Any]:
     """Runs whole episodes, the adversaries in turn, until they took so many control steps.
 
     Returns:
         What was found: control steps, episodes by how they ended, collisions, the worst commanded and measured
         violation, and the greatest tilt [rad] that was commanded in the upright state.
     """
-    env = make_env(mug_offset=MAX_MUG_OFFSET)
+    env = make_env(mug_offset=MAX_MUG_OFFSET, input_speed=input_speed)
     rng = np.random.default_rng(seed)
     found: dict[str, Any] = {"steps": 0, "collisions": 0, "commanded": 0.0, "measured": 0.0, "early_tilt": 0.0}
     endings: Counter[str] = Counter()
@@ -70,8 +70,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--steps", type=int, default=100_000, help="control steps in all")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--input-speed", type=float, default=1.0, help="how much faster than meant the inputs are")
     arguments = parser.parse_args()
-    found = stress(arguments.steps, arguments.seed, progress=True)
+    found = stress(arguments.steps, arguments.seed, progress=True, input_speed=arguments.input_speed)
     print(json.dumps(found, indent=2))
     failed = found["collisions"] > 0 or found["commanded"] > TOLERANCE or found["early_tilt"] > TOLERANCE
     return 1 if failed else 0

@@ -26,8 +26,8 @@ from guiderail.systems.reward_system import RewardSystem
 from guiderail.systems.safety_ledger import SafetyLedger
 
 GUIDANCE = ("sct", "none")
-DECISIONS = 150
-"""After so many decisions an episode is over (about as many as in the thesis)."""
+NUM_STEPS = 1500
+"""After so many control steps an episode is over: 150 decisions at 10 Hz, about as many as in the thesis."""
 
 LEASH = 0.05
 """m: farther from its command than this the arm is waited for."""
@@ -42,18 +42,24 @@ START_HEIGHT = (0.08, 0.19)  # [m]
 MAX_MUG_OFFSET = 0.04  # [m] along x and y: as far as the arm reaches around the mug
 
 
-def make_skill(config: PouringConfig) -> Skill:
-    """The pouring template for this scene's vessels."""
+FULL_SPEED = 0.15  # [m/s] of a full input, along one axis
+FULL_TILT = 0.8  # [rad/s]
+
+
+def make_skill(config: PouringConfig, input_speed: float = 1.0) -> Skill:
+    """The pouring template for this scene's vessels; `input_speed` times as fast as it is meant."""
     return load_skill(
         "pouring",
+        full_speed_m_per_s=input_speed * FULL_SPEED,
+        full_tilt_rad_per_s=input_speed * FULL_TILT,
         mug_radius_m=config.mug.outer_radius,
-        mug_height_m=config.mug.height,
         thermos_radius_m=config.thermos.outer_radius,
-        thermos_length_m=config.thermos.height,
     )
 
 
-def make_guidance(kind: str, config: PouringConfig, active_constraints: bool | None = None) -> SctGuidance:
+def make_guidance(
+    kind: str, config: PouringConfig, active_constraints: bool | None = None, input_speed: float = 1.0
+) -> SctGuidance:
     """The guidance of a kind: `sct`, three inputs through the template, or `none`, six as a velocity.
 
     Its `action` port is a policy's or a person's device's, which is all that the two differ in.
@@ -61,7 +67,7 @@ def make_guidance(kind: str, config: PouringConfig, active_constraints: bool | N
     check_guidance(kind, GUIDANCE, "Pouring")
     constrained = kind == "sct" if active_constraints is None else active_constraints
     return SctGuidance(
-        make_skill(config),
+        make_skill(config, input_speed),
         {"mug_tip": RigidTransform()},
         config.control_period,
         input_mapping=None if kind == "sct" else load_skill("end_effector_velocity"),
@@ -77,6 +83,7 @@ def make_env(
     render_mode: str | None = None,
     hold: int = 10,
     active_constraints: bool | None = None,
+    input_speed: float = 1.0,
     mug_inner_diameter: float = MUG.inner_diameter,
     mug_depth: float = MUG.depth,
     mug_offset: float = 0.0,
@@ -90,8 +97,10 @@ def make_env(
         observation: "state": the tip's pose in the frame of the mug's tip, position in units of 0.2 m and a rotation
             vector.
         render_mode: None, "human" (a browser view) or "rgb_array".
-        hold: control steps per decision; the inputs' speeds are the skill's.
+        hold: control steps per decision.
         active_constraints: the template's; by default with "sct" only. With "none" they are a safety filter.
+        input_speed: how much faster than meant the template's inputs are, 0.2 to 2: a policy that gets no reward before
+            it has poured finds out how only if its random inputs sometimes do.
         mug_inner_diameter: m, of the mug that stands there.
         mug_depth: m.
         mug_offset: m, up to which the mug is moved along x and y, drawn at every reset.
@@ -106,10 +115,12 @@ def make_env(
         raise InputError(f"there is no observation '{observation}' of Pouring: use 'state'")
     if not 0.0 <= mug_offset <= MAX_MUG_OFFSET:
         raise InputError(f"mug_offset is between 0 and {MAX_MUG_OFFSET} m, where the arm reaches, not {mug_offset}")
+    if not 0.2 <= input_speed <= 2.0:
+        raise InputError(f"input_speed is between 0.2 and 2, where the arm still follows, not {input_speed}")
     config = PouringConfig(mug=vessel_or_refuse(mug_inner_diameter, mug_depth, Ball()))
     task = build_task(
         config,
-        make_guidance(guidance, config, active_constraints),
+        make_guidance(guidance, config, active_constraints, input_speed),
         reward=reward,
         hold=hold,
         mug_offset=mug_offset,
@@ -207,7 +218,7 @@ def build_task(
     return TaskDiagram(
         diagram=diagram,
         control_period=config.control_period,
-        num_steps=DECISIONS * hold,
+        num_steps=NUM_STEPS,
         observation_space=gymnasium.spaces.Box(-10.0, 10.0, (6,), np.float32),
         reward_terms=rewards.term_names,
         ledger_fields=SafetyLedger.FIELDS,

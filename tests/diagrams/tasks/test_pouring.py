@@ -111,6 +111,17 @@ def test_the_template_is_the_objects_not_the_episodes(mug, position):
     assert info["ledger"]["worst_commanded_violation"] <= 1e-9
 
 
+def test_faster_inputs_are_as_safe():
+    env = make_env(reward="sparse", input_speed=1.7, hold=20)
+    info, total, _ = run(env, person, seed=3)
+    assert info["termination"] == "success"
+    assert info["control_steps"] < 250
+    assert info["ledger"]["worst_commanded_violation"] <= 1e-9
+    rng = np.random.default_rng(0)
+    info, _, _ = run(env, ADVERSARIES["noisy_person"](rng), seed=3, limit=15)
+    assert info["termination"] not in ("collision", "spill")
+
+
 def test_starts_are_drawn_and_repeat_with_the_seed(env):
     first = env.reset(seed=3)[1]["start"]
     second = env.reset()[1]["start"]
@@ -181,6 +192,7 @@ def test_hand_shaped_reward_is_the_thesiss():
         ({"observation": "image"}, "state"),
         ({"mug_offset": 1.0}, "between 0 and"),
         ({"mug_inner_diameter": 0.03}, "take the balls"),
+        ({"input_speed": 5.0}, "between 0.2 and 2"),
     ],
 )
 def test_refuses_what_makes_no_sense(arguments, said):
