@@ -113,7 +113,7 @@ def test_the_template_is_the_objects_not_the_episodes(mug, position):
 
 def test_faster_inputs_are_as_safe():
     env = make_env(reward="sparse", input_speed=1.7, hold=20)
-    info, total, _ = run(env, person, seed=3)
+    info, _, _ = run(env, person, seed=3)
     assert info["termination"] == "success"
     assert info["control_steps"] < 250
     assert info["ledger"]["worst_commanded_violation"] <= 1e-9
@@ -163,7 +163,7 @@ def test_shaping_is_the_progress_of_the_template(env):
         for name in sums:
             sums[name] += info[name]
 
-    info, total, actions = run(env, person, seed=2, watch=watch)
+    _, total, actions = run(env, person, seed=2, watch=watch)
     assert sums["terminal_reward"] == 200.0
     assert total == pytest.approx(sum(sums.values()))
     # The last action's cost counts for as long as it lasted.
