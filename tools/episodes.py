@@ -98,7 +98,7 @@ class EpisodeRecord:
             "episode": episode,
             "return": self._return,
             "success": int(self._last["is_success"]),
-            "termination": self._last["termination"],
+            "termination": "simulation_failure" if "simulation_failure" in self._last else self._last["termination"],
             "steps": len(trace),
             "peak_force": float(ledger.get("peak_force", force.max(initial=0.0))),
             "mean_force": float(ledger.get("mean_force", force.mean() if len(force) else 0.0)),
