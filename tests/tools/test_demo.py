@@ -1,0 +1,16 @@
+from guiderail.tools import demo
+
+
+def test_the_demo_says_what_it_left_and_replaces_itself(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "HELD_OUT", 1)
+    out = tmp_path / "demo"
+    demo.run_demo(out, episodes=2, seed=0)
+    said = capsys.readouterr().out
+    for name in ("picture.png", "replay.html", "episodes.csv", "learning_curve.png"):
+        assert (out / name).stat().st_size > 0
+        assert name in said
+    assert "2 of 2 training episodes reached the goal, 0 violated the constraint, 0 touched a wall" in said
+    assert "The demonstrations alone" in said
+    (out / "left_over.txt").write_text("of the last demo")
+    demo._clear(out)
+    assert not out.exists()
