@@ -1,6 +1,7 @@
 """The `guiderail` command: what a person types, checked, and handed to the tool that does it."""
 
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -240,7 +241,9 @@ def _settings(pairs: list[str]) -> dict[str, str]:
 def _print(result: dict[str, Any], as_json: bool) -> None:
     """A result for a program or for a person."""
     if as_json:
-        typer.echo(json.dumps(result, allow_nan=False))
+        # JSON knows no infinity: what is unbounded, such as the slack of no constraint at all, is null there.
+        known = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
+        typer.echo(json.dumps(known, allow_nan=False))
         return
     width = max(len(key) for key in result)
     for key, value in result.items():
