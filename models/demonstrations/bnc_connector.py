@@ -37,21 +37,23 @@ _DEVIATIONS = {
     "Rx": np.array([1.2, 1.2, 1.2, 1.2, 0.5, 0.2, 0.2, 0.15]) * DEGREE,
 }
 _CORRELATION = {"x": 0.22, "y": 0.22, "z": 0.35, "Rz": 0.5, "Ry": 0.3, "Rx": 0.3}  # [s] how quickly the hand wanders
+_CENTRING = 0.9  # five random curves have a mean of their own; this much of it is taken out: nobody knows a better path
 _TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # [s]: ahead of or behind the script by this much, for this long
 
 
-def demonstrator_motion(seed: int, times: np.ndarray) -> np.ndarray:
-    """Desired poses (N, 6) of one demonstration at `times` (N,) [s], in the locked frame."""
+def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
+    """Desired poses (M, N, 6) of a session of M demonstrations at `times` (N,) [s], in the locked frame."""
     rng = np.random.default_rng(seed)
     script_times, script = insert_and_lock()
-    lead = _TEMPO_DEVIATION * _smooth(rng, times, _TEMPO_CORRELATION) * np.sin(np.pi * times / times[-1])
-    at = np.clip(times + lead, 0.0, script_times[-1])
-    motion = np.stack([np.interp(at, script_times, column) for column in script.T], axis=1)
-    wander = [
-        np.interp(times, _TIMES, deviation) * _smooth(rng, times, _CORRELATION[name])
-        for name, deviation in _DEVIATIONS.items()
-    ]
-    return motion + np.stack(wander, axis=1)
+    scripted, curves = [], []
+    for _ in range(NUM_DEMONSTRATIONS):
+        lead = _TEMPO_DEVIATION * _smooth(rng, times, _TEMPO_CORRELATION) * np.sin(np.pi * times / times[-1])
+        at = np.clip(times + lead, 0.0, script_times[-1])
+        scripted.append(np.stack([np.interp(at, script_times, column) for column in script.T], axis=1))
+        curves.append(np.stack([_smooth(rng, times, _CORRELATION[name]) for name in _DEVIATIONS], axis=1))
+    wander = np.stack(curves) - _CENTRING * np.mean(curves, axis=0)
+    scale = np.stack([np.interp(times, _TIMES, deviation) for deviation in _DEVIATIONS.values()], axis=1)
+    return np.stack(scripted) + scale * wander
 
 
 def load() -> Demonstrations:
