@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
@@ -15,7 +16,8 @@ class SctInputMapping(LeafSystem):
 
         H^im = displace_q(H, map_q(u))
 
-    during one period, from the pose H that `pose` brings. Inputs are clipped to [−1, 1].
+    during one period, from the pose H that `pose` brings. Inputs are clipped to [−1, 1]; of an input that is not finite
+    comes a pose that is not finite either, for whoever checks poses to see.
 
     .. pydrake_system::
 
@@ -79,10 +81,14 @@ class SctInputMapping(LeafSystem):
         return self._requested_pose_port
 
     def _calc_requested_pose(self, context: Context, output) -> None:
+        action = self._action_port.Eval(context)
+        if not np.isfinite(action).all():
+            output.SetFromVector(np.full(6, np.nan))
+            return
         X_WE = pose_to_transform(self._pose_port.Eval(context))
         displacement = self._skill.map(
             int(self._state_port.Eval(context)[0]),
-            self._action_port.Eval(context),
+            action,
             X_WE,
             self.frames.eval(context),
             self._period,

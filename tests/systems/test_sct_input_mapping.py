@@ -59,6 +59,11 @@ def test_a_reset_can_move_an_object(system):
     np.testing.assert_allclose(aside, POSE, atol=1e-12)
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_finite_stays_visible(system, bad):
+    assert np.isnan(requested(system, np.array([0.0, bad, 0.0]), 1)).all()
+
+
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan")])
 def test_refuses_what_makes_no_sense(skill, period):
     with pytest.raises(ValueError, match="period"):

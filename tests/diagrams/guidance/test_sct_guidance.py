@@ -94,6 +94,16 @@ def test_goes_through_all_states_and_says_how_far_it_is(skill):
     assert progress[-1] == pytest.approx(sum(s.weight * (s.starts_at - s.ends_at) for s in skill.states), abs=0.02)
 
 
+def test_a_broken_device_repeats_the_last_safe_command(skill):
+    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+    before = rig.step(np.array([0.0, 1.0, 0.0]))
+    for _ in range(3):
+        np.testing.assert_array_equal(rig.step(np.array([np.nan, 0.0, np.inf])), before)
+        assert rig.value("fallback")[0] == 1.0
+    assert rig.step(np.array([0.0, 1.0, 0.0]))[1] > before[1]
+    assert rig.value("fallback")[0] == 0.0
+
+
 def test_objects_can_be_moved_at_a_reset(skill):
     """Everything happens relative to the object: the same inputs draw the same path elsewhere."""
     paths = []
