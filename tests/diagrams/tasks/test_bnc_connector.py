@@ -122,7 +122,7 @@ def test_reward_is_the_sum_of_its_terms(kgrl):
     action = np.array([0.5, -1.0])
     _, reward, _, _, info = kgrl.step(action)
     assert reward == pytest.approx(info["action_cost"] + info["force_cost"] + info["terminal_reward"])
-    assert info["action_cost"] == pytest.approx(-0.01 * 5 * action @ action)
+    assert info["action_cost"] == pytest.approx(-0.01 * kgrl.hold * action @ action)
 
 
 def test_shaped_reward_adds_the_depth_gained():
@@ -149,7 +149,7 @@ def test_a_push_moves_the_robot(kgrl):
     before = kgrl.trace.measured[-1].copy()
     kgrl.push(np.array([0.0, 0.0, 0.004, 0.0, 0.0, 0.0]))
     kgrl.step(np.zeros(2))
-    assert kgrl.trace.measured[5, 2] > before[2] + 0.001
+    assert kgrl.trace.measured[kgrl.hold, 2] > before[2] + 0.001
 
 
 class TestUncertainty:
