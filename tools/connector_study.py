@@ -107,6 +107,8 @@ def judge(cell: Cell, out: Path) -> list[dict[str, Any]]:
     rows = []
     for mark in cell.marks:
         trained = _trained(folder)
+        if trained:
+            _refuse_another(folder, cell)
         if len(trained) < mark:
             trained = train(folder, cell.config(mark), resume=bool(trained))
         elif len(trained) > mark and not _file(folder, cell, mark).exists():
@@ -118,6 +120,13 @@ def judge(cell: Cell, out: Path) -> list[dict[str, Any]]:
 
 def _trained(folder: RunFolder) -> list[dict[str, Any]]:
     return folder.episodes() if (folder.path / "episodes.csv").exists() else []
+
+
+def _refuse_another(folder: RunFolder, cell: Cell) -> None:
+    """A run with other settings is neither trained further nor judged as if it were this one."""
+    found, wanted = folder.config(), cell.config(1)
+    if (found.environment, found.learner, found.seed) != (wanted.environment, wanted.learner, wanted.seed):
+        raise InputError(f"{folder.path} holds a run with other settings: name another folder with --out")
 
 
 def _file(folder: RunFolder, cell: Cell, mark: int) -> Path:

@@ -8,6 +8,7 @@ from gymnasium import spaces
 
 from guiderail.models.errors import InputError
 from guiderail.tools.learners import PRESETS, Learner, resolve_preset
+from guiderail.tools.policy import Policy
 
 
 class Spaces(gymnasium.Env):
@@ -116,5 +117,49 @@ def test_a_checkpoint_of_another_network_does_not_fit(preset):
 
 @pytest.mark.parametrize("settings", [{"discount": 1.5}, {"units": ""}, {"entropy": "much"}, {"batch_size": 2.5}])
 def test_refuses_what_no_learner_can_use(settings):
+    with pytest.raises(InputError):
+        resolve_preset("robust", "tqc", settings)
+
+
+def acted(learner, episodes, decisions=4):
+    """The actions of so many episodes at one and the same observation, (episodes, decisions, 2)."""
+    actions = []
+    for _ in range(episodes):
+        learner.begin()
+        actions.append([learner.act(np.ones(3, np.float32)) for _ in range(decisions)])
+    return np.array(actions)
+
+
+def test_steady_episodes_keep_to_one_action_each(preset):
+    actions = acted(make(replace(preset, steady_episodes=3)), 4)
+    assert (actions[:3] == actions[:3, :1]).all()
+    assert len(np.unique(actions[:3, 0], axis=0)) == 3
+    assert len(np.unique(actions[3], axis=0)) == 4
+
+
+def test_practising_episodes_do_what_the_policy_would(preset):
+    learner = make(replace(preset, steady_episodes=0, practise_every=2))
+    live(learner, 20)
+    explored, practised = acted(learner, 2)
+    assert len(np.unique(explored, axis=0)) == 4
+    assert (practised == practised[0]).all()
+    policy = Policy.from_actor(learner.actor(), {"observation_shape": [3]})
+    np.testing.assert_allclose(practised[0], policy(np.ones(3, np.float32)), atol=1e-6)
+
+
+def test_a_restored_learner_is_in_the_same_episode(preset):
+    first = make(replace(preset, steady_episodes=2, practise_every=2))
+    live(first, 20)
+    acted(first, 3)
+    arrays, values = first.state()
+    arrays = {key: value.copy() for key, value in arrays.items()}
+    expected = acted(first, 3)
+    second = make(first.preset, seed=9)
+    second.restore(arrays, values)
+    np.testing.assert_array_equal(acted(second, 3), expected)
+
+
+@pytest.mark.parametrize("settings", [{"steady_episodes": -1}, {"practise_every": -1}])
+def test_negative_counts_of_episodes_are_refused(settings):
     with pytest.raises(InputError):
         resolve_preset("robust", "tqc", settings)
