@@ -44,6 +44,7 @@ MAX_MUG_OFFSET = 0.04  # [m] along x and y: as far as the arm reaches around the
 
 FULL_SPEED = 0.15  # [m/s] of a full input, along one axis
 FULL_TILT = 0.8  # [rad/s]
+SPARSE_INPUT_SPEED = 1.7
 
 
 def make_skill(config: PouringConfig, input_speed: float = 1.0) -> Skill:
@@ -83,7 +84,7 @@ def make_env(
     render_mode: str | None = None,
     hold: int = 10,
     active_constraints: bool | None = None,
-    input_speed: float = 1.0,
+    input_speed: float | None = None,
     mug_inner_diameter: float = MUG.inner_diameter,
     mug_depth: float = MUG.depth,
     mug_offset: float = 0.0,
@@ -99,8 +100,9 @@ def make_env(
         render_mode: None, "human" (a browser view) or "rgb_array".
         hold: control steps per decision.
         active_constraints: the template's; by default with "sct" only. With "none" they are a safety filter.
-        input_speed: how much faster than meant the template's inputs are, 0.2 to 2: a policy that gets no reward before
-            it has poured finds out how only if its random inputs sometimes do.
+        input_speed: how much faster than meant the template's inputs are, 0.2 to 2. Unless given it is 1, and 1.7 for a
+            sparse reward through the template: what is rewarded only once it is done is found only if random inputs
+            sometimes do it. Then also let an action last longer, such as hold=20.
         mug_inner_diameter: m, of the mug that stands there.
         mug_depth: m.
         mug_offset: m, up to which the mug is moved along x and y, drawn at every reset.
@@ -115,6 +117,8 @@ def make_env(
         raise InputError(f"there is no observation '{observation}' of Pouring: use 'state'")
     if not 0.0 <= mug_offset <= MAX_MUG_OFFSET:
         raise InputError(f"mug_offset is between 0 and {MAX_MUG_OFFSET} m, where the arm reaches, not {mug_offset}")
+    if input_speed is None:
+        input_speed = SPARSE_INPUT_SPEED if (guidance, reward) == ("sct", "sparse") else 1.0
     if not 0.2 <= input_speed <= 2.0:
         raise InputError(f"input_speed is between 0.2 and 2, where the arm still follows, not {input_speed}")
     config = PouringConfig(mug=vessel_or_refuse(mug_inner_diameter, mug_depth, Ball()))

