@@ -64,3 +64,9 @@ def draw_runs(axis: Axes, runs: Sequence[Sequence[float]], *, colour: str, label
     episodes = np.arange(1, length + 1)
     axis.fill_between(episodes, smooth.min(0), smooth.max(0), color=colour, alpha=0.15, linewidth=0)
     axis.plot(episodes, smooth.mean(0), color=colour, label=label)
+
+
+def legend(figure: Figure, axis: Axes) -> None:
+    """One legend above all axes, where it covers no curve."""
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)

@@ -41,7 +41,7 @@ def trained(bead_config, tmp_path):
         (["train", "Bead", "--out", "new", "--set", "batch_size"], "name=value"),
         (["train", "Bead", "--out", "new", "--set", "batchsize=3"], "batch_size"),
         (["train", "Bead", "--out", "new", "--set", "batch_size=0"], "at least 1"),
-        (["train", "Bead", "--out", "new", "--set", "learning_rate=fast"], "0.0003"),
+        (["train", "Bead", "--out", "new", "--set", "learning_rate=fast"], "give a value such as"),
         (["train", "--resume", "--out", "new"], "not a run"),
         (["train", "Bead", "--fast"], "--fast"),
         (["evaluate", "new"], "not a run"),

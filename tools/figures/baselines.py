@@ -7,7 +7,7 @@ import numpy as np
 
 from guiderail.tools.episodes import make_environment, run_episode
 from guiderail.tools.figures import passage, runs
-from guiderail.tools.pictures import COLOURS, NAMES, new_figure, save_figure
+from guiderail.tools.pictures import COLOURS, NAMES, legend, new_figure, save_figure
 from guiderail.tools.study import write_table
 
 METHODS = ("residual", "safe_residual", "kgrl")
@@ -81,7 +81,7 @@ def figure_4_5(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
         strict=True,
     ):
         runs.draw_learning(axis, results, METHODS, column, label)
-    axes[0, 0].legend(frameon=False)
+    legend(figure, axes[0, 0])
     rows = [passage.learned(result) for result in results]
     return {
         "picture": str(save_figure(figure, out / "figure_4_5.png")),
@@ -99,7 +99,7 @@ def figure_4_6(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
     runs.draw_learning(axes[0], results, METHODS, "collisions", "wall collisions per episode", window=1)
     runs.draw_learning(axes[1], results, METHODS, "worst_measured_violation", "worst violation [m]", window=1)
     axes[1].axhline(0, color="firebrick", linewidth=0.8)
-    axes[0].legend(frameon=False)
+    legend(figure, axes[0])
     rows = [passage.learned(result) for result in results]
     return {
         "picture": str(save_figure(figure, out / "figure_4_6.png")),

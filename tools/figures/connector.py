@@ -9,7 +9,7 @@ from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
 from guiderail.models.demonstrations import bnc_connector
 from guiderail.tools.episodes import make_environment, run_episode
 from guiderail.tools.figures import runs
-from guiderail.tools.pictures import COLOURS, NAMES, new_figure, save_figure
+from guiderail.tools.pictures import COLOURS, NAMES, legend, new_figure, save_figure
 from guiderail.tools.study import write_table
 
 TASK = "BncConnector"
@@ -80,7 +80,7 @@ def figure_5_9(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
         axes, (("success", "success"), ("return", "return"), ("mean_force", "mean contact force [N]")), strict=True
     ):
         runs.draw_learning(axis, results, METHODS, column, label)
-    axes[0].legend(frameon=False)
+    legend(figure, axes[0])
     rows = [runs.table_row(result) for result in results]
     return {
         "picture": str(save_figure(figure, out / "figure_5_9.png")),

@@ -5,7 +5,7 @@ from typing import Any
 
 from guiderail.tools.figures import passage, runs
 from guiderail.tools.figures.baselines import EPISODES
-from guiderail.tools.pictures import NAMES, new_figure, save_figure
+from guiderail.tools.pictures import NAMES, legend, new_figure, save_figure
 from guiderail.tools.study import write_table
 
 METHODS = ("kgrl", "skgrl")
@@ -27,7 +27,7 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
     ):
         runs.draw_learning(axis, results, METHODS, column, label)
     axes[1, 1].set_yscale("log")
-    axes[0, 0].legend(frameon=False)
+    legend(figure, axes[0, 0])
     rows = [passage.learned(result) for result in results]
     returns = {kind: runs.mean_of_last(results, kind, "return") for kind in METHODS}
     actions = {kind: runs.mean_of_last(results, kind, "reward_action_cost") for kind in METHODS}
