@@ -8,11 +8,13 @@ import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import (
+    Demonstrations,
     LcNsKmp,
     LinearConstraints,
     Matern52,
     ReferenceTrajectory,
     SquaredExponential,
+    UnsolvableError,
     pose_demonstrations,
 )
 from oracles.dense import Extended
@@ -241,6 +243,41 @@ def test_bound_holds_under_hostile_actions(history, period, history_variance):
             assert p.constraints.violation(output) <= 1e-9
             if history:
                 past = np.vstack([past[1:], output])
+
+
+@pytest.mark.parametrize(
+    "variances", [(1e-12, 1.0), (1.0, 1e-12), (1e-12, 1e-12), "alternating", "demonstrations that coincide"]
+)
+@pytest.mark.parametrize("period", [0.02, 0.001])
+@pytest.mark.parametrize("history", [0, 1, 10])
+def test_bound_holds_where_problems_are_badly_scaled(variances, period, history):
+    """Covariances from 1e-12 to 1, ρ = 1e-10, a millisecond's clock: at worst a refusal, which repeats a safe command."""
+    t = period * np.arange(60)
+    means = np.column_stack([t, np.sin(40 * t)])
+    if variances == "demonstrations that coincide":
+        reference = ReferenceTrajectory.from_demonstrations(Demonstrations(t, [means] * 3), components=5)
+    else:
+        diagonal = np.tile(variances if variances != "alternating" else (1.0, 1e-12), (60, 1))
+        if variances == "alternating":
+            diagonal[::2] = 1e-12
+        reference = ReferenceTrajectory(t, means, diagonal[:, :, None] * np.eye(2))
+    p = LcNsKmp(
+        reference,
+        history=history,
+        history_variance=1e-10,
+        constraints=LinearConstraints.box([-0.002, -0.5], [t[-1] / 2, 0.5]),
+    )
+    rng = np.random.default_rng(0)
+    past, last, refused = np.zeros((history, 2)) if history else None, None, 0
+    for n in range(60):
+        try:
+            last = p.predict(n, 1e4 * rng.choice([-1, 1], 2), past).output
+            assert p.constraints.violation(last) <= 1e-9
+        except UnsolvableError:
+            refused += 1
+        if history and last is not None:
+            past = np.vstack([past[1:], last])
+    assert refused == 0
 
 
 def test_constraints_that_change_with_the_step_bind_where_they_apply():
