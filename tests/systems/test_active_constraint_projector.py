@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
@@ -141,7 +143,7 @@ def test_a_robot_that_starts_outside_is_led_inside():
         rig.step(rig.desired())
         violations.append(rig.value("commanded_violation"))
     assert violations[0] > 0.1
-    assert all(later <= earlier + 1e-12 for earlier, later in zip(violations, violations[1:], strict=False))
+    assert all(later <= earlier + 1e-12 for earlier, later in pairwise(violations))
     assert violations[-1] <= 1e-9
 
 
