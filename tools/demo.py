@@ -19,6 +19,7 @@ from guiderail.tools.training import run
 
 HELD_OUT = 10  # episodes that the result is judged on
 SEED = 1_000_000
+PRESET = "steady"
 
 
 def run_demo(out: Path, *, episodes: int, seed: int) -> None:
@@ -39,7 +40,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         "and a zone was forbidden. It now learns by trial and error to go around the one, and never enters the other."
     )
     _clear(out)
-    summary = run("NarrowPassage", out, environment={"guidance": "skgrl"}, preset="quick", episodes=episodes, seed=seed)
+    summary = run("NarrowPassage", out, environment={"guidance": "skgrl"}, preset=PRESET, episodes=episodes, seed=seed)
     before, after = _judge(out)
     picture = _draw(out, before, after)
     rows = RunFolder(out).episodes()
@@ -76,7 +77,7 @@ def _clear(out: Path) -> None:
         config = folder.config()
     except InputError:
         config = None
-    if config is None or config.task != "NarrowPassage" or config.preset != "quick":
+    if config is None or config.task != "NarrowPassage" or config.preset != PRESET:
         folder.refuse_existing()
         return
     shutil.rmtree(out)

@@ -18,11 +18,17 @@ PRESET = "quick"
 
 
 def train_all(
-    out: Path, guidance: Sequence[str], *, seeds: int, episodes: int, observation: str = "state"
+    out: Path,
+    guidance: Sequence[str],
+    *,
+    seeds: int,
+    episodes: int,
+    observation: str = "state",
+    preset: str = PRESET,
 ) -> list[dict[str, Any]]:
     """Runs in the narrow passage (see `runs.train_all`)."""
     environment = {"hold": HOLD, "observation": observation}
-    return runs.train_all(out, TASK, guidance, seeds=seeds, episodes=episodes, preset=PRESET, environment=environment)
+    return runs.train_all(out, TASK, guidance, seeds=seeds, episodes=episodes, preset=preset, environment=environment)
 
 
 def learned(result: dict[str, Any]) -> dict[str, Any]:
