@@ -43,7 +43,7 @@ class Preset:
     entropy: str = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     units: tuple[int, ...] = (256, 256)  # of the hidden layers
     steady_episodes: int = 0  # the first ones, in which one action drawn uniformly is kept all the time
-    practise_every: int = 0  # of so many episodes, one is acted without exploring; 0 for none
+    practise: float = 0.0  # part of the episodes, evenly spread, that are acted without exploring
     averaging: float = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
 
 
@@ -62,7 +62,7 @@ PRESETS = {
         gradient_steps=16,
         units=(128, 128),
         steady_episodes=6,
-        practise_every=2,
+        practise=0.5,
         averaging=0.01,
     ),
     # Cheap enough to watch: the narrow passage within a minute.
@@ -115,9 +115,10 @@ def _check(preset: Preset) -> None:
     for key in ("train_every", "gradient_steps", "batch_size", "buffer_size", "learning_starts"):
         if getattr(preset, key) < 1:
             raise InputError(f"the learner's {key} must be at least 1, not {getattr(preset, key)}")
-    for key in ("steady_episodes", "practise_every"):
-        if getattr(preset, key) < 0:
-            raise InputError(f"the learner's {key} must not be negative, not {getattr(preset, key)}")
+    if preset.steady_episodes < 0:
+        raise InputError(f"the learner's steady_episodes must not be negative, not {preset.steady_episodes}")
+    if not 0 <= preset.practise <= 1:
+        raise InputError(f"the learner's practise must be between 0 and 1, not {preset.practise}")
     if not (np.isfinite(preset.learning_rate) and preset.learning_rate > 0):
         raise InputError(f"the learner's learning_rate must be positive, not {preset.learning_rate}")
     for key, low in (("discount", 0.0), ("soft_update", 0.0), ("averaging", -1e-300)):
@@ -196,8 +197,8 @@ class Learner:
     def begin(self) -> None:
         """Begins an episode, and decides how it explores."""
         self.episodes += 1
-        every = self.preset.practise_every
-        self._practises = every > 0 and self.episodes % every == 0
+        share = self.preset.practise
+        self._practises = int(self.episodes * share) > int((self.episodes - 1) * share)
         self._steady = self._uniform() if self.episodes <= self.preset.steady_episodes else None
 
     def act(self, observation: np.ndarray) -> np.ndarray:

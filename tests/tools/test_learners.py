@@ -138,7 +138,7 @@ def test_steady_episodes_keep_to_one_action_each(preset):
 
 
 def test_practising_episodes_do_what_the_policy_would(preset):
-    learner = make(replace(preset, steady_episodes=0, practise_every=2))
+    learner = make(replace(preset, steady_episodes=0, practise=0.5))
     live(learner, 20)
     explored, practised = acted(learner, 2)
     assert len(np.unique(explored, axis=0)) == 4
@@ -147,8 +147,16 @@ def test_practising_episodes_do_what_the_policy_would(preset):
     np.testing.assert_allclose(practised[0], policy(np.ones(3, np.float32)), atol=1e-6)
 
 
+def test_so_many_episodes_practise_as_asked_for(preset):
+    for share in (0.0, 0.25, 0.75, 1.0):
+        learner = make(replace(preset, steady_episodes=0, practise=share))
+        live(learner, 20)
+        practised = [len(np.unique(actions, axis=0)) == 1 for actions in acted(learner, 8)]
+        assert sum(practised) == 8 * share
+
+
 def test_a_restored_learner_is_in_the_same_episode(preset):
-    first = make(replace(preset, steady_episodes=2, practise_every=2))
+    first = make(replace(preset, steady_episodes=2, practise=0.5))
     live(first, 20)
     acted(first, 3)
     arrays, values = first.state()
@@ -159,7 +167,7 @@ def test_a_restored_learner_is_in_the_same_episode(preset):
     np.testing.assert_array_equal(acted(second, 3), expected)
 
 
-@pytest.mark.parametrize("settings", [{"steady_episodes": -1}, {"practise_every": -1}])
-def test_negative_counts_of_episodes_are_refused(settings):
+@pytest.mark.parametrize("settings", [{"steady_episodes": -1}, {"practise": -1}, {"practise": 1.5}])
+def test_episodes_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError):
         resolve_preset("robust", "tqc", settings)
