@@ -77,7 +77,7 @@ def _low_pass(cutoff: float) -> Explore:
 
 
 def smoothness(
-    out: Path, *, episodes: int = 4, kappa: float = 0.5, outputs: str = "all", seed: int = 0
+    out: Path, *, episodes: int = 4, kappa: float = 1.0, outputs: str = "all", seed: int = 0
 ) -> dict[str, Any]:
     """Runs the benchmark; writes `smoothness.csv`, `smoothness.md` and `smoothness.png`.
 
