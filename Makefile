@@ -25,7 +25,7 @@ bench: $(VENV)/.ready
 # An editable install maps the folders to guiderail.*; a type checker can't follow that, so it gets the same map as links.
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	mkdir -p $(VENV)/types/guiderail
 	for folder in models systems diagrams tools; do ln -sfn ../../../$$folder $(VENV)/types/guiderail/$$folder; done
 	touch $@

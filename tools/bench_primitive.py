@@ -146,7 +146,8 @@ def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> dict:
     gc.collect()
     seconds, constrained, samples = loop.run(p.predict, steps)
     scale = np.abs(p.reference.means).max(axis=0)
-    dense_seconds, difference = [], 0.0
+    dense_seconds: list[float] = []
+    difference = 0.0
     for n, action, history, output in samples[::8][:25]:
         if sum(dense_seconds) > DENSE_SECONDS:
             break

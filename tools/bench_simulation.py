@@ -1,7 +1,7 @@
 """How fast the connector's simulation is: `guiderail bench simulation`.
 
-CPU time of one core, not wall clock, and the best of some runs: what else a machine does changes that less. Python's share is the time in callbacks
-of systems written in Python, with what they call.
+CPU time of one core, not wall clock, and the best of some runs: what else a machine does changes that less. Python's
+share is the time in callbacks of systems written in Python, with what they call.
 """
 
 from __future__ import annotations

@@ -173,11 +173,14 @@ class Kmp:
         return rows, np.einsum("noi,ni->no", whiten, means).ravel()
 
 
-def _append(triangle: np.ndarray, right: np.ndarray, rows: np.ndarray, targets: np.ndarray):
+def _append(
+    triangle: np.ndarray, right: np.ndarray, rows: np.ndarray, targets: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The triangle, and its right-hand side, of a least-squares problem with more rows."""
     if not len(rows):
         return triangle, right
-    both = np.linalg.qr(np.vstack([np.column_stack([triangle, right]), np.column_stack([rows, targets])]), mode="r")
+    stacked = np.vstack([np.column_stack([triangle, right]), np.column_stack([rows, targets])])
+    both = np.asarray(np.linalg.qr(stacked, mode="r"))
     size = triangle.shape[1]
     return both[:size, :size], both[:size, size]
 
