@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.geometry import Box, CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
+from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
 from pydrake.systems.framework import Context
 
+from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.bnc_connector import JACK_SDF, PLUG_SDF, BncDimensions
 
 # The pairs that never meet in a connector of these dimensions, or whose part of the contact another surface carries.
@@ -75,23 +76,16 @@ class BncWorkcell:
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Leaves the barrel to the bore, the lugs to the slots and the pad to the seat."""
-        jack, plug = (self._geometries(plant, scene_graph, name) for name in ("jack", "plug"))
-        manager = scene_graph.collision_filter_manager()
-        for of_jack, of_plug in FILTERED_PAIRS:
-            manager.Apply(
-                CollisionFilterDeclaration().ExcludeBetween(
-                    GeometrySet([jack[name] for name in of_jack]), GeometrySet([plug[name] for name in of_plug])
-                )
-            )
+        exclude_contacts(plant, scene_graph, "jack", "plug", FILTERED_PAIRS)
 
     def set_jack_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
         """Moves the jack so that the plug locks at X_TTactual instead of at the target."""
         X_WJ = self.X_WT @ X_TTactual @ self.X_JT.inverse()
-        _frame(plant, "jack_mount").SetPoseInParentFrame(plant_context, X_WJ)
+        movable_frame(plant, "jack_mount").SetPoseInParentFrame(plant_context, X_WJ)
 
     def set_grasp_offset(self, plant: MultibodyPlant, plant_context: Context, X_PPlug: RigidTransform) -> None:
         """Moves the plug in the tool."""
-        _frame(plant, "grasp").SetPoseInParentFrame(plant_context, X_PPlug)
+        movable_frame(plant, "grasp").SetPoseInParentFrame(plant_context, X_PPlug)
 
     def plug_in_locked_frame(self, plant: MultibodyPlant, plant_context: Context) -> RigidTransform:
         """Where the plug is as seen from where it locks, offsets included: the identity when it is locked."""
@@ -106,15 +100,3 @@ class BncWorkcell:
         """
         yaw = RollPitchYaw(X_LockedPlug.rotation()).yaw_angle()
         return bool(abs(X_LockedPlug.translation()[2]) < LOCKED_HEIGHT and abs(yaw) < LOCKED_ANGLE)
-
-    @staticmethod
-    def _geometries(plant: MultibodyPlant, scene_graph: SceneGraph, body: str) -> dict[str, GeometryId]:
-        inspector = scene_graph.model_inspector()
-        ids = plant.GetCollisionGeometriesForBody(plant.GetBodyByName(body))
-        return {inspector.GetName(geometry).split("::")[-1]: geometry for geometry in ids}
-
-
-def _frame(plant: MultibodyPlant, name: str) -> FixedOffsetFrame:
-    frame = plant.GetFrameByName(name)
-    assert isinstance(frame, FixedOffsetFrame)
-    return frame

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Protocol
 
-from pydrake.geometry import SceneGraph
+from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, RigidBody
+from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
 
 
 class Workcell(Protocol):
@@ -29,3 +30,37 @@ class Workcell(Protocol):
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Excludes pairs of geometry that can't or mustn't touch; called once the plant is finalized."""
+
+
+def movable_frame(plant: MultibodyPlant, name: str) -> FixedOffsetFrame:
+    """A frame whose pose in its parent a reset may change in the context, and whatever is welded to it follows."""
+    frame = plant.GetFrameByName(name)
+    assert isinstance(frame, FixedOffsetFrame)
+    return frame
+
+
+def exclude_contacts(
+    plant: MultibodyPlant,
+    scene_graph: SceneGraph,
+    fixture: str,
+    workpiece: str,
+    pairs: Iterable[tuple[Iterable[str], Iterable[str]]],
+) -> None:
+    """Excludes contact between surfaces of two bodies: each pair names some of the fixture's, some of the workpiece's.
+
+    `drake:collision_filter_group` inside an SDF file can't do this: it filters whole bodies.
+    """
+    of_fixture, of_workpiece = (_geometries(plant, scene_graph, body) for body in (fixture, workpiece))
+    manager = scene_graph.collision_filter_manager()
+    for first, second in pairs:
+        manager.Apply(
+            CollisionFilterDeclaration().ExcludeBetween(
+                GeometrySet([of_fixture[name] for name in first]), GeometrySet([of_workpiece[name] for name in second])
+            )
+        )
+
+
+def _geometries(plant: MultibodyPlant, scene_graph: SceneGraph, body: str) -> dict[str, GeometryId]:
+    inspector = scene_graph.model_inspector()
+    ids = plant.GetCollisionGeometriesForBody(plant.GetBodyByName(body))
+    return {inspector.GetName(geometry).split("::")[-1]: geometry for geometry in ids}

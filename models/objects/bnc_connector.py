@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.objects.triangle_mesh import TriangleMesh
+from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, lathe, strip
 
 MM = 1e-3
 FOLDER = Path(__file__).parent
@@ -132,16 +132,6 @@ def slot_columns(dimensions: BncDimensions, num_entry: int = 6, num_ramp: int = 
     return SlotColumns(arcs / radius, lower, upper, num_entry)
 
 
-def _cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
-    radius, angle, height = np.broadcast_arrays(radius, angle, height)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
-
-
-def _strip(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Quads between two polylines (N, 3), seen counter-clockwise from where `second` lies right of `first`."""
-    return np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
-
-
 def _both_halves(quads: np.ndarray) -> np.ndarray:
     return np.concatenate([quads, quads * [-1.0, -1.0, 1.0]])
 
@@ -159,9 +149,9 @@ def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) 
             [[entry_left, chamfer], [entry_left - chamfer / d.slot_radius, 0.0]],
         ]
     )
-    return _strip(
-        _cylindrical(d.bore_radius, outline[:, 0], outline[:, 1]),
-        _cylindrical(outer_radius, outline[:, 0], outline[:, 1]),
+    return strip(
+        cylindrical(d.bore_radius, outline[:, 0], outline[:, 1]),
+        cylindrical(outer_radius, outline[:, 0], outline[:, 1]),
     )
 
 
@@ -171,7 +161,7 @@ def _faces_between_entries(
     """A flat ring from one slot's entry to the other's, facing the jack."""
     columns = slot_columns(dimensions)
     angles = np.linspace(columns.angles[columns.num_entry] + margin, np.pi + columns.angles[0] - margin, num_sides + 1)
-    return _strip(_cylindrical(radii[1], angles, height), _cylindrical(radii[0], angles, height))
+    return strip(cylindrical(radii[1], angles, height), cylindrical(radii[0], angles, height))
 
 
 def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
@@ -195,10 +185,7 @@ def bore_mesh(dimensions: BncDimensions, num_sides: int = 24) -> TriangleMesh:
         (d.bore_radius * circumscribed, d.mouth_chamfer),
         (d.bore_radius * circumscribed, d.ring_length),
     ]
-    angles = 2.0 * np.pi * (np.arange(num_sides + 1) + 0.5) / num_sides
-    circles = [_cylindrical(radius, angles, height) for radius, height in profile]
-    quads = [_strip(first, second) for first, second in itertools.pairwise(circles)]
-    return TriangleMesh.from_quads(np.concatenate(quads))
+    return lathe(profile, num_sides)
 
 
 def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
@@ -208,9 +195,9 @@ def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
     plain_angles = np.linspace(columns.angles[-1], np.pi + columns.angles[0], 9)
 
     def shell(angles: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> list[np.ndarray]:
-        low_in, high_in = (_cylindrical(d.bore_radius, angles, height) for height in (low, high))
-        low_out, high_out = (_cylindrical(d.ring_radius, angles, height) for height in (low, high))
-        return [_strip(low_in, high_in), _strip(high_out, low_out)]
+        low_in, high_in = (cylindrical(d.bore_radius, angles, height) for height in (low, high))
+        low_out, high_out = (cylindrical(d.ring_radius, angles, height) for height in (low, high))
+        return [strip(low_in, high_in), strip(high_out, low_out)]
 
     radii = (d.bore_radius, d.ring_radius)
     all_angles = np.concatenate([columns.angles, plain_angles[1:]])
@@ -220,6 +207,6 @@ def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
         + shell(plain_angles, 0.0, d.ring_length)
         + [_slot_walls(d, d.ring_radius, chamfer=0.0)]
         + [_faces_between_entries(d, radii, 0.0, 0.0, num_sides=24)]
-        + [_strip(_cylindrical(radii[0], all_angles, d.ring_length), _cylindrical(radii[1], all_angles, d.ring_length))]
+        + [strip(cylindrical(radii[0], all_angles, d.ring_length), cylindrical(radii[1], all_angles, d.ring_length))]
     )
     return TriangleMesh.from_quads(_both_halves(np.concatenate(quads)))

@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+
+
+def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
+    """Points (N, 3) from cylindrical coordinates about z."""
+    radius, angle, height = np.broadcast_arrays(radius, angle, height)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
+
+
+def strip(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Quads between two polylines (N, 3), seen counter-clockwise from where `second` lies right of `first`."""
+    return np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -37,3 +50,16 @@ class TriangleMesh:
         for number, corners in enumerate(self.triangles + 1, start=1):
             lines.append("f " + " ".join(f"{corner}//{number}" for corner in corners))
         return "\n".join(lines) + "\n"
+
+
+def lathe(profile: Sequence[tuple[float, float]], num_sides: int) -> TriangleMesh:
+    """A surface about z with a regular polygon for every circle, its first corner half a side from x.
+
+    The surface is seen from the left of its profile: of (radius, height) with the radius to the right and the height
+    up, a wall that goes up is a bore's, one that goes down a shaft's.
+    """
+    angles = 2.0 * np.pi * (np.arange(num_sides + 1) + 0.5) / num_sides
+    circles = [cylindrical(radius, angles, height) for radius, height in profile]
+    return TriangleMesh.from_quads(
+        np.concatenate([strip(first, second) for first, second in itertools.pairwise(circles)])
+    )
