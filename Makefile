@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-export DRAKE_ALLOW_NETWORK := meshcat
+# Replays and the hardware drivers speak on this machine only; nothing is ever fetched.
+export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test lint bench clean

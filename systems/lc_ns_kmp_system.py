@@ -111,6 +111,16 @@ class LcNsKmpSystem(LeafSystem):
         self._violation_port = self.DeclareVectorOutputPort("constraint_violation", 1, self._calc_violation, ticket)
         self._fallback_port = self.DeclareVectorOutputPort("fallback", 1, self._calc_fallback, ticket)
 
+    @property
+    def primitive(self) -> LcNsKmp:
+        """The primitive with the longest history."""
+        return self._primitive
+
+    @property
+    def gain(self) -> np.ndarray:
+        """What an action of one is worth to it in raw null-space units, (O,)."""
+        return self._voices[self._primitive.history][1].copy()
+
     def get_null_space_action_input_port(self) -> InputPort:
         """The policy's action in [−1, 1], (O,)."""
         return self._action_port

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder
@@ -19,6 +18,7 @@ from guiderail.diagrams.stations.station import (
     export_simulation_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.models.parsing import add_model
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.robots.iiwa import CONNECTOR_TOOL_URDF, IIWA_URDF, NUM_JOINTS, READY_POSTURE
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
@@ -46,10 +46,9 @@ class ArmModel:
 
 def add_arm(plant: MultibodyPlant, workcell: Workcell) -> ArmModel:
     """Adds the arm at the world's origin, the tool, and the workpiece in it."""
-    parser = Parser(plant)
-    (arm,) = parser.AddModels(str(IIWA_URDF))
+    arm = add_model(plant, IIWA_URDF)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("iiwa_link_0", arm))
-    (tool,) = parser.AddModels(str(CONNECTOR_TOOL_URDF))
+    tool = add_model(plant, CONNECTOR_TOOL_URDF)
     wrist = plant.WeldFrames(
         plant.GetFrameByName("iiwa_flange", arm),
         plant.GetFrameByName("tool_body", tool),

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.bnc_connector import JACK_SDF, PLUG_SDF, BncDimensions
+from guiderail.models.parsing import add_model
 
 # The pairs that never meet in a connector of these dimensions, or whose part of the contact another surface carries.
 FILTERED_PAIRS = [
@@ -59,7 +59,7 @@ class BncWorkcell:
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Adds the jack, on a frame that `set_jack_offset` moves, and a board under it to look at."""
-        (model,) = Parser(plant).AddModels(str(JACK_SDF))
+        model = add_model(plant, JACK_SDF)
         mount = plant.AddFrame(FixedOffsetFrame("jack_mount", plant.world_frame(), self.X_WJ))
         plant.WeldFrames(mount, plant.GetFrameByName("jack", model))
         depth, width, thickness = BOARD
@@ -68,7 +68,7 @@ class BncWorkcell:
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
         """Adds the plug, on a frame that `set_grasp_offset` moves."""
-        (model,) = Parser(plant).AddModels(str(PLUG_SDF))
+        model = add_model(plant, PLUG_SDF)
         grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
         plug = plant.GetBodyByName("plug", model)
         plant.WeldFrames(grasp, plug.body_frame())

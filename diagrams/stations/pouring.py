@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 from pydrake.geometry import Box, Cylinder, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
@@ -22,6 +21,7 @@ from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscrete
 from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
+from guiderail.models.parsing import add_model
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.robots.iiwa import IIWA_URDF, NUM_JOINTS
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
@@ -230,7 +230,7 @@ class PouringStation(Diagram):
 
 def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[ModelInstanceIndex, Frame]:
     """Adds the arm at the world's origin, a hand, and the thermos in it; returns the arm and the tip's frame."""
-    (arm,) = Parser(plant).AddModels(str(IIWA_URDF))
+    arm = add_model(plant, IIWA_URDF)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("iiwa_link_0", arm))
     thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
     plant.WeldFrames(plant.GetFrameByName("iiwa_flange", arm), thermos.body_frame(), config.X_FlangeP)

@@ -121,7 +121,7 @@ def test_no_adversary_makes_null_space_guidance_violate_collide_or_fail(guidance
 def test_no_sequence_of_actions_at_all_leads_into_the_walls_of_the_gap(guidance):
     """A bound instead of a sample: the sum of the absolute impulse responses, at hold 1 the worst that can be done."""
     lc_ns_kmp = make(guidance).task.diagram.GetSubsystemByName("guidance").GetSubsystemByName("lc_ns_kmp")
-    primitive, gain = lc_ns_kmp._primitive, lc_ns_kmp._gain
+    primitive, gain = lc_ns_kmp.primitive, lc_ns_kmp.gain
     steps, history = primitive.num_steps, primitive.history
     response = np.zeros((history + steps, 2, steps, 2))  # of output o at step n to action j at step k
     for n in range(steps):

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JointIndex
 
+from guiderail.models.parsing import add_model
 from guiderail.models.robots.iiwa import CONNECTOR_TOOL_URDF, IIWA_URDF, READY_POSTURE
 from guiderail.models.tool_wrench import external_wrench
 
@@ -11,9 +11,9 @@ from guiderail.models.tool_wrench import external_wrench
 @pytest.fixture(scope="module")
 def arm():
     plant = MultibodyPlant(0.0)
-    (model,) = Parser(plant).AddModels(str(IIWA_URDF))
+    model = add_model(plant, IIWA_URDF)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("iiwa_link_0"))
-    Parser(plant).AddModels(str(CONNECTOR_TOOL_URDF))
+    add_model(plant, CONNECTOR_TOOL_URDF)
     plant.WeldFrames(plant.GetFrameByName("iiwa_flange", model), plant.GetFrameByName("tool_body"))
     plant.Finalize()
     return plant
@@ -57,7 +57,7 @@ def test_a_tool_at_rest_feels_what_the_wrist_does_not_carry():
 def test_a_tool_that_spins_and_falls_freely_is_touched_by_nothing(arm):
     """A free body with an offset centre of mass, checked against Drake's own dynamics."""
     plant = MultibodyPlant(0.0)
-    (model,) = Parser(plant).AddModels(str(CONNECTOR_TOOL_URDF))
+    model = add_model(plant, CONNECTOR_TOOL_URDF)
     plant.Finalize()
     body = plant.GetBodyByName("tool_body", model)
     context = plant.CreateDefaultContext()

@@ -1,0 +1,36 @@
+"""Model files, read where no network is."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
+
+_VARIABLE = "DRAKE_ALLOW_NETWORK"
+
+
+def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
+    """Adds the one model of an SDF or URDF file on this machine.
+
+    Every `Parser` knows the remote package `drake_models`, and refuses to exist where DRAKE_ALLOW_NETWORK forbids
+    packages from the network, whatever it is asked to read. A file of ours refers to none.
+    """
+    with _remote_packages_may_be_named():
+        (model,) = Parser(plant).AddModels(str(path))
+    return model
+
+
+@contextmanager
+def _remote_packages_may_be_named() -> Iterator[None]:
+    allowed = os.environ.get(_VARIABLE)
+    if allowed is None or "package_map" in allowed:
+        yield
+        return
+    os.environ[_VARIABLE] = "package_map"
+    try:
+        yield
+    finally:
+        os.environ[_VARIABLE] = allowed
