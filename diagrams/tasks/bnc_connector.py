@@ -8,13 +8,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from pydrake.geometry import Meshcat
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import AffineSystem, Multiplexer, Saturation, TrajectorySource, ZeroOrderHold
+from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from guiderail.diagrams.cameras import add_camera, add_meshcat
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.guidance import build_guidance, check_guidance
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
@@ -22,12 +20,22 @@ from guiderail.diagrams.stations.bnc_workcell import LOCKED_ANGLE, LOCKED_HEIGHT
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE, Station
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.diagrams.tasks.insertion import (
+    CLIP,
+    add_force_ledger,
+    add_observation,
+    add_view,
+    add_workpiece_pose,
+    connect_guidance,
+    force_limit,
+    look_from_front,
+    make_station,
+)
 from guiderail.models.demonstrations import bnc_connector as demonstrations
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import TERMINATIONS, Condition, EpisodeMonitor
-from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.reward_system import RewardSystem, RewardTerm
 from guiderail.systems.safety_ledger import SafetyLedger
 
@@ -47,13 +55,12 @@ COLLISION_FORCE = 35.0  # [N], of the impedance
 LOCKED_BESIDE = 1.0 * MM  # a plug that is as low and as turned beside the jack is not locked
 LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
 
-# A policy sees (value − centre) / scale, clipped to ±3: [time, pose, wrench]. The wrench's torques are small, and they
+# What a policy sees, [time, pose, wrench], is centred and scaled by these. The wrench's torques are small, and they
 # are what tells on which side of the rim the plug sits: 0.02 Nm at 4 N.
 END = NUM_STEPS * CONTROL_PERIOD
 POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
-CLIP = 3.0
 
 # Equations 4.27 and 4.28; the thesis gives no unit of f: here it is 10 N and 0.5 Nm.
 ACTION_WEIGHT = FORCE_WEIGHT = 0.01
@@ -136,19 +143,6 @@ def make_env(
     return GuidedEnv(task, hold=hold, render_mode=render_mode)
 
 
-def make_station(name: str, workcell: BncWorkcell) -> Station:
-    """A simulated station by its name."""
-    if name == "rails":
-        from guiderail.diagrams.stations.rails import RailsStation
-
-        return RailsStation(workcell)
-    if name == "arm":
-        from guiderail.diagrams.stations.arm import ArmStation
-
-        return ArmStation(workcell)
-    raise InputError(f"there is no simulated station '{name}': use 'rails' or 'arm'")
-
-
 def build_task(
     workcell: BncWorkcell,
     station: Station,
@@ -161,21 +155,10 @@ def build_task(
 ) -> TaskDiagram:
     """Wires a station, a guidance diagram, reward, monitor and ledger."""
     builder = DiagramBuilder()
-    builder.AddNamedSystem("station", station)
-    builder.AddNamedSystem("guidance", guidance)
+    connect_guidance(builder, station, guidance)
     pose, desired_pose = station.get_pose_output_port(), guidance.GetOutputPort("desired_pose")
     wrench, force = station.get_wrench_output_port(), station.get_contact_force_output_port()
-    builder.Connect(pose, guidance.GetInputPort("pose"))
-    builder.Connect(wrench, guidance.GetInputPort("wrench"))
-    builder.Connect(desired_pose, station.get_desired_pose_input_port())
-    builder.ExportInput(guidance.GetInputPort("action"), "action")
-
-    plant = station.plant
-    plug_in_jack = builder.AddNamedSystem(
-        "plug_in_jack", RelativePoses(plant, [plant.GetBodyByName("plug")], plant.GetBodyByName("jack"))
-    )
-    builder.Connect(station.GetOutputPort("body_poses"), plug_in_jack.get_body_poses_input_port())
-    plug = plug_in_jack.get_relative_poses_output_port()
+    plug = add_workpiece_pose(builder, station, "plug", "jack")
 
     violations = {}
     for name, port in (("commanded_violation", desired_pose), ("measured_violation", pose)):
@@ -199,19 +182,6 @@ def build_task(
         builder.Connect(plug, reward.get_signal_input_port("plug"))
         builder.Connect(last_plug.get_output_port(), reward.get_signal_input_port("last_plug"))
 
-    too_hard = builder.AddNamedSystem("force_beyond_limit", _affine(np.eye(1), [-COLLISION_FORCE]))
-    builder.Connect(force, too_hard.get_input_port())
-    ledger = builder.AddNamedSystem("ledger", SafetyLedger(CONTROL_PERIOD))
-    recorded = {
-        **violations,
-        "contact_force": force,
-        "collision": too_hard.get_output_port(),
-        "saturation": station.get_saturation_output_port(),
-        "fallback": guidance.GetOutputPort("fallback"),
-    }
-    for name, port in recorded.items():
-        builder.Connect(port, ledger.get_record_input_port(name))
-
     exported = {
         **violations,
         "observation": _add_observation(builder, pose, wrench),
@@ -219,16 +189,17 @@ def build_task(
         **{name: reward.get_term_output_port(name) for name in reward.term_names},
         "termination": termination,
         "contact_force": force,
-        "ledger": ledger.get_ledger_output_port(),
+        "ledger": add_force_ledger(builder, station, guidance, violations, COLLISION_FORCE),
         "desired_pose": desired_pose,
         "pose": pose,
         "wrench": wrench,
     }
     for name, port in exported.items():
         builder.ExportOutput(port, name)
-    meshcat = _add_view(builder, station, workcell, render_mode)
+    meshcat = add_view(builder, station, render_mode, view_of_jack(workcell))
     diagram = builder.Build()
     diagram.set_name("BncConnector")
+    plant = station.plant
     start = alignment_constraints().nearest(reference_trajectory().means[0])
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -270,7 +241,7 @@ def _conditions(workcell: BncWorkcell) -> list[Condition]:
 
     return [
         Condition("success", {"plug": 6}, is_locked, steps=LOCKED_STEPS),
-        Condition("collision", {"contact_force": 1}, lambda contact_force: contact_force[0] > COLLISION_FORCE),
+        force_limit(COLLISION_FORCE),
     ]
 
 
@@ -294,53 +265,15 @@ def _reward_terms(num_actions: int, shaped: bool) -> list[RewardTerm]:
     return terms
 
 
-def _affine(D: np.ndarray, y0: np.ndarray | list[float]) -> AffineSystem:
-    """y = D u + y0, evaluated in C++."""
-    outputs, inputs = D.shape
-    return AffineSystem(
-        A=np.zeros((0, 0)), B=np.zeros((0, inputs)), f0=np.zeros(0), C=np.zeros((outputs, 0)), D=D, y0=np.asarray(y0)
-    )
-
-
 def _add_observation(builder: DiagramBuilder, pose: OutputPort, wrench: OutputPort) -> OutputPort:
     """[time, pose, wrench], each centred, scaled and clipped."""
     clock = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, END], np.array([[0.0, END]])))
-    together = builder.AddNamedSystem("time_pose_wrench", Multiplexer([1, POSE_SIZE, 6]))
+    builder.AddNamedSystem("clock", clock)
     centre = np.concatenate([[0.5 * END], POSE_CENTRE, np.zeros(6)])
     scale = np.concatenate([[0.5 * END], POSE_SCALE, WRENCH_SCALE])
-    scaled = builder.AddNamedSystem("scaled", _affine(np.diag(1.0 / scale), -centre / scale))
-    clipped = builder.AddNamedSystem("clipped", Saturation(np.full(len(scale), -CLIP), np.full(len(scale), CLIP)))
-    for index, port in enumerate((builder.AddNamedSystem("clock", clock).get_output_port(), pose, wrench)):
-        builder.Connect(port, together.get_input_port(index))
-    builder.Connect(together.get_output_port(), scaled.get_input_port())
-    builder.Connect(scaled.get_output_port(), clipped.get_input_port())
-    return clipped.get_output_port()
+    return add_observation(builder, (clock.get_output_port(), pose, wrench), centre, scale)
 
 
-def _add_view(
-    builder: DiagramBuilder, station: Station, workcell: BncWorkcell, render_mode: str | None
-) -> Meshcat | None:
-    if render_mode == "human":
-        return add_meshcat(builder, station.GetOutputPort("query"))[0]
-    if render_mode == "rgb_array":
-        picture = add_camera(
-            builder,
-            station.scene_graph,
-            station.GetOutputPort("query"),
-            "picture",
-            size=(640, 480),
-            vertical_fov=np.deg2rad(30.0),
-            X_WC=view_of_jack(workcell),
-        )
-        builder.ExportOutput(picture, "rgb_image")
-    return None
-
-
-def view_of_jack(workcell: BncWorkcell, distance: float = 0.16, height: float = 0.06) -> RigidTransform:
-    """A camera that looks slightly down at the jack from the side that faces away from the arm."""
-    target = np.array(workcell.p_WJ) + [0.0, 0.0, 0.02]
-    eye = target + [0.8 * distance, -0.6 * distance, height]
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    return RigidTransform(RotationMatrix(np.stack([right, np.cross(forward, right), forward], axis=1)), eye)
+def view_of_jack(workcell: BncWorkcell) -> RigidTransform:
+    """A camera that looks slightly down at the jack."""
+    return look_from_front(np.array(workcell.p_WJ) + [0.0, 0.0, 0.02], distance=0.16, height=0.06)
