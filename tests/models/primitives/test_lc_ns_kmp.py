@@ -1,5 +1,6 @@
 """The primitive against problem 4.5 itself, and against what its callers may do to it."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -333,6 +334,24 @@ def test_memory_stays_within_its_limit():
     assert everything.factor_all() == everything.cached_bytes > 20_000
     expected = everything.predict(7).output
     np.testing.assert_array_equal(p.predict(7).output, expected)
+
+
+def test_a_long_running_controller_allocates_nothing_that_stays():
+    p = LcNsKmp(**small(history=3))
+    past = p.reference.means[:3]
+
+    def run(steps):
+        for k in range(steps):
+            p.predict(k % 20, np.ones(2) * (-1) ** k, past)
+
+    run(200)
+    tracemalloc.start()
+    run(2_000)
+    before, _ = tracemalloc.get_traced_memory()
+    run(10_000)
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert after - before < 2_000
 
 
 @pytest.mark.parametrize(
