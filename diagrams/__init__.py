@@ -8,6 +8,7 @@ import gymnasium
 
 TASKS = {
     "BncConnector": "guiderail.diagrams.tasks.bnc_connector:make_env",
+    "GridClamp": "guiderail.diagrams.tasks.grid_clamp:make_env",
     "NarrowPassage": "guiderail.diagrams.tasks.narrow_passage:make_env",
     "Pouring": "guiderail.diagrams.tasks.pouring:make_env",
 }

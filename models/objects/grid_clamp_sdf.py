@@ -8,7 +8,7 @@ from guiderail.models.objects.sdf import ContactMaterial, at, box, collision, co
 STEEL, ALUMINIUM, ANODIZED = "0.62 0.64 0.68 1", "0.80 0.81 0.82 1", "0.20 0.35 0.60 1"
 
 PEG = ContactMaterial(friction=0.2, modulus=5e8)
-BEAD = ContactMaterial(friction=0.1, modulus=3e7)
+BEAD = ContactMaterial(friction=0.1, modulus=2e7)
 PAD = ContactMaterial(friction=0.2, modulus=1e6)
 HOLE = ContactMaterial(friction=0.2)
 LIP = ContactMaterial(friction=0.1)

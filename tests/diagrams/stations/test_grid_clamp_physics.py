@@ -13,6 +13,7 @@ from guiderail.models.objects.grid_clamp import MM
 
 WORKCELL = GridClampWorkcell()
 SURFACE = WORKCELL.dimensions.peg_length  # height of the tips in T when they stand on the table
+BESIDE = 1.0 * MM  # farther than this from its hole's centre a tip is not in the hole
 PUSH_60_N = Impedance(limits=(60.0, 60.0, 60.0, 3.0, 3.0, 3.0))
 
 
@@ -50,17 +51,17 @@ def test_the_snap_resists_and_then_gives_way(inserted):
     _, recording = inserted
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     at_lip, past_lip = (z > 0.9) & (z < 1.3), (z > 0.1) & (z < 0.5)
-    assert 3.0 < force[at_lip].max() < 8.0
+    assert 2.0 < force[at_lip].max() < 8.0
     assert force[past_lip].max() < 0.5 * force[at_lip].max()
     assert force[-1] > force[past_lip].max()
 
 
 def test_the_snap_holds_against_a_light_pull_and_yields_to_a_strong_one():
-    _, recording = descend([0, 0.9, 1.4, 2.0, 3.5, 4.2], [16, -6, -6, 2, 2, 16])
+    _, recording = descend([0, 0.9, 1.4, 2.0, 3.5, 4.2], [16, -6, -6, 1, 1, 16])
     z, force = recording["pose"][:, 2], recording["wrench"][:, 2]
-    assert z[170] < 0.6 * MM  # pulled by 2 mm of spring, 3 N, and still in
+    assert z[170] < 0.6 * MM  # pulled by 1 mm of spring, 1.5 N, and still in
     assert z[-1] > 10.0 * MM
-    assert -12.0 < force.min() < -3.0
+    assert -12.0 < force.min() < -2.0
 
 
 @pytest.mark.parametrize(("xy_mm", "tilt_deg"), [((2.5, 0.0), 0.0), ((1.5, 1.5), 0.0), ((0.0, 0.0), 6.0), ((0, 3), 4)])
@@ -73,7 +74,7 @@ def test_sixty_newtons_do_not_force_the_pegs_through_the_table(xy_mm, tilt_deg):
     X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
     d = WORKCELL.dimensions
     tips = X @ np.column_stack([d.peg_positions, np.zeros(5)]).T
-    beside = np.hypot(*(tips[:2] - d.peg_positions.T)) > d.capture_radius
+    beside = np.hypot(*(tips[:2] - d.peg_positions.T)) > BESIDE
     assert (tips[2][beside] > SURFACE - 0.2 * MM).all()
     assert beside.all() or tilt_deg != 0.0
 
