@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
-from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.grid_clamp import CLAMP_SDF, TABLE_SDF, GridClampDimensions
+from guiderail.models.parsing import add_model
 
 HOLES = tuple(f"hole_{number}" for number in range(5))
 PEGS = tuple(f"peg_{number}" for number in range(5))
@@ -55,13 +55,13 @@ class GridClampWorkcell:
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Adds the table, on a frame that `set_table_offset` moves."""
-        (model,) = Parser(plant).AddModels(str(TABLE_SDF))
+        model = add_model(plant, TABLE_SDF)
         mount = plant.AddFrame(FixedOffsetFrame("table_mount", plant.world_frame(), self.X_WG))
         plant.WeldFrames(mount, plant.GetFrameByName("table", model))
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
         """Adds the clamp, on a frame that `set_grasp_offset` moves."""
-        (model,) = Parser(plant).AddModels(str(CLAMP_SDF))
+        model = add_model(plant, CLAMP_SDF)
         grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
         clamp = plant.GetBodyByName("clamp", model)
         plant.WeldFrames(grasp, clamp.body_frame())
