@@ -62,4 +62,5 @@ def test_every_module_imports_from_the_wheel(packages):
         "[f for f in sys.meta_path if 'editable' not in getattr(f, '__module__', str(f))]\n"
         f"for name in {modules!r}: module = importlib.import_module(name); assert {str(installed)!r} in module.__file__"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=installed)
+    result = subprocess.run([sys.executable, "-c", code], cwd=installed, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr

@@ -121,4 +121,5 @@ def test_help_needs_neither_pytorch_nor_drake():
 
     code = "import sys; from guiderail.tools.command import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
     check = code + "assert not {'torch', 'pydrake', 'stable_baselines3', 'matplotlib'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", check], check=True, stdout=subprocess.DEVNULL)
+    result = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
