@@ -7,133 +7,20 @@ are here, so that everything that a run depends on has a name and can be written
 import copy
 import random
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch.nn.utils import parameters_to_vector
 
-from guiderail.models.errors import InputError
+from guiderail.tools.presets import ALGORITHMS, Preset, decision_discount
 
-ALGORITHMS = {"sac": SAC, "tqc": TQC}
 IMAGE_POOL = 5  # pixels; 110×144×3 becomes 22×28×3
-
-
-@dataclass(frozen=True)
-class Preset:
-    """How a learner learns. A decision is one action of the policy; it lasts `hold` control steps."""
-
-    algorithm: str = "tqc"
-    learning_rate: float = 3e-4
-    discount: float = 0.995  # of one control step: a decision is discounted by discount**hold
-    soft_update: float = 0.02
-    train_every: int = 8  # decisions between two trainings
-    gradient_steps: int = 24  # in one training
-    batch_size: int = 64
-    buffer_size: int = 1_000_000
-    learning_starts: int = 100  # decisions drawn uniformly before the first training
-    entropy: str = "auto_0.1"  # "auto", "auto_<initial value>", or a number
-    units: tuple[int, ...] = (256, 256)  # of the hidden layers
-    steady_episodes: int = 0  # the first ones, in which one action drawn uniformly is kept all the time
-    practise: float = 0.0  # part of the episodes, evenly spread, that are acted without exploring
-    averaging: float = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
-
-
-_TABLE_4_1 = Preset(
-    learning_rate=1e-3, discount=0.99, gradient_steps=8, batch_size=256, entropy="auto", averaging=0.0
-)  # batch and buffer of table 3.2, as table 4.1 has none
-_TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, discount=0.95, learning_starts=1000)
-_QUICK = Preset(learning_rate=1e-3, discount=0.998, gradient_steps=8, entropy="auto")
-
-PRESETS = {
-    # Measured on the connector: small batches, a moderate learning rate, and an averaged actor, because a single one
-    # swings from episode to episode. Four of five episodes do not explore: white actions find the hole by wiggling, so
-    # that the critic learns little about the mean, and a policy that always succeeds in training fails by itself.
-    "robust": Preset(
-        learning_rate=7e-4,
-        train_every=4,
-        gradient_steps=16,
-        units=(128, 128),
-        steady_episodes=8,
-        practise=0.8,
-        averaging=0.01,
-    ),
-    # Cheap enough to watch: the narrow passage within a minute.
-    "quick": _QUICK,
-    # The same, but the first episodes each keep to one random action. sKGRL reacts slowly: actions drawn anew at every
-    # decision seldom lead it around an obstacle, and one seed of three settled between obstacle and zone.
-    "steady": replace(_QUICK, steady_episodes=10),
-    "table_4_1_simulation": _TABLE_4_1,
-    "table_4_1_robot": replace(_TABLE_4_1, soft_update=0.01, discount=0.995, entropy="auto_0.1"),
-    "table_3_2_iiwa": _TABLE_3_2,
-    "table_3_2_sara": replace(_TABLE_3_2, algorithm="sac", learning_rate=1e-3, discount=0.98),
-}
-
-
-def resolve_preset(name: str, algorithm: str, settings: Mapping[str, Any] | None = None) -> Preset:
-    """The preset of that name for an algorithm, with single settings replaced.
-
-    Raises:
-        InputError: for an unknown preset, algorithm or setting, or a value out of range.
-    """
-    if name not in PRESETS:
-        raise InputError(f"there is no preset {name!r}: choose one of {', '.join(PRESETS)}")
-    if algorithm not in ALGORITHMS:
-        raise InputError(f"there is no algorithm {algorithm!r}: choose one of {', '.join(sorted(ALGORITHMS))}")
-    known = {field.name for field in fields(Preset)}
-    values = asdict(PRESETS[name]) | {"algorithm": algorithm}
-    for key, value in (settings or {}).items():
-        if key not in known or key == "algorithm":
-            raise InputError(f"a learner has no setting {key!r}: choose one of {', '.join(sorted(known))}")
-        values[key] = _as_setting(key, value, values[key])
-    preset = Preset(**values)
-    _check(preset)
-    return preset
-
-
-def _as_setting(key: str, value: Any, example: Any) -> Any:
-    """The value, given as text or as a number, with the type that the setting has."""
-    try:
-        if isinstance(example, tuple):
-            return tuple(int(v) for v in (value.split(",") if isinstance(value, str) else value))
-        if isinstance(example, int) and not float(value).is_integer():
-            raise ValueError(value)
-        return type(example)(float(value)) if isinstance(example, int) else type(example)(value)
-    except (TypeError, ValueError):
-        raise InputError(f"the learner's {key} cannot be {value!r}: give a value such as {example!r}") from None
-
-
-def _check(preset: Preset) -> None:
-    """Refuses settings that no learner can use."""
-    for key in ("train_every", "gradient_steps", "batch_size", "buffer_size", "learning_starts"):
-        if getattr(preset, key) < 1:
-            raise InputError(f"the learner's {key} must be at least 1, not {getattr(preset, key)}")
-    if preset.steady_episodes < 0:
-        raise InputError(f"the learner's steady_episodes must not be negative, not {preset.steady_episodes}")
-    if not 0 <= preset.practise <= 1:
-        raise InputError(f"the learner's practise must be between 0 and 1, not {preset.practise}")
-    if not (np.isfinite(preset.learning_rate) and preset.learning_rate > 0):
-        raise InputError(f"the learner's learning_rate must be positive, not {preset.learning_rate}")
-    for key, low in (("discount", 0.0), ("soft_update", 0.0), ("averaging", -1e-300)):
-        if not low < getattr(preset, key) <= 1:
-            raise InputError(f"the learner's {key} must be between 0 and 1, not {getattr(preset, key)}")
-    if not preset.units or min(preset.units) < 1:
-        raise InputError(f"the learner's units must be positive numbers, one a hidden layer, not {preset.units}")
-    initial = preset.entropy.removeprefix("auto").removeprefix("_")
-    try:
-        usable = (preset.entropy == "auto") or float(initial) > 0
-    except ValueError:
-        usable = False
-    if not usable:
-        raise InputError(f"the learner's entropy must be auto, auto_0.1 or a positive number, not {preset.entropy!r}")
 
 
 class PooledImage(BaseFeaturesExtractor):
@@ -182,7 +69,7 @@ class Learner:
             buffer_size=min(preset.buffer_size, decisions + 1),
             batch_size=preset.batch_size,
             tau=preset.soft_update,
-            gamma=preset.discount**hold,
+            gamma=decision_discount(preset, hold),
             ent_coef=preset.entropy if preset.entropy.startswith("auto") else float(preset.entropy),
             policy_kwargs=networks,
             seed=seed,

@@ -13,7 +13,7 @@ import yaml
 
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learners import Preset, resolve_preset
+from guiderail.tools.presets import Preset, resolve_preset
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from guiderail.models.errors import InputError
 from guiderail.tools.episodes import check_environment
-from guiderail.tools.learners import resolve_preset
+from guiderail.tools.presets import resolve_preset
 from guiderail.tools.progress import TrainingProgress
 from guiderail.tools.run_folder import RunConfig, RunFolder, as_arguments, converged_after, installed_versions
 from guiderail.tools.train import train

@@ -7,8 +7,9 @@ import torch
 from gymnasium import spaces
 
 from guiderail.models.errors import InputError
-from guiderail.tools.learners import PRESETS, Learner, resolve_preset
+from guiderail.tools.learners import Learner
 from guiderail.tools.policy import Policy
+from guiderail.tools.presets import PRESETS, resolve_preset
 
 
 class Spaces(gymnasium.Env):
@@ -60,6 +61,11 @@ def test_every_preset_makes_a_learner_of_every_algorithm(name, algorithm):
 
 def test_a_longer_hold_discounts_a_decision_more(preset):
     assert make(preset, hold=5).model.gamma == pytest.approx(make(preset).model.gamma ** 5)
+
+
+def test_the_pouring_tables_discount_a_decision_whatever_its_hold():
+    table = replace(resolve_preset("table_3_2_sara", "sac"), units=(4,))
+    assert make(table, hold=10).model.gamma == make(table, hold=1).model.gamma == 0.98
 
 
 def test_training_follows_the_count_of_decisions(preset):

@@ -4,8 +4,9 @@ import pytest
 from gymnasium import spaces
 
 from guiderail.models.errors import InputError
-from guiderail.tools.learners import Learner, resolve_preset
+from guiderail.tools.learners import Learner
 from guiderail.tools.policy import Policy
+from guiderail.tools.presets import resolve_preset
 
 
 class Spaces(gymnasium.Env):
