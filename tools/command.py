@@ -33,7 +33,9 @@ def train(
     preset: Annotated[str | None, typer.Option(help="The learner's settings.  [default: robust]")] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="One setting, such as batch_size=128.")] = None,
     hold: Annotated[int | None, typer.Option(help="Control steps that an action lasts.")] = None,
-    reward: Annotated[str | None, typer.Option(help="sparse or shaped.")] = None,
+    reward: Annotated[
+        str | None, typer.Option(help="sparse or shaped; Pouring also has hand_shaped, GridClamp no_force.")
+    ] = None,
     observation: Annotated[str | None, typer.Option(help="state or image.")] = None,
     uncertainty: Annotated[str | None, typer.Option(help="calibration or disc, for the connector.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
@@ -153,7 +155,7 @@ def study(
 
 @app.command()
 def reproduce(
-    figure: Annotated[str, typer.Argument(help="A figure of the thesis, such as 5.6.")],
+    figure: Annotated[str, typer.Argument(help="A figure of the thesis, such as 5.6, or 'table 3.3'.")],
     seeds: Annotated[int, typer.Option(help="Runs of each method.")] = 3,
     episodes: Annotated[int | None, typer.Option(help="Of each run.  [default: the figure's own]")] = None,
     out: Annotated[Path, typer.Option(help="The folder; finished runs in it are used again.")] = Path("reproductions"),

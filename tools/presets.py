@@ -61,6 +61,8 @@ PRESETS = {
     "table_4_1_simulation": _TABLE_4_1,
     "table_4_1_robot": replace(_TABLE_4_1, soft_update=0.01, discount=0.995, entropy="auto_0.1"),
     "table_3_2_iiwa": _TABLE_3_2,
+    # Table 3.2, but learning begins after three hundred decisions: an episode of pouring has at most 150.
+    "pouring": replace(_TABLE_3_2, learning_starts=300),
     "table_3_2_sara": replace(_TABLE_3_2, algorithm="sac", learning_rate=1e-3, discount=0.98),
 }
 

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.diagrams.tasks.held_out import episode_stream
 from guiderail.models.errors import InputError
 
 MM = 1e-3
 OPTIONS = ("held_out", "offset", "new_run")
-# Held-out offsets come from streams of their own: no seed of a training run leads to them.
-_HELD_OUT_STREAM = 0x8E1D
 
 
 class HiddenOffsets(ABC):
@@ -46,9 +45,8 @@ class HiddenOffsets(ABC):
         if unknown:
             raise InputError(f"{self.task} knows no reset option {sorted(unknown)}: it knows {', '.join(OPTIONS)}")
         # Every reset draws the same numbers, used or not, so that a seed means the same at the first reset and later.
-        hidden, key = self._draw_run(rng), int(rng.integers(2**62))
-        stream = _HELD_OUT_STREAM if options.get("held_out") else 0
-        episode = np.random.default_rng([key, stream])
+        hidden = self._draw_run(rng)
+        episode = episode_stream(rng, bool(options.get("held_out")))
         if self._run is None or options.get("new_run"):
             self._run = hidden
         if "offset" in options:

@@ -16,6 +16,7 @@ from guiderail.diagrams.guidance import check_guidance
 from guiderail.diagrams.guidance.sct import WRENCH_SIZE, SctGuidance
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, vessel_or_refuse
 from guiderail.diagrams.task import TaskDiagram
+from guiderail.diagrams.tasks.held_out import episode_stream
 from guiderail.diagrams.tasks.pouring_rewards import REWARDS, reward_terms
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, Ball
@@ -26,6 +27,7 @@ from guiderail.systems.reward_system import RewardSystem
 from guiderail.systems.safety_ledger import SafetyLedger
 
 GUIDANCE = ("sct", "none")
+OPTIONS = ("start", "mug_position", "held_out")
 NUM_STEPS = 1500
 """After so many control steps an episode is over: 150 decisions at 10 Hz, about as many as in the thesis."""
 
@@ -108,7 +110,8 @@ def make_env(
         mug_offset: m, up to which the mug is moved along x and y, drawn at every reset.
 
     A reset takes the options `start`, (x, y, z) of the upright thermos's tip in the mug's frame, and `mug_position`,
-    (x, y) of the mug from where it nominally stands, in metres; they are drawn where they aren't given.
+    (x, y) of the mug from where it nominally stands, in metres; they are drawn where they aren't given, and with
+    `held_out` from a stream that training never draws from.
     """
     check_guidance(guidance, GUIDANCE, "Pouring")
     if reward not in REWARDS:
@@ -268,13 +271,14 @@ def _start_episode(
     mug_offset: float,
 ) -> dict[str, Any]:
     """Places the mug, the upright thermos and the balls; everything is drawn, whether or not an option replaces it."""
-    azimuth = np.deg2rad(rng.uniform(*START_AZIMUTH_DEG))
-    radius, height = rng.uniform(*START_RADIUS), rng.uniform(*START_HEIGHT)
-    drawn = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-    offset = mug_offset * rng.uniform(-1.0, 1.0, 2)
-    unknown = set(options) - {"start", "mug_position"}
+    unknown = set(options) - set(OPTIONS)
     if unknown:
-        raise InputError(f"Pouring knows no reset option {sorted(unknown)}: it knows 'start' and 'mug_position'")
+        raise InputError(f"Pouring knows no reset option {sorted(unknown)}: it knows {', '.join(OPTIONS)}")
+    episode = episode_stream(rng, bool(options.get("held_out")))
+    azimuth = np.deg2rad(episode.uniform(*START_AZIMUTH_DEG))
+    radius, height = episode.uniform(*START_RADIUS), episode.uniform(*START_HEIGHT)
+    drawn = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
+    offset = mug_offset * episode.uniform(-1.0, 1.0, 2)
     p_MP = _numbers(options.get("start", drawn), 3, "start")
     p_TMug = _numbers(options.get("mug_position", offset), 2, "mug_position")
     if np.abs(p_TMug).max() > MAX_MUG_OFFSET:

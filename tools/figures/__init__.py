@@ -1,4 +1,4 @@
-"""Figures of the thesis, made anew: each a picture and a table with the numbers behind it."""
+"""Figures and a table of the thesis, made anew: each a picture and a table with the numbers behind it."""
 
 import inspect
 from importlib import import_module
@@ -9,6 +9,10 @@ from guiderail.models.errors import InputError
 
 # Where each figure is made; imported when asked for, so that a list of figures costs nothing.
 FIGURES = {
+    "table 3.3": ("pouring", "table_3_3"),
+    "3.5": ("pouring", "figure_3_5"),
+    "3.6": ("pouring", "figure_3_6"),
+    "3.8": ("pouring", "figure_3_8"),
     "4.2": ("properties", "figure_4_2"),
     "4.4": ("baselines", "figure_4_4"),
     "4.5": ("baselines", "figure_4_5"),
@@ -29,7 +33,7 @@ def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: 
     """Makes one figure.
 
     Args:
-        figure: its number in the thesis.
+        figure: its number in the thesis, or "table 3.3".
         seeds: runs of each method, where the figure is about learning.
         episodes: of each run; the figure's own number unless given.
         out: where pictures, tables and runs go. Runs that are there and finished are used again, so that figures which

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
-from guiderail.diagrams.tasks.pouring import make_env
+from guiderail.diagrams.tasks.pouring import START_HEIGHT, START_RADIUS, make_env
 from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES, person
 from guiderail.models.errors import InputError
 
@@ -127,6 +127,17 @@ def test_starts_are_drawn_and_repeat_with_the_seed(env):
     second = env.reset()[1]["start"]
     assert not np.allclose(first, second)
     np.testing.assert_array_equal(env.reset(seed=3)[1]["start"], first)
+
+
+def test_held_out_starts_are_none_of_trainings(env):
+    trained = [env.reset(seed=seed)[1]["start"] for seed in range(5)]
+    held_out = [env.reset(seed=seed, options={"held_out": True})[1]["start"] for seed in range(5)]
+    assert not np.isin(held_out, trained).any()
+    np.testing.assert_array_equal(env.reset(seed=4, options={"held_out": True})[1]["start"], held_out[4])
+    # From the same places nevertheless: `held_out` is about which starts, not about harder ones.
+    radii, heights = np.hypot(*np.transpose(held_out)[:2]), np.transpose(held_out)[2]
+    np.testing.assert_array_equal(np.clip(radii, *START_RADIUS), radii)
+    np.testing.assert_array_equal(np.clip(heights, *START_HEIGHT), heights)
 
 
 def test_an_episode_repeats_to_the_last_bit(env):

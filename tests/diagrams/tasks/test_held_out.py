@@ -1,0 +1,24 @@
+import numpy as np
+
+from guiderail.diagrams.tasks.held_out import episode_stream
+
+
+def test_what_is_held_out_is_never_drawn_in_training_and_both_repeat_with_the_seed():
+    drawn = {
+        held_out: np.array(
+            [episode_stream(np.random.default_rng(seed), held_out).uniform(size=3) for seed in range(50)]
+        )
+        for held_out in (False, True)
+    }
+    assert not np.isin(drawn[True], drawn[False]).any()
+    again = episode_stream(np.random.default_rng(7), True).uniform(size=3)
+    np.testing.assert_array_equal(again, drawn[True][7])
+
+
+def test_the_next_episode_is_the_same_whichever_this_one_was():
+    after = []
+    for held_out in (False, True):
+        rng = np.random.default_rng(3)
+        episode_stream(rng, held_out).uniform(size=100)
+        after.append(episode_stream(rng, False).uniform())
+    assert after[0] == after[1]
