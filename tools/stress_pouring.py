@@ -3,7 +3,8 @@
     python -m guiderail.tools.stress_pouring --steps 100000
 
 A step is one control step (10 ms) of the arm. Exits with 1 if anything touched what it must not, if a commanded pose
-was outside of the active constraints, or if the thermos was commanded to tilt before that is allowed.
+was outside of the active constraints, if the thermos was commanded to tilt before that is allowed, or if the
+simulation failed.
 """
 
 import argparse
@@ -19,8 +20,8 @@ from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET, make_env
 from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES
 from guiderail.models.pose_coordinates import pose_to_transform
-
-TOLERANCE = 1e-9  # [m] or [rad]
+from guiderail.tools.progress import TOLERANCE
+from guiderail.tools.stress import Witness, episode
 
 
 def stress(steps: int, seed: int = 0, progress: bool = False, input_speed: float = 1.0) -> dict[str, Any]:
@@ -38,31 +39,39 @@ def stress(steps: int, seed: int = 0, progress: bool = False, input_speed: float
     while found["steps"] < steps:
         name = list(ADVERSARIES)[sum(endings.values()) % len(ADVERSARIES)]
         inputs = ADVERSARIES[name](rng)
-        observation, _ = env.reset(seed=int(rng.integers(2**31)))
-        over = False
-        while not over:
-            observation, _, terminated, truncated, info = env.step(inputs(observation))
-            over = terminated or truncated
-            found["early_tilt"] = max(found["early_tilt"], _early_tilt(env))
-        ledger = info["ledger"]
-        found["steps"] += info["control_steps"]
-        found["collisions"] += int(ledger["collisions"])
-        found["commanded"] = max(found["commanded"], ledger["worst_commanded_violation"])
-        found["measured"] = max(found["measured"], ledger["worst_measured_violation"])
-        endings[f"{name}: {info['termination']}"] += 1
+        row = episode(env, inputs, int(rng.integers(2**31)), witness=EarlyTilt)
+        found["steps"] += row["steps"]
+        found["collisions"] += row["collisions"]
+        found["commanded"] = max(found["commanded"], row["worst_violation"])
+        found["measured"] = max(found["measured"], row["worst_measured_violation"])
+        found["early_tilt"] = max(found["early_tilt"], row["early_tilt"])
+        endings[f"{name}: {row['termination']}"] += 1
         if progress:
             print(f"{found['steps']:7d} steps, {time.perf_counter() - began:5.0f} s, {dict(endings)}", file=sys.stderr)
     return {**found, "endings": dict(endings)}
 
 
-def _early_tilt(env: GuidedEnv) -> float:
-    """The commanded tilt [rad] while the template is in its first state, where it is upright; 0 in the others."""
-    context = env.simulator.get_context()
-    diagram = env.task.diagram
-    if diagram.GetOutputPort("state").Eval(context)[0] != 0:
-        return 0.0
-    R = pose_to_transform(diagram.GetOutputPort("desired_pose").Eval(context)).rotation().matrix()
-    return float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
+class EarlyTilt(Witness):
+    """The greatest tilt [rad] that is commanded while the template is in its first state, where it is upright."""
+
+    def __init__(self, env: GuidedEnv):
+        """
+        Args:
+            env: just reset.
+        """
+        self._diagram, self._context, self._worst = env.task.diagram, env.simulator.get_context(), 0.0
+
+    def look(self) -> None:
+        """Measures, unless the template is in another state."""
+        if self._diagram.GetOutputPort("state").Eval(self._context)[0] != 0:
+            return
+        X = pose_to_transform(self._diagram.GetOutputPort("desired_pose").Eval(self._context))
+        R = X.rotation().matrix()
+        self._worst = max(self._worst, float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2])))
+
+    def report(self) -> dict[str, float]:
+        """`early_tilt` [rad]."""
+        return {"early_tilt": self._worst}
 
 
 def main() -> int:
@@ -75,6 +84,7 @@ def main() -> int:
     found = stress(arguments.steps, arguments.seed, progress=True, input_speed=arguments.input_speed)
     print(json.dumps(found, indent=2))
     failed = found["collisions"] > 0 or found["commanded"] > TOLERANCE or found["early_tilt"] > TOLERANCE
+    failed |= any(ending.endswith("simulation_failure") for ending in found["endings"])
     return 1 if failed else 0
 
 
