@@ -108,8 +108,22 @@ def test_offsets_moved_in_the_context_are_where_the_clamp_goes_in(moved):
     assert found["contact_force"].max() <= 10.0
 
 
+def test_what_friction_bears_does_not_creep():
+    """Beside its holes, 27 N down and 2 N sideways, where 5.4 N would slip: it keeps its place for three seconds."""
+    poses = np.array([[16.0, 2.5], [-6.0, 2.5], [-6.0, 2.5 + 2.0 / 1.5], [-6.0, 2.5 + 2.0 / 1.5]])  # 1.5 N/mm
+    _, recording = drive_along(
+        RailsStation(WORKCELL),
+        [0.0, 0.9, 1.0, 4.5],
+        MM * np.column_stack([poses[:, 1], [1.0] * 4, poses[:, 0], np.zeros((4, 3))]),
+    )
+    assert recording["wrench"][-1, 2] == pytest.approx(27.0, abs=0.2)
+    assert recording["wrench"][-1, 0] == pytest.approx(-2.0, abs=0.1)
+    x = recording["pose"][:, 0]
+    assert abs(x[-1] - x[-150]) < 0.03 * MM
+
+
 def test_the_arm_inserts_too():
-    driven, recording = descend([0.0, 1.5, 2.0], [16.0, -6.0, -6.0], station=ArmStation)
+    driven, recording = descend([0.0, 1.8, 2.0], [16.0, -6.0, -6.0], station=ArmStation)
     X = WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM
-    assert recording["contact_force"].max() <= 12.0
+    assert recording["contact_force"].max() <= 10.0

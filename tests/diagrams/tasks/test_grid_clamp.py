@@ -10,6 +10,7 @@ import guiderail.diagrams  # noqa: F401 (registers)
 from guiderail.diagrams.tasks.grid_clamp import COLLISION_FORCE, GUIDANCE, MM, make_env, make_skill
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.models.errors import InputError
+from guiderail.tools.clamp_rule import searching_rule, straight_descent, trials
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -42,6 +43,11 @@ def test_is_registered():
     assert "guiderail/GridClamp-v0" in gymnasium.registry
 
 
+@pytest.fixture(scope="module")
+def arm():
+    return make_env(station="arm", uncertainty="known")
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
     info, total, terms = play(known, lambda _: DOWN, seed=seed)
@@ -54,19 +60,16 @@ def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
 
 
 def test_the_straight_descent_mostly_fails_where_the_offset_is_drawn(env):
-    """At least 70 % of trials on the whole; here, of ten, judged after 4 s, about 2 s after the table is reached.
+    """Pushed with 27 N for the whole 15 s. `python -m guiderail.tools.clamp_rule --trials 50` asks more often."""
+    successes, peak = trials(env, straight_descent, 3, seed=3)
+    assert successes == 0
+    assert peak < COLLISION_FORCE
 
-    Pushed at 27 N for the whole 15 s, friction creeps, and more of them slip in.
-    """
-    successes = 0
-    for seed in range(10):
-        env.reset(seed=seed, options={"new_run": True, "held_out": True})
-        finished, info, decisions = False, {}, 0
-        while not finished and decisions < 40:
-            _, _, terminated, truncated, info = env.step(DOWN)
-            finished, decisions = terminated or truncated, decisions + 1
-        successes += info["is_success"]
-    assert successes <= 3
+
+def test_the_searching_rule_inserts_where_the_straight_descent_fails(env):
+    successes, peak = trials(env, searching_rule, 4, seed=3)
+    assert successes == 4
+    assert peak < 15.0
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
@@ -136,9 +139,12 @@ def test_checkers_are_content():
     check_env_of_sb3(make_env(hold=25), skip_render_check=True)
 
 
-def test_the_arm_inserts_too():
-    info, _, _ = play(make_env(station="arm", uncertainty="known"), lambda _: DOWN, seed=0)
+@pytest.mark.parametrize("seed", range(2))
+def test_the_arm_inserts_too(arm, seed):
+    """At half the speed: an arm that descends faster is pulled sideways by more than a chamfer leads back."""
+    info, _, _ = play(arm, lambda _: 0.5 * DOWN, seed=seed)
     assert info["is_success"]
+    assert info["ledger"]["peak_force"] <= 10.0
     assert info["ledger"]["collisions"] == 0
 
 
