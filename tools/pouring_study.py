@@ -1,8 +1,8 @@
 """Who learns to pour, on which seed, how soon, and what it costs: `python -m guiderail.tools.pouring_study`.
 
-The four combinations of the thesis (with and without the template, sparse and shaped), judged on held-out starts and on
-mugs that training never saw. Each seed has a row of its own: what failed on one is not averaged away. A study that was
-interrupted goes on where it was, and the figures use the same runs.
+The four combinations of the thesis (with and without the template, sparse and shaped) and a scripted person, judged on
+held-out starts and on mugs that training never saw. Each seed has a row of its own: what failed on one is not averaged
+away. A study that was interrupted goes on where it was, and the figures use the same runs.
 """
 
 import argparse
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET
+from guiderail.diagrams.tasks.pouring_inputs import Inputs, person
 from guiderail.models.errors import InputError
 from guiderail.tools.episodes import make_environment, run_episode
-from guiderail.tools.evaluate import held_out
 from guiderail.tools.files import write_atomically
 from guiderail.tools.policy import Policy
 from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after, read_table, table_text
@@ -37,13 +37,14 @@ EPISODES_A_MUG = 4
 
 @dataclass(frozen=True)
 class Method:
-    """One of the thesis's four."""
+    """Who acts, through what, and for what reward."""
 
     label: str
     guidance: str
     reward: str
     hold: int  # twice as long where success alone is rewarded: it is found only if random inputs sometimes have it
     episodes: int  # of a run
+    active_constraints: bool | None = None  # the guidance's own unless given
 
 
 METHODS = {
@@ -51,6 +52,11 @@ METHODS = {
     "rl_shaped": Method("RL-Shaped", "none", "hand_shaped", 10, 300),
     "rl_sct_sparse": Method("RL-SCT-Sparse", "sct", "sparse", 20, 60),
     "rl_sct_shaped": Method("RL-SCT-Shaped", "sct", "shaped", 10, 60),
+}
+# Nobody learns here: a scripted person's three axes, and the same person's with nothing that holds them back.
+PERSONS = {
+    "person": Method("a person", "sct", "shaped", 10, 1),
+    "person_unconstrained": Method("a person without constraints", "sct", "shaped", 10, 1, active_constraints=False),
 }
 
 
@@ -60,10 +66,13 @@ def job(out: Path, method: str, algorithm: str, seed: int, episodes: int | None 
     Raises:
         InputError: for an unknown method or algorithm, or a number out of range.
     """
-    if method not in METHODS:
-        raise InputError(f"there is no method {method!r}: choose of {', '.join(METHODS)}")
-    known = METHODS[method]
+    methods = METHODS | PERSONS
+    if method not in methods:
+        raise InputError(f"there is no method {method!r}: choose of {', '.join(methods)}")
+    known = methods[method]
     environment = {"guidance": known.guidance, "reward": known.reward, "hold": known.hold}
+    if known.active_constraints is not None:
+        environment["active_constraints"] = known.active_constraints
     episodes = known.episodes if episodes is None else episodes
     config = configure(TASK, environment, algorithm=algorithm, preset=PRESET, episodes=episodes, seed=seed)
     return Job(method, config, out / "runs" / TASK / f"{method}-{algorithm}-{episodes}-{seed}")
@@ -84,7 +93,7 @@ def pouring_study(
 
     Args:
         out: the folder; runs in it are used again.
-        methods: of `METHODS`.
+        methods: of `METHODS` and `PERSONS`; a person has no seeds, and one row.
         algorithm: "sac" or "tqc".
         seeds: of the runs.
         episodes: of each run; the method's own number unless given.
@@ -97,7 +106,11 @@ def pouring_study(
     """
     if not methods or not seeds or evaluations < 0 or mugs < 0:
         raise InputError("a study of pouring needs methods and seeds, and no number in it is negative")
-    jobs = [job(out, method, algorithm, seed, episodes) for method in methods for seed in seeds]
+    jobs = [
+        job(out, method, algorithm, seed, episodes)
+        for method in methods
+        for seed in (seeds if method in METHODS else seeds[:1])
+    ]
     rows = []
     for one in jobs:
         rows.append(judge(one, evaluations, mugs))
@@ -113,13 +126,16 @@ def pouring_study(
 
 def judge(one: Job, evaluations: int, mugs: int) -> dict[str, Any]:
     """A run's row; it is trained where it isn't yet."""
-    run_job(one)
-    trained = RunFolder(one.folder).episodes()
-    file = one.folder / f"held_out-{evaluations}.csv"
-    judged = _kept(file, lambda: _held_out(one.config, Policy.load(one.folder), evaluations))
-    unseen = _kept(
-        one.folder / f"unseen_mugs-{mugs}.csv", lambda: unseen_mugs(one.config, Policy.load(one.folder), mugs)
-    )
+    trained: list[dict[str, Any]] = []
+    if one.name in METHODS:
+        run_job(one)
+        trained = RunFolder(one.folder).episodes()
+
+    def act() -> Inputs:
+        return Policy.load(one.folder) if one.name in METHODS else person
+
+    judged = _kept(one.folder / f"held_out-{evaluations}.csv", lambda: held_out_starts(one.config, act(), evaluations))
+    unseen = _kept(one.folder / f"unseen_mugs-{mugs}.csv", lambda: unseen_mugs(one.config, act(), mugs))
     return {
         "method": one.name,
         "algorithm": one.config.learner.algorithm,
@@ -127,7 +143,7 @@ def judge(one: Job, evaluations: int, mugs: int) -> dict[str, Any]:
         **training_row(trained),
         **_judged("held_out", judged),
         **_judged("unseen_mugs", unseen),
-        "worst_violation": max(row["worst_violation"] for row in (*trained, *judged, *unseen)),
+        "worst_violation": max((row["worst_violation"] for row in (*trained, *judged, *unseen)), default=None),
         "training_seconds": float(sum(row["wall_time"] for row in trained)),
     }
 
@@ -149,7 +165,15 @@ def ended(rows: Sequence[Mapping[str, Any]], how: str) -> int:
     return sum(row["termination"] == how for row in rows)
 
 
-def unseen_mugs(config: RunConfig, policy: Policy, episodes: int, seed: int = HELD_OUT_SEED) -> list[dict[str, Any]]:
+def held_out_starts(config: RunConfig, act: Inputs, episodes: int, seed: int = HELD_OUT_SEED) -> list[dict[str, Any]]:
+    """Rows of episodes with held-out starts."""
+    env = make_environment(config.task, config.environment)
+    rows = [run_episode(env, act, held_out_seed=seed + index, episode=index) for index in range(episodes)]
+    env.close()
+    return rows
+
+
+def unseen_mugs(config: RunConfig, act: Inputs, episodes: int, seed: int = HELD_OUT_SEED) -> list[dict[str, Any]]:
     """Rows of episodes with held-out starts and mugs of other sizes in other places, drawn within the bounds above."""
     rows: list[dict[str, Any]] = []
     while len(rows) < episodes:
@@ -160,13 +184,9 @@ def unseen_mugs(config: RunConfig, policy: Policy, episodes: int, seed: int = HE
         }
         env = make_environment(config.task, config.environment | mug | {"mug_offset": MAX_MUG_OFFSET})
         for index in range(len(rows), min(len(rows) + EPISODES_A_MUG, episodes)):
-            rows.append(run_episode(env, policy, held_out_seed=seed + index, episode=index) | mug)
+            rows.append(run_episode(env, act, held_out_seed=seed + index, episode=index) | mug)
         env.close()
     return rows
-
-
-def _held_out(config: RunConfig, policy: Policy, episodes: int) -> list[dict[str, Any]]:
-    return held_out(config, policy, episodes=episodes, seed=HELD_OUT_SEED) if episodes else []
 
 
 def _kept(file: Path, judge: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -193,7 +213,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Prints a line for every row, and what they come to."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="the folder; runs in it are used again")
-    parser.add_argument("--methods", default="rl_sct_shaped", help=f"of {', '.join(METHODS)}, separated by commas")
+    parser.add_argument("--methods", default="rl_sct_shaped", help=f"of {', '.join(METHODS | PERSONS)}")
     parser.add_argument("--algorithm", default="sac", help="sac or tqc")
     parser.add_argument("--seeds", default="10,11,12,13,14", help="separated by commas")
     parser.add_argument("--episodes", type=int, help="of each run; the method's own number unless given")

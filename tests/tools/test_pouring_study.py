@@ -63,6 +63,16 @@ def test_what_makes_no_sense_is_refused_before_anything_runs(tmp_path, wrong):
     assert not (tmp_path / "new").exists()
 
 
+def test_a_person_pours_and_the_constraints_are_why(tmp_path):
+    methods = ["person", "person_unconstrained"]
+    result = pouring_study(tmp_path, methods=methods, seeds=[3, 4], evaluations=2)
+    assert [result[f"{method}, held out success of each seed"] for method in methods] == [[1.0], [0.0]]
+    bound, free = read_table(tmp_path / "pouring-sac-person-person_unconstrained.csv")
+    assert bound["held_out_spills"] + bound["held_out_collisions"] == 0
+    assert free["held_out_spills"] + free["held_out_collisions"] == 2
+    assert bound["worst_violation"] <= 1e-9
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_is_an_environment_that_there_is(tmp_path, method):
     config = job(tmp_path, method, "sac", 0).config
