@@ -18,6 +18,7 @@ from guiderail.tools.study import Job, run_jobs, write_table
 
 COLOURS = {"rl_sparse": "#d62728", "rl_shaped": "#e6a700", "rl_sct_sparse": "#1f77b4", "rl_sct_shaped": "#2ca02c"}
 ENDINGS = ("success", "spill", "collision")
+TICKS = (10, 20, 50, 100, 200, 500)  # episodes
 CONDITION = (
     "an iiwa in simulation; the preset 'pouring'; an action lasts 10 control steps, and 20 where the reward is sparse; "
     "the template's inputs are 1.7 times as fast there"
@@ -50,10 +51,14 @@ def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
         ):
             _boxes(axis, found, key)
             axis.set_ylabel(label)
+    for axis in axes[0]:
+        axis.set(yscale="log", yticks=TICKS)
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("")
     for row in axes[1:]:
         top = max(axis.get_ylim()[1] for axis in row)
         for axis in row:
-            axis.set_ylim(-2.0, top)
+            axis.set_ylim(-0.05 * top, top)
     return {
         "picture": str(save_figure(figure, out / "figure_3_8.png")),
         "table": str(write_table(out / "figure_3_8", rows)),
@@ -142,7 +147,8 @@ def _learning_curves(out: Path, number: str, algorithm: str, seeds: int, episode
             runs = [[row["termination"] == ending for row in one["rows"]] for one in results if one["name"] == name]
             label = f"{method.label} ({len(runs)} {'run' if len(runs) == 1 else 'runs'})"
             draw_runs(axis, runs, colour=COLOURS[name], label=label)
-        axis.set(xscale="log", xlabel="episode", ylabel=f"{ending} rate (mean of 10)", ylim=(-0.04, 1.04))
+        axis.set(xlabel="episode", ylabel=f"{ending} rate (mean of 10)", xscale="log", ylim=(-0.04, 1.04))
+        axis.xaxis.set_major_formatter("{x:g}")
     legend(figure, axes[0])
     rows = [_row(result) for result in results]
     return {
@@ -188,4 +194,4 @@ def _said(rows: Sequence[Mapping[str, Any]], algorithm: str) -> dict[str, str]:
 def _outcome(rows: Sequence[Mapping[str, Any]], method: str) -> str:
     of_method = [row for row in rows if row["method"] == method]
     percent = {what: float(np.mean([row[f"{what}_percent"] for row in of_method])) for what in ENDINGS}
-    return ", ".join(f"{value:.0f} % {what}" for what, value in percent.items()) + f" in {len(of_method)} runs"
+    return ", ".join(f"{value:.0f} % {what}" for what, value in percent.items()) + f" (runs: {len(of_method)})"
