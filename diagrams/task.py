@@ -43,6 +43,23 @@ def _nothing_to_randomize(context: Context, rng: np.random.Generator, options: M
 
 
 @dataclass(frozen=True)
+class Symmetry:
+    """A half turn or a mirror under which a task stays what it is, up to small things such as demonstrations' means.
+
+    Args:
+        observation: (n,) of ±1, what each observed number is multiplied by.
+        action: (A,) of ±1, what each action is multiplied by.
+    """
+
+    observation: tuple[float, ...]
+    action: tuple[float, ...]
+
+    def __post_init__(self):
+        if not set(self.observation) | set(self.action) <= {-1.0, 1.0}:
+            raise ValueError("a symmetry multiplies by 1 or -1")
+
+
+@dataclass(frozen=True)
 class TaskDiagram:
     """A task, wired and built: what `GuidedEnv` needs to know of it.
 
@@ -80,6 +97,7 @@ class TaskDiagram:
         push: called with the root context and a displacement; moves the measured pose by it, as a person would who
             pushes the robot. None where a task has no such thing.
         meshcat: where the diagram publishes to, for `render_mode="human"`.
+        symmetry: of the task, where it has one; a learner may learn from what it saw, seen from the other side.
     """
 
     diagram: Diagram
@@ -91,6 +109,7 @@ class TaskDiagram:
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]] = _nothing_to_randomize
     push: Callable[[Context, np.ndarray], None] | None = None
     meshcat: Meshcat | None = None
+    symmetry: Symmetry | None = None
 
     def __post_init__(self):
         missing = [name for name in (*PORTS, *self.reward_terms) if not self.diagram.HasOutputPort(name)]
@@ -100,5 +119,10 @@ class TaskDiagram:
             raise ValueError(f"the task's diagram '{self.diagram.get_name()}' exports no port {', '.join(missing)}")
         if self.num_steps < 1 or not self.control_period > 0:
             raise ValueError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
+        if self.symmetry is not None and (
+            np.shape(self.symmetry.observation) != self.observation_space.shape
+            or len(self.symmetry.action) != self.diagram.GetInputPort("action").size()
+        ):
+            raise ValueError("a symmetry has a sign for every observed number and one for every action")
         if len(self.ledger_fields) != self.diagram.GetOutputPort("ledger").size():
             raise ValueError(f"the ledger has {self.diagram.GetOutputPort('ledger').size()} fields, not the named ones")

@@ -18,6 +18,7 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch.nn.utils import parameters_to_vector
 
+from guiderail.diagrams.task import Symmetry
 from guiderail.tools.presets import ALGORITHMS, Preset, decision_discount
 
 IMAGE_POOL = 5  # pixels; 110×144×3 becomes 22×28×3
@@ -48,7 +49,16 @@ class PooledImage(BaseFeaturesExtractor):
 class Learner:
     """An off-policy algorithm of Stable-Baselines3 that is told when to act, to remember and to learn."""
 
-    def __init__(self, preset: Preset, env: gymnasium.Env, *, hold: int, seed: int, decisions: int):
+    def __init__(
+        self,
+        preset: Preset,
+        env: gymnasium.Env,
+        *,
+        hold: int,
+        seed: int,
+        decisions: int,
+        symmetry: Symmetry | None = None,
+    ):
         """
         Args:
             preset: how to learn.
@@ -56,7 +66,11 @@ class Learner:
             hold: control steps that an action lasts.
             seed: of the networks, and of everything drawn in training.
             decisions: the most that this run can take, so that the replay buffer asks for no more memory than it uses.
+            symmetry: of the task, where it has one; used if the preset says so.
         """
+        self.symmetry = symmetry if preset.symmetry else None
+        if self.symmetry is not None:
+            decisions *= 2
         networks: dict[str, Any] = {"net_arch": list(preset.units), "optimizer_kwargs": {"fused": True}}
         if is_image_space(env.observation_space):
             networks |= {"features_extractor_class": PooledImage, "features_extractor_kwargs": {"pool": IMAGE_POOL}}
@@ -115,9 +129,11 @@ class Learner:
         action = self.model.policy.scale_action(np.asarray(action)[None])
         if np.ndim(observation) == 3:  # an image; Stable-Baselines3 keeps channels first
             observation, following = np.moveaxis(observation, -1, 0), np.moveaxis(following, -1, 0)
-        self.model.replay_buffer.add(
-            observation, following, action, np.array([reward]), np.array([terminated or truncated]), infos
-        )
+        rest = np.array([reward]), np.array([terminated or truncated]), infos
+        self.model.replay_buffer.add(observation, following, action, *rest)
+        if self.symmetry is not None:
+            sides, turned = np.array(self.symmetry.observation), np.array(self.symmetry.action)
+            self.model.replay_buffer.add(sides * observation, sides * following, turned * action, *rest)
         self.decisions += 1
 
     def learn(self) -> None:

@@ -31,6 +31,7 @@ class Preset:
     units: tuple[int, ...] = (256, 256)  # of the hidden layers
     steady_episodes: int = 0  # the first ones, in which one action drawn uniformly is kept all the time
     practise: float = 0.0  # part of the episodes, evenly spread, that are acted without exploring
+    symmetry: bool = False  # remember what was seen as seen from the other side too, where the task has one
     averaging: float = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
 
 
@@ -43,7 +44,9 @@ _QUICK = Preset(learning_rate=1e-3, discount=0.998, gradient_steps=8, entropy="a
 PRESETS = {
     # Measured on the connector: small batches, a moderate learning rate, and an averaged actor, because a single one
     # swings from episode to episode. Four of five episodes do not explore: white actions find the hole by wiggling, so
-    # that the critic learns little about the mean, and a policy that always succeeds in training fails by itself.
+    # that the critic learns little about the mean, and a policy that always succeeds in training fails by itself. What
+    # happens on one side of the jack is remembered for the other as well: without that, a jack that is elsewhere in
+    # every episode was missed one time in six after a hundred episodes.
     "robust": Preset(
         learning_rate=7e-4,
         train_every=4,
@@ -51,6 +54,7 @@ PRESETS = {
         units=(128, 128),
         steady_episodes=8,
         practise=0.8,
+        symmetry=True,
         averaging=0.01,
     ),
     # Cheap enough to watch: the narrow passage within a minute.

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -40,7 +40,8 @@ def train(
     torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
     env = make_environment(config.task, config.environment)
     decisions = config.episodes * most_decisions(env)
-    learner = Learner(config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions)
+    symmetry = cast(Any, env.unwrapped).task.symmetry
+    learner = Learner(config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=symmetry)
     env.reset(seed=config.seed)  # what is hidden and constant in a run is drawn here
     if resume:
         rows = _resume(folder, learner, env)

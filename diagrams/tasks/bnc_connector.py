@@ -18,7 +18,7 @@ from guiderail.diagrams.guidance import build_guidance, check_guidance
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
 from guiderail.diagrams.stations.bnc_workcell import LOCKED_ANGLE, LOCKED_HEIGHT, BncWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE, Station
-from guiderail.diagrams.task import TaskDiagram
+from guiderail.diagrams.task import Symmetry, TaskDiagram
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import (
     CLIP,
@@ -66,6 +66,10 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 ACTION_WEIGHT = FORCE_WEIGHT = 0.01
 REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
 SUCCESS_REWARD, COLLISION_REWARD = 60.0, -50.0
+
+# A jack has two equal sides: half a turn about its axis changes the signs of what lies across it.
+HALF_TURN = np.array([-1.0, -1.0, 1.0, 1.0, -1.0, -1.0])  # of a pose's x, y, z, Rz, Ry, Rx
+HALF_TURN_OF_WRENCH = np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
 _SUCCESS, _COLLISION = TERMINATIONS.index("success"), TERMINATIONS.index("collision")
 
 
@@ -136,7 +140,7 @@ def make_env(
         make_station(station, workcell),
         build_guidance(guidance, skill, "BncConnector"),
         uncertain,
-        num_actions=skill.num_actions,
+        explored=skill.explored,
         shaped=reward == "shaped",
         render_mode=render_mode,
     )
@@ -149,11 +153,11 @@ def build_task(
     guidance: Diagram,
     uncertain: BncUncertainty,
     *,
-    num_actions: int,
+    explored: tuple[int, ...],
     shaped: bool = False,
     render_mode: str | None = None,
 ) -> TaskDiagram:
-    """Wires a station, a guidance diagram, reward, monitor and ledger."""
+    """Wires a station, a guidance diagram that moves the `explored` outputs, reward, monitor and ledger."""
     builder = DiagramBuilder()
     connect_guidance(builder, station, guidance)
     pose, desired_pose = station.get_pose_output_port(), guidance.GetOutputPort("desired_pose")
@@ -171,7 +175,7 @@ def build_task(
     builder.Connect(force, monitor.get_signal_input_port("contact_force"))
     termination = monitor.get_termination_output_port()
 
-    reward = builder.AddNamedSystem("reward", RewardSystem(_reward_terms(num_actions, shaped)))
+    reward = builder.AddNamedSystem("reward", RewardSystem(_reward_terms(len(explored), shaped)))
     builder.ConnectInput("action", reward.get_signal_input_port("action"))
     builder.Connect(wrench, reward.get_signal_input_port("wrench"))
     builder.Connect(termination, reward.get_signal_input_port("termination"))
@@ -225,6 +229,7 @@ def build_task(
         randomize=randomize,
         push=push,
         meshcat=meshcat,
+        symmetry=Symmetry((1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH), tuple(HALF_TURN[list(explored)])),
     )
 
 

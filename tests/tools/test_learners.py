@@ -6,6 +6,7 @@ import pytest
 import torch
 from gymnasium import spaces
 
+from guiderail.diagrams.task import Symmetry
 from guiderail.models.errors import InputError
 from guiderail.tools.learners import Learner
 from guiderail.tools.policy import Policy
@@ -100,6 +101,23 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
     buffer = learner.model.replay_buffer
     bootstrapped = buffer.dones[:3, 0] * (1 - buffer.timeouts[:3, 0])
     np.testing.assert_array_equal(bootstrapped, [1, 0, 0])
+
+
+def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
+    half_turn = Symmetry((-1.0, -1.0, 1.0), (-1.0, 1.0))
+    learner = Learner(preset, Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
+    plain = Learner(replace(preset, symmetry=False), Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
+    for one in (learner, plain):
+        one.remember(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True, False)
+    buffer = learner.model.replay_buffer
+    assert (buffer.size(), plain.model.replay_buffer.size(), learner.decisions) == (2, 1, 1)
+    np.testing.assert_array_equal(buffer.observations[:2, 0], [[1, 2, 3], [-1, -2, 3]])
+    np.testing.assert_array_equal(buffer.next_observations[:2, 0], [[4, 5, 6], [-4, -5, 6]])
+    np.testing.assert_array_equal(buffer.actions[:2, 0], [[0.5, 0.25], [-0.5, 0.25]])
+    np.testing.assert_array_equal(buffer.rewards[:2, 0], [7, 7])
+    np.testing.assert_array_equal(buffer.dones[:2, 0], [1, 1])
+    live(learner, 49)  # and the buffer has room for all of it
+    assert (buffer.size(), buffer.full) == (100, False)
 
 
 def test_a_restored_learner_goes_on_as_the_first_would_have(preset):

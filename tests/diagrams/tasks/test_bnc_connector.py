@@ -95,6 +95,21 @@ def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
     assert "simulation_failure" not in info
 
 
+def test_half_a_turn_of_everything_is_the_same_task(kmp):
+    signs = np.array(kmp.task.symmetry.observation)
+    across = signs < 0
+    felt = []
+    for side in (1.0, -1.0):
+        observations = play(kmp, standing_still, options={"offset": (side * 1.0 * MM, side * 0.5 * MM)})[3]
+        felt.append(observations[6:14].mean(axis=0))  # while the plug stands on the rim
+    seen, other = felt[0], signs * felt[1]
+    torques = slice(10, 12)
+    assert np.linalg.norm(seen[torques]) > 0.3
+    # Not exactly so: the demonstrations search the rim one way round.
+    assert np.linalg.norm(seen[torques] - other[torques]) < 0.5 * np.linalg.norm(seen[torques])
+    np.testing.assert_allclose(seen[~across], other[~across], atol=0.1)
+
+
 def test_the_same_seed_is_the_same_episode(kgrl):
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (12, 2))
