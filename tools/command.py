@@ -77,11 +77,13 @@ def replay(
     run: Run,
     html: Annotated[Path | None, typer.Option(help="The page to write.  [default: replay.html in the run]")] = None,
     seed: Annotated[int, typer.Option(help="Of the held-out initial condition shown.")] = 1_000_000,
+    station: Annotated[str | None, typer.Option(help="Where the policy acts: rails or arm, for the connector.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="What a camera sees of the episode, a .png to write.")] = None,
 ) -> None:
     """Write one self-contained page with the robot, the demonstrations, the executed paths and the constraint."""
     from guiderail.tools.replay import write_replay
 
-    typer.echo(write_replay(run, html, seed=seed))
+    typer.echo(write_replay(run, html, seed=seed, station=station, picture=picture))
 
 
 @app.command()

@@ -1,7 +1,9 @@
-"""A run as one self-contained page: robot, demonstrations, executed paths and the constraint, in any browser."""
+"""An episode as one self-contained page: robot, demonstrations, executed paths and the constraint, in any browser."""
+
+from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
 from typing import Any, cast
@@ -11,12 +13,14 @@ import numpy as np
 from guiderail.models.errors import InputError
 from guiderail.tools.episodes import DEMONSTRATED, make_environment, run_episode, standing_still
 from guiderail.tools.files import write_atomically
+from guiderail.tools.film import Shown, outcome, write_film
 from guiderail.tools.policy import Policy
 from guiderail.tools.progress import TOLERANCE
-from guiderail.tools.run_folder import RunConfig, RunFolder
-from guiderail.tools.scenes import scene
+from guiderail.tools.run_folder import RunFolder
+from guiderail.tools.scenes import Camera, scene
 
 FRAMES_PER_SECOND = 32.0
+REPETITIONS = 1000  # of the motion, before it rests
 OTHER_PATHS = 5  # held-out episodes whose paths are drawn beside the one that is shown
 
 GREY, BLACK, GREEN, PALE_GREEN, RED = (
@@ -30,49 +34,83 @@ GREY, BLACK, GREEN, PALE_GREEN, RED = (
 # What each line on the page is: name, colour, words.
 LEGEND = (
     ("demonstrations", GREY, "demonstrations"),
-    ("before_learning", BLACK, "before learning: the demonstration alone"),
-    ("other_episodes", PALE_GREEN, "after learning: other held-out episodes"),
-    ("executed", GREEN, "after learning: the episode shown"),
+    ("alone", BLACK, "the demonstration alone"),
+    ("other_episodes", PALE_GREEN, "{acting}: other held-out episodes"),
+    ("executed", GREEN, "{acting}: the episode shown"),
     ("constraint", RED, "the constraint"),
 )
 
 
-def write_replay(run: Path, html: Path | None = None, *, seed: int = 1_000_000) -> Path:
+def write_replay(
+    run: Path,
+    html: Path | None = None,
+    *,
+    seed: int = 1_000_000,
+    station: str | None = None,
+    picture: Path | None = None,
+) -> Path:
     """Replays a run's deterministic policy on held-out initial conditions, and writes it as a page.
 
     Args:
         run: the run's folder.
-        html: the page; `replay.html` in the run unless given. It is replaced.
+        html: the page; `replay.html` in the run unless given, `replay-<station>.html` for another station. It is
+            replaced.
         seed: of the episode shown.
+        station: where the policy acts, for tasks that have several; where it learned unless given.
+        picture: if given, what the task's camera sees of the same episode is written there.
 
     Raises:
-        InputError: if there is no trained run, or its task cannot be shown.
+        InputError: if there is no trained run, its task cannot be shown, or it has no such station.
     """
     folder = RunFolder(run)
     config, policy = folder.config(), Policy.load(folder.path)
+    name = "replay.html" if station is None else f"replay-{station}.html"
+    episode = Shown(
+        task=config.task,
+        environment=config.environment | ({} if station is None else {"station": station}),
+        act=policy,
+        acting="after learning",
+        title=config.learner.algorithm.upper(),
+        run_seed=config.seed,
+        seed=seed,
+    )
+    html = folder.path / name if html is None else html
+    if picture is not None:
+        write_film(picture, episode)
+    write_page(html, episode)
+    return html
+
+
+def write_page(html: Path, episode: Shown) -> dict[str, Any]:
+    """Runs an episode and writes it as a page; returns the episode's row.
+
+    Raises:
+        InputError: if the task cannot be shown.
+    """
     logging.getLogger("drake").setLevel(logging.WARNING)  # where Meshcat listens is of no interest to a page
-    env = make_environment(config.task, config.environment, render_mode="human")
+    env = make_environment(episode.task, episode.environment, render_mode="human")
     base = cast(Any, env.unwrapped)
     meshcat = getattr(base.task, "meshcat", None)
     if meshcat is None:
-        raise InputError(f"{config.task} has nothing to show: guiderail plot draws its learning curve")
+        raise InputError(f"{episode.task} has nothing to show: guiderail plot draws its learning curve")
     base.simulator.set_target_realtime_rate(0.0)
-    env.reset(seed=config.seed)
+    env.reset(seed=episode.run_seed)
 
-    shown = scene(config.task)
+    shown = scene(episode.task)
     lines: dict[str, list[np.ndarray]] = {"demonstrations": [shown.to_world(d) for d in shown.demonstrations]}
     lines["constraint"] = list(shown.constraint)
 
-    def path(act: Callable[[np.ndarray], np.ndarray], episode: int) -> tuple[np.ndarray, dict[str, Any]]:
-        row = run_episode(env, act, held_out_seed=seed + episode)
+    def path(act: Callable[[np.ndarray], np.ndarray], index: int) -> tuple[np.ndarray, dict[str, Any]]:
+        row = run_episode(env, act, held_out_seed=episode.seed + index)
         return shown.to_world(base.trace.measured.copy()), row
 
-    if config.environment.get("guidance") in DEMONSTRATED:
-        lines["before_learning"] = [path(standing_still(env), 0)[0]]
-    lines["other_episodes"] = [path(policy, index)[0] for index in range(1, OTHER_PATHS + 1)]
+    if episode.environment.get("guidance") in DEMONSTRATED:
+        lines["alone"] = [path(standing_still(env), 0)[0]]
+    lines["other_episodes"] = [path(episode.act, index)[0] for index in range(1, OTHER_PATHS + 1)]
     meshcat.StartRecording(frames_per_second=FRAMES_PER_SECOND)
-    executed, row = path(policy, 0)
+    executed, row = path(episode.act, 0)
     meshcat.StopRecording()
+    meshcat.get_mutable_recording().set_repetitions(REPETITIONS)
     meshcat.PublishRecording()
     lines["executed"] = [executed]
 
@@ -82,13 +120,15 @@ def write_replay(run: Path, html: Path | None = None, *, seed: int = 1_000_000) 
             _draw(meshcat, f"/guiderail/{name}/{index}", points, radius, colour)
     for ornament in ("/Grid", "/Axes"):
         meshcat.SetProperty(ornament, "visible", False)
-    if shown.camera is not None:
-        meshcat.SetCameraPose(*(np.array(point) for point in shown.camera))
+    views = dict(shown.arm_views) if episode.environment.get("station") == "arm" else {}
+    camera = next(iter(views.values()), shown.camera)
+    if camera is not None:
+        meshcat.SetCameraPose(*(np.array(point) for point in camera))
     page = meshcat.StaticHtml()
     env.close()
-    html = folder.path / "replay.html" if html is None else html
-    write_atomically(html, _with_caption(page, config, row, {name for name, paths in lines.items() if paths}).encode())
-    return html
+    drawn = {name for name, paths in lines.items() if paths}
+    write_atomically(html, _with_caption(page, episode, row, drawn, views).encode())
+    return row
 
 
 def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, colour: tuple[float, ...]) -> None:
@@ -114,28 +154,39 @@ def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray,
     return (points[:, None] + radius * ring).reshape(-1, 3), faces
 
 
-def _with_caption(page: str, config: RunConfig, row: dict[str, Any], drawn: set[str]) -> str:
-    """The page with a legend over it: what it shows, and the numbers of the episode shown."""
+def _with_caption(page: str, episode: Shown, row: dict[str, Any], drawn: set[str], views: Mapping[str, Camera]) -> str:
+    """The page with a legend over it: what it shows, the numbers of the episode shown, and where to look from."""
     entries = "".join(
         f'<div><span style="color:rgb({",".join(str(round(255 * c)) for c in colour[:3])})">&#9644;</span> '
-        f"{escape(words)}</div>"
+        f"{escape(words.format(acting=episode.acting))}</div>"
         for name, colour, words in LEGEND
         if name in drawn
     )
-    title = f"{config.task} · {config.environment.get('guidance', '')} · {config.learner.algorithm.upper()}"
-    outcome = row["termination"] or "running"
     violations = (
         f"{name} {'none' if row[key] <= TOLERANCE else format(row[key], '.1e')}"
         for name, key in (("commanded", "worst_violation"), ("measured", "worst_measured_violation"))
     )
-    numbers = (
-        f"{outcome} after {row['steps']} control steps, return {row['return']:.1f}, "
-        f"peak force {row['peak_force']:.1f} N, violations: {', '.join(violations)}"
-    )
+    numbers = f"{outcome(row)}, return {row['return']:.1f}, violations: {', '.join(violations)}"
     caption = (
         '<div style="position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,.88);'
         'font:13px sans-serif;border-radius:6px;max-width:340px;z-index:10">'
-        f"<b>{escape(title)}</b>{entries}<div>{escape(numbers)}</div></div>"
+        f"<b>{escape(episode.heading)}</b>{entries}<div>{escape(numbers)}</div>{_buttons(views)}</div>"
     )
     head, body, tail = page.rpartition("</body>")
     return f"{head}{caption}{body}{tail}" if body else page + caption
+
+
+def _buttons(views: Mapping[str, Camera]) -> str:
+    """A button for each view; Meshcat's own camera lives in a frame whose y is up."""
+    if not views:
+        return ""
+    look = (
+        "<script>function look(eye, target) {"
+        "viewer.set_property(['Cameras', 'default', 'rotated', '<object>'], 'position', eye);"
+        "viewer.set_camera_target(target);}</script>"
+    )
+    buttons = (
+        f'<button onclick="look({", ".join(str([x, z, -y]) for x, y, z in camera)})">{escape(name)}</button> '
+        for name, camera in views.items()
+    )
+    return f"<div>look at {''.join(buttons)}</div>{look}"

@@ -1,9 +1,11 @@
 """What belongs into a picture of a task besides the robot: demonstrations, constraints, and where to look from."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
+
+Camera = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True)
@@ -15,13 +17,15 @@ class Scene:
         demonstrations: poses (N, O) of each demonstration.
         constraint: corner points (k, 3) of each line that bounds what is allowed.
         camera: where to look from, and where to look at, in the world [m].
+        arm_views: the same where a whole arm does it, by name; a page opens with the first and offers them all.
         line_radius: how thick a path is drawn [m].
     """
 
     to_world: Callable[[np.ndarray], np.ndarray]
     demonstrations: tuple[np.ndarray, ...] = ()
     constraint: tuple[np.ndarray, ...] = ()
-    camera: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    camera: Camera | None = None
+    arm_views: Mapping[str, Camera] = field(default_factory=dict)
     line_radius: float = 0.0015
 
 
@@ -56,6 +60,10 @@ def _narrow_passage() -> Scene:
     )
 
 
+ARM_VIEW: Camera = ((1.05, -0.75, 0.55), (0.42, 0.0, 0.32))
+TOOL_VIEW: Camera = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
+
+
 def _bnc_connector() -> Scene:
     from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
     from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
@@ -70,11 +78,13 @@ def _bnc_connector() -> Scene:
     rings = [np.column_stack([square, np.full(5, height)]) for height in (0.0, 0.015)]
     edges = [np.array([[x, y, 0.0], [x, y, 0.015]]) for x, y in square[:4]]
     eye, target = to_world(np.array([[0.025, -0.035, 0.022], [0.0, 0.0, 0.008]]))
+    near: Camera = (tuple(eye.tolist()), tuple(target.tolist()))
     return Scene(
         to_world=to_world,
         demonstrations=tuple(bnc_connector.load().outputs),
         constraint=tuple(to_world(line) for ring in rings for line in _sides(ring)) + tuple(to_world(e) for e in edges),
-        camera=(tuple(eye), tuple(target)),
+        camera=near,
+        arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
         line_radius=0.0001,
     )
 

@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from guiderail.tools.bnc_rule import FORCE_Z, TIME, TORQUE_X, TORQUE_Y, Z, reactive_rule
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS
+from guiderail.tools import replay
+from guiderail.tools.bnc_rule import FORCE_Z, GAIN, ON_RIM, SEARCH, TIME, TORQUE_X, TORQUE_Y, Z, reactive_rule
+from guiderail.tools.episodes import make_environment, run_episode
+from guiderail.tools.policy import FORMAT, Policy
+from guiderail.tools.run_folder import RunFolder
+from guiderail.tools.training import configure
 
 
 def observation(**values):
@@ -26,3 +32,35 @@ def test_stands_still_unless_it_stands_on_the_rim(elsewhere):
 
 def test_stays_within_an_actions_bounds():
     assert np.abs(reactive_rule(observation(torque_x=3.0, torque_y=-3.0))).max() == 1.0
+
+
+def rule_as_a_network():
+    """The rule as weights of a policy: what a run leaves, and what learning could arrive at."""
+    first, last = (2.0 * step / NUM_STEPS - 1.0 for step in SEARCH)
+    features = np.zeros((7, 13), np.float32)  # both torques with either sign; too early, too late, too low
+    features[[0, 1, 2, 3], [TORQUE_Y, TORQUE_Y, TORQUE_X, TORQUE_X]] = [-1.0, 1.0, 1.0, -1.0]
+    features[[4, 5, 6], [TIME, TIME, Z]] = [-1.0, 1.0, -1.0]
+    thresholds = np.array([0.0, 0.0, 0.0, 0.0, first, -last, ON_RIM], np.float32)
+    gates = np.hstack([np.eye(4), np.full((4, 3), -100.0)]).astype(np.float32)
+    actions = 2.0 * GAIN * np.array([[1, -1, 0, 0], [0, 0, 1, -1]], np.float32)
+    layers = [(features, thresholds), (gates, np.zeros(4, np.float32)), (actions, np.zeros(2, np.float32))]
+    spaces = {"observation_shape": [13], "action_low": [-1, -1], "action_high": [1, 1]}
+    return Policy(layers, {"format": FORMAT, "pool": 1} | spaces)
+
+
+def test_a_policy_of_a_run_on_rails_drives_the_arm_too_and_is_shown_there(tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+    config = configure("BncConnector", {"guidance": "kgrl", "uncertainty": "disc"}, episodes=1, seed=3)
+    folder.create(config)
+    rule_as_a_network().save(folder.path)
+
+    rails = make_environment(config.task, config.environment)
+    row = run_episode(rails, Policy.load(folder.path), held_out_seed=1_000_003)
+    assert row["success"]
+    assert row["worst_violation"] <= 1e-9
+
+    monkeypatch.setattr(replay, "OTHER_PATHS", 0)
+    page = replay.write_replay(folder.path, seed=1_000_003, station="arm").read_text()
+    assert page.count("success after") == 1
+    assert "the arm</button>" in page
+    assert (folder.path / "replay-arm.html").exists()

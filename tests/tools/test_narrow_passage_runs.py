@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from safetensors.numpy import load_file
 
 from guiderail.models.errors import InputError
@@ -85,6 +86,18 @@ def test_the_replay_is_one_page_that_needs_nothing_else(trained, tmp_path):
     assert "demonstrations" in page
     assert "<script src=" not in page
     assert "https://" not in page.partition("<body>")[0]
+
+
+def test_a_replay_comes_with_a_picture_and_only_on_stations_that_there_are(trained, tmp_path):
+    page, picture = tmp_path / "replay.html", tmp_path / "replay.png"
+    write_replay(trained.path, page, picture=picture)
+    image = imread(picture)
+    assert image.shape[0] > 400
+    assert image[..., :3].std() > 0.05  # it is not blank
+    page.unlink()
+    with pytest.raises(InputError, match="no argument station"):
+        write_replay(trained.path, page, station="arm")
+    assert not page.exists()
 
 
 def test_what_a_policy_does_can_be_demonstrated_again(trained, tmp_path):
