@@ -8,11 +8,12 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem, ValueProducer
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
 
 from guiderail.models.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.systems.command_watch import CommandWatch
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,7 @@ class CartesianImpedanceController(LeafSystem):
     `models.cartesian_impedance`. K may be given in the axes of any frame. The orientation's error is a
     quaternion's, so that no orientation is singular. D follows from K and the arm's inertia at its present posture.
 
-    The watchdog. A desired pose counts while it is finite and no older than `timeout`. Where it doesn't, the last one
-    that did is held; before the first one, the pose at initialization.
+    A watchdog holds the last sound command where they stop: see `CommandWatch`.
 
     .. pydrake_system::
 
@@ -104,23 +104,25 @@ class CartesianImpedanceController(LeafSystem):
             InputError: if an argument is out of range.
         """
         super().__init__()
-        if not period > 0.0 or not timeout > 0.0:
-            raise InputError(f"an impedance's period and timeout must be positive, not {period} s and {timeout} s")
         num_joints = plant.num_positions()
         if np.shape(gains.posture) != (num_joints,):
             raise InputError(f"an impedance's posture must have {num_joints} joints, not {np.shape(gains.posture)}")
         self._plant, self._target, self._tool_centre, self._gains = plant, target, tool_centre, gains
         self._stiffness_frame = stiffness_frame
         self._compensate_gravity = compensate_gravity
-        self._timeout = timeout
         self._torque_limits = plant.GetEffortUpperLimits()
 
         self._desired_pose = self.DeclareVectorInputPort("desired_pose", 6)
         self._state = self.DeclareVectorInputPort("state", 2 * num_joints)
         self._command_time = self.DeclareVectorInputPort("command_time", 1)
-        self._held_pose = self.DeclareDiscreteState(6)
-        self.DeclareInitializationDiscreteUpdateEvent(self._hold_present)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._keep_safe_command)
+        self._watch = CommandWatch(
+            self,
+            self._desired_pose,
+            self._command_time,
+            lambda context: self._pose.Eval(context),
+            period=period,
+            timeout=timeout,
+        )
 
         self._kinematics = self.DeclareCacheEntry(
             "kinematics",
@@ -132,22 +134,20 @@ class CartesianImpedanceController(LeafSystem):
             ),
             {self._state.ticket()},
         )
-        commands = {self._desired_pose.ticket(), self._command_time.ticket(), self.time_ticket()}
-        law_inputs = commands | {self._state.ticket(), self.discrete_state_ticket(self._held_pose)}
         self._law = self.DeclareCacheEntry(
             "law",
             ValueProducer(
                 allocate=lambda: Value(object()),
                 calc=lambda context, value: value.set_value(self._calc_law(context)),
             ),
-            law_inputs,
+            self._watch.tickets | {self._state.ticket()},
         )
         law = {self._law.ticket()}
         self._torque = self.DeclareVectorOutputPort("torque", num_joints, self._calc_torque, law)
         self._pose = self.DeclareVectorOutputPort("pose", 6, self._calc_pose, {self._state.ticket()})
         self._wrench = self.DeclareVectorOutputPort("impedance_wrench", 6, self._calc_wrench, law)
         self._saturation = self.DeclareVectorOutputPort("saturation", 1, self._calc_saturation, law)
-        self._holding = self.DeclareVectorOutputPort("holding", 1, self._calc_holding, commands)
+        self._holding = self.DeclareVectorOutputPort("holding", 1, self._watch.calc_holding, self._watch.commands)
 
     def get_desired_pose_input_port(self):
         """Where the tool centre shall be, (6,)."""
@@ -181,28 +181,10 @@ class CartesianImpedanceController(LeafSystem):
         """1 while the watchdog holds, (1,)."""
         return self._holding
 
-    def _is_sound(self, context: Context) -> bool:
-        if not np.isfinite(self._desired_pose.Eval(context)).all():
-            return False
-        if not self._command_time.HasValue(context):
-            return True
-        return bool(context.get_time() - self._command_time.Eval(context)[0] <= self._timeout)
-
-    def _hold_present(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._pose.Eval(context))
-        return EventStatus.Succeeded()
-
-    def _keep_safe_command(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        if not self._is_sound(context):
-            return EventStatus.DidNothing()
-        discrete_state.set_value(self._desired_pose.Eval(context))
-        return EventStatus.Succeeded()
-
     def _calc_law(self, context: Context) -> JointTorques:
         plant, gains = self._plant, self._gains
         plant_context = self._kinematics.Eval(context)
-        target = self._desired_pose.Eval(context) if self._is_sound(context) else self._held(context)
-        X_TPd = pose_to_transform(target)
+        X_TPd = pose_to_transform(self._watch.pose(context))
         X_TP = self._tool_centre.CalcPose(plant_context, self._target)
         R_TAxes = None
         if self._stiffness_frame is not None:
@@ -229,9 +211,6 @@ class CartesianImpedanceController(LeafSystem):
             torque_limits=self._torque_limits,
         )
 
-    def _held(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state(self._held_pose).value()
-
     def _gravity_torque(self, plant_context: Context) -> np.ndarray:
         if not self._compensate_gravity:
             return np.zeros(self._plant.num_velocities())
@@ -249,6 +228,3 @@ class CartesianImpedanceController(LeafSystem):
 
     def _calc_saturation(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(self._law.Eval(context).is_saturated))
-
-    def _calc_holding(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(not self._is_sound(context)))

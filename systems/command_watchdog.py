@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from guiderail.models.errors import InputError
+from guiderail.systems.command_watch import CommandWatch
 
 
 class CommandWatchdog(LeafSystem):
     """Holds the last safe pose when commands stop, for robots whose controller doesn't watch by itself.
 
-    A desired pose is sound while it is finite and no older than `timeout`. Where it isn't, the last one that was is
-    passed on; before the first one, the pose at initialization.
+    What is sound, and what is held where nothing is, `CommandWatch` says.
 
     .. pydrake_system::
 
@@ -39,19 +37,14 @@ class CommandWatchdog(LeafSystem):
             InputError: if an argument is not positive.
         """
         super().__init__()
-        if not period > 0.0 or not timeout > 0.0:
-            raise InputError(f"a watchdog's period and timeout must be positive, not {period} s and {timeout} s")
-        self._timeout = timeout
         self._desired_pose = self.DeclareVectorInputPort("desired_pose", 6)
         self._pose = self.DeclareVectorInputPort("pose", 6)
         self._command_time = self.DeclareVectorInputPort("command_time", 1)
-        self._held_pose = self.DeclareDiscreteState(6)
-        self.DeclareInitializationDiscreteUpdateEvent(self._hold_present)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
-        command = {self._desired_pose.ticket(), self._command_time.ticket(), self.time_ticket()}
-        held = {self.discrete_state_ticket(self._held_pose)}
-        self._safe_pose = self.DeclareVectorOutputPort("safe_pose", 6, self._calc_safe_pose, command | held)
-        self._holding = self.DeclareVectorOutputPort("holding", 1, self._calc_holding, command)
+        self._watch = CommandWatch(
+            self, self._desired_pose, self._command_time, self._pose.Eval, period=period, timeout=timeout
+        )
+        self._safe_pose = self.DeclareVectorOutputPort("safe_pose", 6, self._calc_safe_pose, self._watch.tickets)
+        self._holding = self.DeclareVectorOutputPort("holding", 1, self._watch.calc_holding, self._watch.commands)
 
     def get_desired_pose_input_port(self):
         """What is commanded, (6,)."""
@@ -73,28 +66,5 @@ class CommandWatchdog(LeafSystem):
         """1 while a pose is held, (1,)."""
         return self._holding
 
-    def _is_sound(self, context: Context) -> bool:
-        if not np.isfinite(self._desired_pose.Eval(context)).all():
-            return False
-        if not self._command_time.HasValue(context):
-            return True
-        return bool(context.get_time() - self._command_time.Eval(context)[0] <= self._timeout)
-
-    def _hold_present(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._pose.Eval(context))
-        return EventStatus.Succeeded()
-
-    def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        if not self._is_sound(context):
-            return EventStatus.DidNothing()
-        discrete_state.set_value(self._desired_pose.Eval(context))
-        return EventStatus.Succeeded()
-
     def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
-        if self._is_sound(context):
-            output.SetFromVector(self._desired_pose.Eval(context))
-        else:
-            output.SetFromVector(context.get_discrete_state(self._held_pose).value())
-
-    def _calc_holding(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(not self._is_sound(context)))
+        output.SetFromVector(self._watch.pose(context))

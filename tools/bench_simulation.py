@@ -20,6 +20,8 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, make_env, make_station
 from guiderail.models.objects.bnc_motion import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
+from guiderail.systems.command_watch import CommandWatch
+from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.recorder import Recorder
 from guiderail.systems.wrench_sensor import WrenchSensor
@@ -28,7 +30,8 @@ from guiderail.systems.wrench_sensor import WrenchSensor
 CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
     (CartesianImpedanceController, "_calc_law"),
-    (CartesianImpedanceController, "_keep_safe_command"),
+    (CommandWatch, "_remember"),
+    (CommandWatchdog, "_calc_safe_pose"),
     (ImpedanceMonitor, "_calc_contact_force"),
     (ImpedanceMonitor, "_calc_saturation"),
     (Recorder, "_record"),

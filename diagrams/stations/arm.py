@@ -8,14 +8,17 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
-from pydrake.systems.framework import Context, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.stations.station import (
     PLANT_PERIOD,
     Impedance,
     Station,
-    add_contact_plant,
+    add_workcell_plant,
+    add_wrench_sensor,
     export_simulation_ports,
+    export_station_ports,
+    force_first,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.parsing import add_model
@@ -24,13 +27,13 @@ from guiderail.models.robots.iiwa import CONNECTOR_TOOL_URDF, IIWA_URDF, NUM_JOI
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
-from guiderail.systems.wrench_sensor import WrenchSensor
 
 # The tool is bolted on turned by this much, so that a quarter turn lies symmetric about joint 7's middle.
 TOOL_TURN = 0.75 * np.pi  # [rad]
 # The arm's joints are torque-controlled: feedback of the joint torque makes the rotors appear this much lighter
 # (Albu-Schäffer, Ott, Hirzinger 2007). Without it a Cartesian impedance would lag far behind its command.
 APPARENT_ROTOR_INERTIA = 0.1
+MIDDLE_OF_TURN = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -72,15 +75,82 @@ def controller_model(workcell: Workcell) -> tuple[MultibodyPlant, ArmModel]:
     return plant, arm
 
 
+class KnownArm:
+    """The arm as its controller knows it, and what follows from that alone.
+
+    Attributes:
+        plant: the arm, its tool and the workpiece; no fixture, no offsets.
+        arm: in that plant.
+        posture: halfway through the workpiece's quarter turn, so that a null space that returns to it pulls either way
+            alike, (7,).
+    """
+
+    def __init__(self, workcell: Workcell):
+        """
+        Args:
+            workcell: what is held, and where the target is.
+        """
+        self.plant, self.arm = controller_model(workcell)
+        self.posture = self.solve(MIDDLE_OF_TURN, READY_POSTURE)
+
+    def solve(self, pose: np.ndarray, guess: np.ndarray) -> np.ndarray:
+        """Joint positions (7,) with the tool centre at `pose`, (6,)."""
+        arm = self.arm
+        return solve_inverse_kinematics(self.plant, arm.target, arm.tool_centre, pose_to_transform(pose), guess)
+
+    def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
+        """Puts an arm of a station's plant at rest with its tool centre at `pose`, (6,); `context` is the root's."""
+        plant_context = plant.GetMyMutableContextFromRoot(context)
+        plant.SetPositions(plant_context, model, self.solve(pose, self.posture))
+        plant.SetVelocities(plant_context, model, np.zeros(NUM_JOINTS))
+
+
 def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains:
     """The station's impedance, which is ordered as a pose is, as the controller wants it."""
-    by_axis = [0, 1, 2, 5, 4, 3]
     return ImpedanceGains(
-        stiffness=np.diag(np.array(impedance.stiffness)[by_axis]),
-        wrench_limits=np.array(impedance.limits)[by_axis],
+        stiffness=np.diag(force_first(impedance.stiffness)),
+        wrench_limits=force_first(impedance.limits),
         posture=posture,
         damping_ratio=impedance.damping_ratio,
     )
+
+
+def add_impedance_control(
+    builder: DiagramBuilder,
+    known: KnownArm,
+    impedance: Impedance,
+    period: float,
+    *,
+    state: OutputPort,
+    wrench: OutputPort,
+    compensate_gravity: bool = True,
+) -> OutputPort:
+    """Adds the controller of an arm whose joints are at `state`, and exports a station's ports; returns the torque."""
+    controller = builder.AddNamedSystem(
+        "controller",
+        CartesianImpedanceController(
+            known.plant,
+            known.arm.target,
+            known.arm.tool_centre,
+            impedance_gains(impedance, known.posture),
+            period=period,
+            compensate_gravity=compensate_gravity,
+        ),
+    )
+    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
+    builder.Connect(state, controller.get_state_input_port())
+    builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+    export_station_ports(
+        builder,
+        controller.get_desired_pose_input_port(),
+        controller.get_command_time_input_port(),
+        pose=controller.get_pose_output_port(),
+        wrench=wrench,
+        contact_force=monitor.get_contact_force_output_port(),
+        saturation=controller.get_saturation_output_port(),
+        holding=controller.get_holding_output_port(),
+    )
+    return controller.get_torque_output_port()
 
 
 class ArmStation(Station):
@@ -106,61 +176,24 @@ class ArmStation(Station):
         """
         super().__init__()
         builder = DiagramBuilder()
-        self.plant, self.scene_graph = plant, _ = add_contact_plant(builder, time_step)
-        workcell.add_fixture(plant)
-        self.arm = add_arm(plant, workcell)
-        plant.Finalize()
-        workcell.filter_contacts(plant, self.scene_graph)
-
-        self.controller_plant, self._controller_arm = controller_model(workcell)
-        # Halfway through the quarter turn, so that the posture pulls either way alike.
-        self.posture = self.solve(np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0]), READY_POSTURE)
-        controller = builder.AddNamedSystem(
-            "controller",
-            CartesianImpedanceController(
-                self.controller_plant,
-                self._controller_arm.target,
-                self._controller_arm.tool_centre,
-                impedance_gains(impedance, self.posture),
-                period=time_step,
-            ),
+        self.plant, self.scene_graph, self.arm = add_workcell_plant(
+            builder, workcell, time_step, lambda plant: add_arm(plant, workcell)
         )
-        monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)[[0, 1, 2, 5, 4, 3]]))
-        sensor = builder.AddNamedSystem(
-            "wrench_sensor",
-            WrenchSensor(
-                plant,
-                self.arm.wrist,
-                self.arm.tool,
-                self.arm.tool_centre,
-                workcell.X_WT.rotation(),
-                time_step,
-                wrench_time_constant,
-            ),
+        plant, arm = self.plant, self.arm
+        self._known = KnownArm(workcell)
+        wrench = add_wrench_sensor(builder, plant, workcell, arm.wrist, arm.tool, arm.tool_centre, wrench_time_constant)
+        torque = add_impedance_control(
+            builder,
+            self._known,
+            impedance,
+            time_step,
+            state=plant.get_state_output_port(arm.model),
+            wrench=wrench,
         )
-        sensor.connect(builder, plant)
-        builder.Connect(plant.get_state_output_port(self.arm.model), controller.get_state_input_port())
-        builder.Connect(controller.get_torque_output_port(), plant.get_actuation_input_port(self.arm.model))
-        builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
-        builder.ExportInput(controller.get_desired_pose_input_port(), "desired_pose")
-        builder.ExportInput(controller.get_command_time_input_port(), "command_time")
-        builder.ExportOutput(controller.get_pose_output_port(), "pose")
-        builder.ExportOutput(sensor.get_wrench_output_port(), "wrench")
-        builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
-        builder.ExportOutput(controller.get_saturation_output_port(), "saturation")
-        builder.ExportOutput(controller.get_holding_output_port(), "holding")
+        builder.Connect(torque, plant.get_actuation_input_port(arm.model))
         export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 
-    def solve(self, pose: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """Joint positions (7,) with the tool centre at `pose`, (6,)."""
-        arm = self._controller_arm
-        return solve_inverse_kinematics(
-            self.controller_plant, arm.target, arm.tool_centre, pose_to_transform(pose), guess
-        )
-
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.arm.model, self.solve(pose, self.posture))
-        self.plant.SetVelocities(plant_context, self.arm.model, np.zeros(NUM_JOINTS))
+        self._known.place(self.plant, self.arm.model, context, pose)

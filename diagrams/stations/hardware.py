@@ -18,19 +18,14 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
 from pydrake.systems.primitives import Multiplexer
 
-from guiderail.diagrams.stations.arm import add_arm, controller_model, impedance_gains
-from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance, Station, add_contact_plant
+from guiderail.diagrams.stations.arm import KnownArm, add_arm, add_impedance_control
+from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance, Station, add_workcell_plant
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.robots.iiwa import NUM_JOINTS, READY_POSTURE
-from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
-from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.models.robots.iiwa import NUM_JOINTS
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 
 STATUS_CHANNEL, COMMAND_CHANNEL = "IIWA_STATUS", "IIWA_COMMAND"
-MIDDLE_OF_TURN = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 
 
 class HardwareStation(Station):
@@ -64,10 +59,7 @@ class HardwareStation(Station):
         builder = DiagramBuilder()
         bus = lcm or DrakeLcm()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(bus))
-        self.controller_plant, arm = controller_model(workcell)
-        posture = solve_inverse_kinematics(
-            self.controller_plant, arm.target, arm.tool_centre, pose_to_transform(MIDDLE_OF_TURN), READY_POSTURE
-        )
+        known = KnownArm(workcell)
         subscriber = builder.AddNamedSystem(
             "status_subscriber",
             LcmSubscriberSystem.Make(
@@ -80,28 +72,25 @@ class HardwareStation(Station):
         )
         status = builder.AddNamedSystem("status", IiwaStatusReceiver(NUM_JOINTS))
         state = builder.AddNamedSystem("state", Multiplexer([NUM_JOINTS, NUM_JOINTS]))
-        controller = builder.AddNamedSystem(
-            "controller",
-            CartesianImpedanceController(
-                self.controller_plant,
-                arm.target,
-                arm.tool_centre,
-                impedance_gains(impedance, posture),
-                period=period,
-                compensate_gravity=False,
-            ),
-        )
         wrench = builder.AddNamedSystem(
             "wrench",
             JointTorqueWrench(
-                self.controller_plant,
-                arm.target,
-                arm.tool_centre,
+                known.plant,
+                known.arm.target,
+                known.arm.tool_centre,
                 period=period,
                 time_constant=wrench_time_constant,
             ),
         )
-        monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)[[0, 1, 2, 5, 4, 3]]))
+        torque = add_impedance_control(
+            builder,
+            known,
+            impedance,
+            period,
+            state=state.get_output_port(),
+            wrench=wrench.get_wrench_output_port(),
+            compensate_gravity=False,
+        )
         sender = builder.AddNamedSystem("command", IiwaCommandSender(NUM_JOINTS, IiwaControlMode.kTorqueOnly))
         publisher = builder.AddNamedSystem(
             "command_publisher",
@@ -112,19 +101,10 @@ class HardwareStation(Station):
         builder.Connect(subscriber.get_output_port(), status.get_input_port())
         builder.Connect(status.get_position_measured_output_port(), state.get_input_port(0))
         builder.Connect(status.get_velocity_estimated_output_port(), state.get_input_port(1))
-        builder.Connect(state.get_output_port(), controller.get_state_input_port())
         builder.Connect(status.get_position_measured_output_port(), wrench.get_positions_input_port())
         builder.Connect(status.get_torque_external_output_port(), wrench.get_external_torque_input_port())
-        builder.Connect(controller.get_torque_output_port(), sender.get_torque_input_port())
-        builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+        builder.Connect(torque, sender.get_torque_input_port())
         builder.Connect(sender.get_output_port(), publisher.get_input_port())
-        builder.ExportInput(controller.get_desired_pose_input_port(), "desired_pose")
-        builder.ExportInput(controller.get_command_time_input_port(), "command_time")
-        builder.ExportOutput(controller.get_pose_output_port(), "pose")
-        builder.ExportOutput(wrench.get_wrench_output_port(), "wrench")
-        builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
-        builder.ExportOutput(controller.get_saturation_output_port(), "saturation")
-        builder.ExportOutput(controller.get_holding_output_port(), "holding")
         builder.BuildInto(self)
 
     def start(self, simulator: Simulator) -> None:
@@ -164,26 +144,18 @@ class SimulatedIiwa(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm))
-        self.plant, self.scene_graph = plant, _ = add_contact_plant(builder, time_step)
-        workcell.add_fixture(plant)
-        self.arm = add_arm(plant, workcell)
-        plant.Finalize()
-        workcell.filter_contacts(plant, self.scene_graph)
-        self.controller_plant, self._controller_arm = controller_model(workcell)
+        self.plant, self.scene_graph, self.arm = add_workcell_plant(
+            builder, workcell, time_step, lambda plant: add_arm(plant, workcell)
+        )
+        self._known = KnownArm(workcell)
         BuildIiwaControl(
-            builder, lcm, plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self.controller_plant
+            builder, lcm, self.plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self._known.plant
         )
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
-        arm = self._controller_arm
-        q = solve_inverse_kinematics(
-            self.controller_plant, arm.target, arm.tool_centre, pose_to_transform(pose), READY_POSTURE
-        )
-        plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.arm.model, q)
-        self.plant.SetVelocities(plant_context, self.arm.model, np.zeros(NUM_JOINTS))
+        self._known.place(self.plant, self.arm.model, context, pose)
 
 
 def serve(robot: SimulatedIiwa, lcm: DrakeLcm, start: np.ndarray, seconds: float, patience: float) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -12,6 +14,7 @@ from pydrake.multibody.tree import (
     PdControllerGains,
     PrismaticJoint,
     RevoluteJoint,
+    RigidBody,
     SpatialInertia,
     UnitInertia,
     WeldJoint,
@@ -24,13 +27,14 @@ from guiderail.diagrams.stations.station import (
     POSE_SIZE,
     Impedance,
     Station,
-    add_contact_plant,
+    add_workcell_plant,
+    add_wrench_sensor,
     export_simulation_ports,
+    export_station_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
-from guiderail.systems.wrench_sensor import WrenchSensor
 
 RAILS = (
     ("x", PrismaticJoint, [1.0, 0.0, 0.0]),
@@ -71,46 +75,40 @@ class RailsStation(Station):
         """
         super().__init__()
         builder = DiagramBuilder()
-        self.plant, self.scene_graph = plant, _ = add_contact_plant(builder, time_step)
-        workcell.add_fixture(plant)
-        self.rails, wrist = _add_rails(plant, workcell, impedance)
-        tool = wrist.child_body()
-        workpiece = workcell.add_workpiece(plant, tool.body_frame())
-        for model in (self.rails, workpiece.model_instance()):
-            plant.set_gravity_enabled(model, False)
-        plant.Finalize()
-        workcell.filter_contacts(plant, self.scene_graph)
+        self.plant, self.scene_graph, carriage = add_workcell_plant(
+            builder, workcell, time_step, lambda plant: _add_rails(plant, workcell, impedance)
+        )
+        plant, self.rails = self.plant, carriage.model
 
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(time_step))
         # The desired pose is the desired state's first half; the desired velocity is zero, so that damping damps.
         desired_state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
         pose = builder.AddNamedSystem("pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)))
         monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
-        sensor = builder.AddNamedSystem(
-            "wrench_sensor",
-            WrenchSensor(
-                plant,
-                wrist,
-                [tool, workpiece],
-                tool.body_frame(),
-                workcell.X_WT.rotation(),
-                time_step,
-                wrench_time_constant,
-            ),
+        wrench = add_wrench_sensor(
+            builder,
+            plant,
+            workcell,
+            carriage.wrist,
+            carriage.tool,
+            carriage.tool[0].body_frame(),
+            wrench_time_constant,
         )
-        sensor.connect(builder, plant)
         builder.Connect(watchdog.get_safe_pose_output_port(), desired_state.get_input_port())
         builder.Connect(pose.get_output_port(), watchdog.get_pose_input_port())
         builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(self.rails))
         builder.Connect(plant.get_state_output_port(self.rails), pose.get_input_port())
         builder.Connect(plant.get_net_actuation_output_port(self.rails), monitor.get_impedance_wrench_input_port())
-        builder.ExportInput(watchdog.get_desired_pose_input_port(), "desired_pose")
-        builder.ExportInput(watchdog.get_command_time_input_port(), "command_time")
-        builder.ExportOutput(pose.get_output_port(), "pose")
-        builder.ExportOutput(sensor.get_wrench_output_port(), "wrench")
-        builder.ExportOutput(monitor.get_contact_force_output_port(), "contact_force")
-        builder.ExportOutput(monitor.get_saturation_output_port(), "saturation")
-        builder.ExportOutput(watchdog.get_holding_output_port(), "holding")
+        export_station_ports(
+            builder,
+            watchdog.get_desired_pose_input_port(),
+            watchdog.get_command_time_input_port(),
+            pose=pose.get_output_port(),
+            wrench=wrench,
+            contact_force=monitor.get_contact_force_output_port(),
+            saturation=monitor.get_saturation_output_port(),
+            holding=watchdog.get_holding_output_port(),
+        )
         export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 
@@ -121,8 +119,17 @@ class RailsStation(Station):
         self.plant.SetVelocities(plant_context, self.rails, np.zeros(POSE_SIZE))
 
 
-def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) -> tuple[ModelInstanceIndex, WeldJoint]:
-    """Adds the rails and, behind a wrist that the sensor measures at, the tool; returns their model and the wrist."""
+@dataclass(frozen=True)
+class _Carriage:
+    """What moves on the rails; behind its wrist hang the tool and the workpiece."""
+
+    model: ModelInstanceIndex
+    wrist: WeldJoint
+    tool: list[RigidBody]
+
+
+def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) -> _Carriage:
+    """Adds the rails and, behind a wrist that the sensor measures at, the tool with the workpiece, all weightless."""
     model = plant.AddModelInstance("rails")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
@@ -137,4 +144,8 @@ def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) 
         parent = link.body_frame()
     inertia = UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS))
     tool = plant.AddRigidBody("tool_centre", model, SpatialInertia(CARRIAGE_MASS, np.zeros(3), inertia))
-    return model, plant.WeldFrames(parent, tool.body_frame())
+    wrist = plant.WeldFrames(parent, tool.body_frame())
+    workpiece = workcell.add_workpiece(plant, tool.body_frame())
+    for weightless in (model, workpiece.model_instance()):
+        plant.set_gravity_enabled(weightless, False)
+    return _Carriage(model, wrist, [tool, workpiece])

@@ -30,15 +30,22 @@ task is done. T lies still in the world, where the *nominal* fixture wants it: a
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.multibody.tree import Frame, RigidBody, WeldJoint
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
+from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
+from guiderail.systems.wrench_sensor import WrenchSensor
+
+Robot = TypeVar("Robot")
 
 POSE_SIZE = 6
 PLANT_PERIOD = exact_period(0.005)  # [s]
@@ -115,6 +122,61 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
         use_sampled_output_ports=False,
     )
     return AddMultibodyPlant(config, builder)
+
+
+def add_workcell_plant(
+    builder: DiagramBuilder, workcell: Workcell, time_step: float, add_robot: Callable[[MultibodyPlant], Robot]
+) -> tuple[MultibodyPlant, SceneGraph, Robot]:
+    """A finalized plant with the workcell's fixture, and the robot that `add_robot` adds with the workpiece."""
+    plant, scene_graph = add_contact_plant(builder, time_step)
+    workcell.add_fixture(plant)
+    robot = add_robot(plant)
+    plant.Finalize()
+    workcell.filter_contacts(plant, scene_graph)
+    return plant, scene_graph, robot
+
+
+def add_wrench_sensor(
+    builder: DiagramBuilder,
+    plant: MultibodyPlant,
+    workcell: Workcell,
+    wrist: WeldJoint,
+    tool: list[RigidBody],
+    tool_centre: Frame,
+    time_constant: float,
+) -> OutputPort:
+    """Adds a sensor at the wrist, behind which `tool` hangs; returns the wrench as a station exports it."""
+    axes = workcell.X_WT.rotation()
+    sensor = WrenchSensor(plant, wrist, tool, tool_centre, axes, plant.time_step(), time_constant)
+    builder.AddNamedSystem("wrench_sensor", sensor)
+    sensor.connect(builder, plant)
+    return sensor.get_wrench_output_port()
+
+
+def force_first(values: Sequence[float]) -> np.ndarray:
+    """What is ordered as a pose is, [x y z Rz Ry Rx], as a wrench is: [x y z Rx Ry Rz]."""
+    return np.array(values)[[0, 1, 2, 5, 4, 3]]
+
+
+def export_station_ports(
+    builder: DiagramBuilder,
+    desired_pose: InputPort,
+    command_time: InputPort,
+    *,
+    pose: OutputPort,
+    wrench: OutputPort,
+    contact_force: OutputPort,
+    saturation: OutputPort,
+    holding: OutputPort,
+) -> None:
+    """Exports the ports of the table above."""
+    builder.ExportInput(desired_pose, "desired_pose")
+    builder.ExportInput(command_time, "command_time")
+    builder.ExportOutput(pose, "pose")
+    builder.ExportOutput(wrench, "wrench")
+    builder.ExportOutput(contact_force, "contact_force")
+    builder.ExportOutput(saturation, "saturation")
+    builder.ExportOutput(holding, "holding")
 
 
 def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
