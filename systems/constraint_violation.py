@@ -11,6 +11,7 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.primitives import LinearConstraints
+from guiderail.systems.sampling import check_period
 
 
 class ConstraintViolation(LeafSystem):
@@ -42,8 +43,7 @@ class ConstraintViolation(LeafSystem):
             ValueError: if the period is not positive.
         """
         super().__init__()
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
+        check_period(period)
         self._constraints, self._period = constraints, period
         self._pose_port = self.DeclareVectorInputPort("pose", constraints.num_outputs)
         tickets = {self._pose_port.ticket()}

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
 from guiderail.systems.caching import declare_array_cache
+from guiderail.systems.sampling import check_period
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """How an episode can end; a `termination` port carries an index into this. The empty one means: it goes on."""
@@ -72,8 +73,7 @@ class EpisodeMonitor(LeafSystem):
         super().__init__()
         if not conditions:
             raise ValueError("a monitor needs at least one condition")
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
+        check_period(period)
         self._conditions = tuple(conditions)
         self._indices = [TERMINATIONS.index(condition.termination) for condition in conditions]
         sizes: dict[str, int] = {}

@@ -3,6 +3,8 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
+from guiderail.systems.sampling import check_period
+
 
 class HistoryBuffer(LeafSystem):
     """Remembers the last P outputs, so that sKGRL can pass through where it has been.
@@ -38,8 +40,7 @@ class HistoryBuffer(LeafSystem):
         super().__init__()
         if num_outputs < 1 or length < 1:
             raise ValueError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
+        check_period(period)
         self._shape = (length, num_outputs)
 
         self._output_port = self.DeclareVectorInputPort("output", num_outputs)

@@ -1,15 +1,9 @@
 """Contact forces as a control step sees them."""
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    EventStatus,
-    InputPort,
-    LeafSystem,
-    OutputPort,
-)
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
+
+from guiderail.systems.sampling import declare_sample
 
 
 class MeanForce(LeafSystem):
@@ -44,13 +38,9 @@ class MeanForce(LeafSystem):
         super().__init__()
         if size < 1 or substeps < 1:
             raise ValueError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
         self._scale = 1.0 / substeps
         self._sum_port = self.DeclareVectorInputPort("force_sum", size)
-        self._last = self.DeclareDiscreteState(size)
-        self.DeclareInitializationDiscreteUpdateEvent(self._sample)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        self._last = declare_sample(self, self._sum_port, period)
         tickets = {self._sum_port.ticket(), self.discrete_state_ticket(self._last)}
         self._force_port = self.DeclareVectorOutputPort("force", size, self._calc_force, tickets)
         self._magnitude_port = self.DeclareVectorOutputPort("magnitude", 1, self._calc_magnitude, tickets)
@@ -66,10 +56,6 @@ class MeanForce(LeafSystem):
     def get_magnitude_output_port(self) -> OutputPort:
         """The norm of the mean force, (1,), N."""
         return self._magnitude_port
-
-    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._sum_port.Eval(context))
-        return EventStatus.Succeeded()
 
     def _mean(self, context: Context) -> np.ndarray:
         return (self._sum_port.Eval(context) - context.get_discrete_state(self._last).value()) * self._scale

@@ -6,6 +6,8 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem, OutputPort
 
+from guiderail.systems.sampling import check_period
+
 DEAD_ZONE = 0.1
 """A stick that nobody touches is rarely at zero."""
 
@@ -37,8 +39,7 @@ class MeshcatDevice(LeafSystem):
             ValueError: if the period is not positive, or axes and keys are not as many.
         """
         super().__init__()
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
+        check_period(period)
         if len(axes) != len(keys) or not axes:
             raise ValueError(f"a device needs as many axes as pairs of keys, not {len(axes)} and {len(keys)}")
         self._meshcat, self._axes = meshcat, tuple(axes)

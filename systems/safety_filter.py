@@ -1,18 +1,11 @@
 """Stops commands before they become a collision."""
 
 import numpy as np
-from pydrake.systems.framework import (
-    BasicVector,
-    Context,
-    DiscreteValues,
-    EventStatus,
-    InputPort,
-    LeafSystem,
-    OutputPort,
-)
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.keep_out import KeepOut
 from guiderail.systems.caching import declare_array_cache
+from guiderail.systems.sampling import declare_sample
 
 
 class SafetyFilter(LeafSystem):
@@ -43,15 +36,11 @@ class SafetyFilter(LeafSystem):
             ValueError: if the period is not positive.
         """
         super().__init__()
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
         self._keep_out = keep_out
         outputs = keep_out.num_outputs
         self._desired_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
-        self._sampled = self.DeclareDiscreteState(outputs)
-        self.DeclareInitializationDiscreteUpdateEvent(self._sample)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
+        self._sampled = declare_sample(self, self._pose_port, period)
         self._safe = declare_array_cache(
             self,
             "safe",
@@ -77,10 +66,6 @@ class SafetyFilter(LeafSystem):
     def get_intervention_output_port(self) -> OutputPort:
         """1 where a box changed the command, (1,)."""
         return self._intervention_port
-
-    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._pose_port.Eval(context))
-        return EventStatus.Succeeded()
 
     def _calc(self, context: Context) -> np.ndarray:
         position = context.get_discrete_state(self._sampled).value()

@@ -11,6 +11,8 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
+from guiderail.systems.sampling import check_period
+
 _INPUTS = ("commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "fallback")
 
 # The state: worst commanded and measured violation, peak force, sum of forces, collisions, steps in collision,
@@ -66,8 +68,7 @@ class SafetyLedger(LeafSystem):
             ValueError: if an argument is out of range.
         """
         super().__init__()
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
+        check_period(period)
         if num_actuators < 1:
             raise ValueError(f"a robot has at least one actuator, not {num_actuators}")
         self._ports = [

@@ -8,6 +8,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
+from guiderail.systems.sampling import check_period
 from guiderail.systems.skill_frames import SkillFrames
 
 
@@ -44,8 +45,7 @@ class SctInputMapping(LeafSystem):
             ValueError: if the period is not positive, or a frame is missing.
         """
         super().__init__()
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
+        check_period(period)
         self._skill = skill
         self._period = period
         self.frames = SkillFrames(self, skill, frames)

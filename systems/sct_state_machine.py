@@ -7,6 +7,7 @@ from pydrake.systems.framework import Context, DiscreteValues, EventStatus, Inpu
 
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.skills.skill import Skill
+from guiderail.systems.sampling import check_period
 from guiderail.systems.skill_frames import SkillFrames
 
 
@@ -46,8 +47,7 @@ class SctStateMachine(LeafSystem):
             ValueError: if the period is not positive, or a frame is missing.
         """
         super().__init__()
-        if not period > 0:
-            raise ValueError(f"the control period must be positive, not {period} s")
+        check_period(period)
         self._skill = skill
         self.frames = SkillFrames(self, skill, frames)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
