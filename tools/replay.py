@@ -20,6 +20,7 @@ from guiderail.tools.run_folder import RunFolder
 from guiderail.tools.scenes import Camera, scene
 
 FRAMES_PER_SECOND = 32.0
+SEEN_THROUGH = 0.35  # opacity of everything but paths, for who asks for it
 REPETITIONS = 1000  # of the motion, before it rests
 OTHER_PATHS = 5  # held-out episodes whose paths are drawn beside the one that is shown
 
@@ -177,16 +178,18 @@ def _with_caption(page: str, episode: Shown, row: dict[str, Any], drawn: set[str
 
 
 def _buttons(views: Mapping[str, Camera]) -> str:
-    """A button for each view; Meshcat's own camera lives in a frame whose y is up."""
-    if not views:
-        return ""
-    look = (
+    """A button that lets one see the paths within things, and one for each view."""
+    # Meshcat's own camera lives in a frame whose y is up. What is opaque is asked of whatever is on the page by then.
+    script = (
         "<script>function look(eye, target) {"
         "viewer.set_property(['Cameras', 'default', 'rotated', '<object>'], 'position', eye);"
-        "viewer.set_camera_target(target);}</script>"
+        "viewer.set_camera_target(target);}"
+        "function see(button) {var through = button.dataset.through != 'yes';"
+        "button.dataset.through = through ? 'yes' : 'no';"
+        f"viewer.set_property(['drake', 'visualizer'], 'modulated_opacity', through ? {SEEN_THROUGH} : 1);}}</script>"
     )
-    buttons = (
+    looks = (
         f'<button onclick="look({", ".join(str([x, z, -y]) for x, y, z in camera)})">{escape(name)}</button> '
         for name, camera in views.items()
     )
-    return f"<div>look at {''.join(buttons)}</div>{look}"
+    return f'<div>{"".join(looks)}<button onclick="see(this)">see through</button></div>{script}'

@@ -77,7 +77,7 @@ def _bnc_connector() -> Scene:
     square = ALIGNMENT * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     rings = [np.column_stack([square, np.full(5, height)]) for height in (0.0, 0.015)]
     edges = [np.array([[x, y, 0.0], [x, y, 0.015]]) for x, y in square[:4]]
-    eye, target = to_world(np.array([[0.025, -0.035, 0.022], [0.0, 0.0, 0.008]]))
+    eye, target = to_world(np.array([[0.025, -0.035, 0.026], [0.0, 0.0, 0.012]]))
     near: Camera = (tuple(eye.tolist()), tuple(target.tolist()))
     return Scene(
         to_world=to_world,
