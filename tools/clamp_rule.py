@@ -29,6 +29,7 @@ PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # [N], [m/s] while it searches
 SNAP_FORCE = 12.0  # [N] that it snaps in with at most
 HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0  # [m/s/N] of force, the same, and [1/s] of distance
 SPEED = make_skill().parameters["speed_m_per_s"]  # of a full input
+LIFT = make_skill().parameters["lift"]  # part of it, upwards
 STIFFNESS = Impedance().stiffness[0]
 
 
@@ -49,7 +50,8 @@ def searching_rule(observation: np.ndarray) -> np.ndarray:
         velocity = np.array([*_along_lanes(command[:2]), HEIGHT_GAIN * (force[2] - PRESS)])
     else:
         velocity = np.array([*(YIELD_GAIN * force[:2]), HEIGHT_GAIN * (force[2] - SNAP_FORCE)])
-    return np.clip(velocity / SPEED, -1.0, 1.0)
+    speeds = np.array([SPEED, SPEED, LIFT * SPEED if velocity[2] > 0.0 else SPEED])
+    return np.clip(velocity / speeds, -1.0, 1.0)
 
 
 def _along_lanes(xy: np.ndarray) -> np.ndarray:

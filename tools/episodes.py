@@ -102,6 +102,7 @@ class EpisodeRecord:
             "steps": len(trace),
             "peak_force": float(ledger.get("peak_force", force.max(initial=0.0))),
             "mean_force": float(ledger.get("mean_force", force.mean() if len(force) else 0.0)),
+            "mean_squared_force": float(np.mean(force**2)) if len(force) else 0.0,
             **jerk,
             "worst_violation": float(ledger.get("worst_commanded_violation", self._violation)),
             "worst_measured_violation": float(ledger.get("worst_measured_violation", self._measured)),

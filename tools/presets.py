@@ -57,6 +57,20 @@ PRESETS = {
         symmetry=True,
         averaging=0.01,
     ),
+    # Measured on the grid clamp with SAC. A cost of force is known long before a success is: an entropy that is worth 1
+    # at first keeps the policy from staying away from all contact.
+    "clamp": Preset(
+        algorithm="sac",
+        learning_rate=7e-4,
+        discount=0.98,
+        discount_of="decision",
+        train_every=4,
+        gradient_steps=16,
+        learning_starts=200,
+        entropy="auto_1.0",
+        units=(128, 128),
+        averaging=0.01,
+    ),
     # Cheap enough to watch: the narrow passage within a minute.
     "quick": _QUICK,
     # The same, but the first episodes each keep to one random action. sKGRL reacts slowly: actions drawn anew at every

@@ -89,6 +89,31 @@ def _bnc_connector() -> Scene:
     )
 
 
+def _grid_clamp() -> Scene:
+    from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
+    from guiderail.diagrams.tasks.grid_clamp import make_skill
+
+    X_WT, parameters = GridClampWorkcell().X_WT, make_skill().parameters
+
+    def to_world(poses: np.ndarray) -> np.ndarray:
+        return X_WT.multiply(np.asarray(poses)[:, :3].T).T
+
+    # The cuboid, as high as the clamp begins.
+    square = 0.5 * parameters["width_m"] * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    low, high = -parameters["push_m"], 0.025
+    rings = [np.column_stack([square, np.full(5, height)]) for height in (low, high)]
+    edges = [np.array([[x, y, low], [x, y, high]]) for x, y in square[:4]]
+    eye, target = to_world(np.array([[0.09, -0.13, 0.075], [0.0, 0.0, 0.014]]))
+    near: Camera = (tuple(eye.tolist()), tuple(target.tolist()))
+    return Scene(
+        to_world=to_world,
+        constraint=tuple(to_world(line) for ring in rings for line in _sides(ring)) + tuple(to_world(e) for e in edges),
+        camera=near,
+        arm_views={"the clamp": near, "the arm": ARM_VIEW},
+        line_radius=0.0001,
+    )
+
+
 def _pouring() -> Scene:
     from guiderail.diagrams.stations.pouring import PouringConfig
 
@@ -108,6 +133,7 @@ def _sides(corners: np.ndarray) -> list[np.ndarray]:
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "BncConnector": _bnc_connector,
+    "GridClamp": _grid_clamp,
     "NarrowPassage": _narrow_passage,
     "Pouring": _pouring,
 }

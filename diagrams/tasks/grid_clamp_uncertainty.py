@@ -8,9 +8,9 @@ from guiderail.diagrams.tasks.offsets import MM, HiddenOffsets, in_ring
 
 NUM_PLACES = 6  # where clamps are picked up
 # Parallel jaws centre what they close on; along the jaws, which is x, a clamp stays where it happened to be.
-ALONG_JAWS = 2.3 * MM  # the six places' offsets spread over ± this
+ALONG_JAWS = 1.0 * MM  # the six places' offsets spread over ± this
 ACROSS_JAWS = 0.2 * MM
-CALIBRATION = (1.0 * MM, 1.3 * MM)  # least and largest error of the hole's place
+CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest error of the hole's place
 REPEATABILITY = 0.1 * MM  # of one pick-up place
 KNOWN_RADIUS = 0.15 * MM
 
@@ -18,7 +18,7 @@ KNOWN_RADIUS = 0.15 * MM
 class GridClampUncertainty(HiddenOffsets):
     """Draws the offsets of table and clamp; `HiddenOffsets` has the options of a reset.
 
-    - "calibration": the table is off by 1.0 to 1.3 mm in one direction, and each of six pick-up places has a grasp
+    - "calibration": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp
       offset of its own, all hidden and the same for a whole run. An episode picks up at one of the places, drawn, with
       a repeatability of 0.1 mm. The thesis's case.
     - "disc": the error of the table and the six grasp offsets are drawn anew every episode.

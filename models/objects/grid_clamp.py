@@ -35,11 +35,11 @@ class GridClampDimensions:
 
     peg_radius: float = 4.0 * MM
     peg_length: float = 12.0 * MM  # from the shoulder to the tip
-    peg_chamfer: float = 0.2 * MM
+    peg_chamfer: float = 0.6 * MM
     spacing: float = 20.0 * MM  # of the four outer pegs from the middle one, along x and along y
 
     hole_radius: float = 4.15 * MM
-    hole_chamfer: float = 0.2 * MM
+    hole_chamfer: float = 0.5 * MM
     hole_land: float = 3.0 * MM  # the wall's part that a peg touches: below, the hole is relieved
     hole_depth: float = 13.0 * MM
     face_radius: float = 14.0 * MM  # of the part of the table's face that a peg beside its hole stands on

@@ -149,3 +149,31 @@ class Scaled(InputMapping):
         distance = float(np.linalg.norm(position_in(self.frame, X_WE, frames)))
         factor = interpolate(distance, self.distance_m, self.factor)
         return self.of.displacement(factor * inputs, X_WE, frames, period_s)
+
+
+@register(INPUT_MAPPINGS, "uneven")
+@dataclass(frozen=True)
+class Uneven(InputMapping):
+    """Another mapping, its inputs above and below zero multiplied by factors: one way slower than the other.
+
+    Zero still is to stand still, but inputs without a preference lead the faster way on average: what explores at
+    random otherwise walks away from a goal as often as towards it.
+    """
+
+    above: float  # in (0, 1]
+    below: float  # in (0, 1]
+    of: InputMapping
+
+    def __post_init__(self):
+        require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")
+
+    @property
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.of.used_inputs
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        return self.of.frame_names
+
+    def displacement(self, inputs, X_WE, frames, period_s):
+        return self.of.displacement(np.where(inputs < 0.0, self.below, self.above) * inputs, X_WE, frames, period_s)

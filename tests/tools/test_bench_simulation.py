@@ -1,4 +1,7 @@
+import pytest
+
 from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.tools import bench_simulation
 from guiderail.tools.bench_simulation import CALLBACKS, real_time_factor, timed_callbacks
 
 
@@ -9,9 +12,11 @@ def test_systems_are_left_as_they_were():
     assert [getattr(system, name) for system, name in CALLBACKS] == before
 
 
-def test_pythons_share_is_a_part_of_the_whole(monkeypatch):
+@pytest.mark.parametrize(("task", "contact"), [("BncConnector", "CONTACT"), ("GridClamp", "CLAMP_CONTACT")])
+def test_pythons_share_is_a_part_of_the_whole(monkeypatch, task, contact):
     monkeypatch.setattr("guiderail.tools.bench_simulation.REPEATS", 1)
-    monkeypatch.setattr("guiderail.tools.bench_simulation.CONTACT", (3.8, 4.6))
-    result = real_time_factor("rails")
+    first, _ = getattr(bench_simulation, contact)
+    monkeypatch.setattr(f"guiderail.tools.bench_simulation.{contact}", (first, first + 0.8))
+    result = real_time_factor("rails", task)
     assert result["real_time_factor"] > 0.0
     assert 0.0 < result["python_share"] < 1.0

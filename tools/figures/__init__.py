@@ -13,6 +13,8 @@ FIGURES = {
     "3.5": ("pouring", "figure_3_5"),
     "3.6": ("pouring", "figure_3_6"),
     "3.8": ("pouring", "figure_3_8"),
+    "3.10": ("grid_clamp", "figure_3_10"),
+    "3.11": ("grid_clamp", "figure_3_11"),
     "4.2": ("properties", "figure_4_2"),
     "4.4": ("baselines", "figure_4_4"),
     "4.5": ("baselines", "figure_4_5"),

@@ -7,10 +7,19 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import guiderail.diagrams  # noqa: F401 (registers)
-from guiderail.diagrams.tasks.grid_clamp import COLLISION_FORCE, GUIDANCE, MM, make_env, make_skill
+from guiderail.diagrams.tasks.grid_clamp import (
+    CENTRE,
+    COLLISION_FORCE,
+    GUIDANCE,
+    LEASH,
+    MM,
+    SCALE,
+    make_env,
+    make_skill,
+)
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.models.errors import InputError
-from guiderail.tools.clamp_rule import searching_rule, straight_descent, trials
+from guiderail.tools.clamp_rule import STIFFNESS, searching_rule, straight_descent, trials
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -55,19 +64,19 @@ def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
     assert info["ledger"]["peak_force"] <= 10.0
     assert total == pytest.approx(sum(terms.values()))
     assert terms["terminal_reward"] == 50.0
-    # What it came down is what it is paid for, 300 a metre, from 45 to 55 mm.
-    assert 300.0 * 0.044 < terms["shaping"] < 300.0 * 0.055
+    # What it came down is what it is paid for, 300 a metre, from 15 to 18 mm.
+    assert 300.0 * 0.014 < terms["shaping"] < 300.0 * 0.0185
 
 
 def test_the_straight_descent_mostly_fails_where_the_offset_is_drawn(env):
-    """Pushed with 27 N for the whole 15 s. `python -m guiderail.tools.clamp_rule --trials 50` asks more often."""
-    successes, peak = trials(env, straight_descent, 3, seed=3)
+    """Pushed with 12 N for the whole 10 s. `python -m guiderail.tools.clamp_rule --trials 50` asks more often."""
+    successes, peak = trials(env, straight_descent, 3, seed=1)
     assert successes == 0
-    assert peak < COLLISION_FORCE
+    assert peak < 1.2 * LEASH * STIFFNESS
 
 
 def test_the_searching_rule_inserts_where_the_straight_descent_fails(env):
-    successes, peak = trials(env, searching_rule, 4, seed=3)
+    successes, peak = trials(env, searching_rule, 4, seed=1)
     assert successes == 4
     assert peak < 15.0
 
@@ -95,6 +104,8 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
     assert np.abs(commanded[:, 3:]).max() <= 1e-9
     assert info["ledger"]["worst_commanded_violation"] <= 1e-9
     assert info["termination"] != "collision"
+    if guidance != "residual":  # whose command comes down whatever is in the way
+        assert info["ledger"]["peak_force"] < 1.2 * LEASH * STIFFNESS
 
 
 def test_without_the_cuboid_a_push_is_a_collision():
@@ -116,18 +127,19 @@ def test_force_costs_unless_it_is_left_out(known):
 def test_an_observation_is_position_and_force(env):
     """Pressed on the table beside the holes: the height of the pegs, and the force that bears them."""
     env.reset(seed=0, options={"offset": (0.0025, 0.001)})
-    for _ in range(22):
+    for _ in range(8):
         observation, _, _, _, info = env.step(DOWN)
-    assert 15.0 * MM * (observation[2] + 1) == pytest.approx(12.0 * MM, abs=0.1 * MM)
-    assert 10.0 * observation[5] == pytest.approx(info["contact_force"], rel=0.25)
-    assert observation[5] > 0.5
+    position, force = (SCALE * observation + CENTRE)[[2, 5]]
+    assert position == pytest.approx(12.0 * MM, abs=0.1 * MM)
+    assert force == pytest.approx(info["contact_force"], rel=0.25)
+    assert force > 5.0
 
 
 def test_the_same_seed_is_the_same_episode_bit_for_bit(env):
-    actions = np.random.default_rng(0).uniform(-1, 1, (30, 3)) - [0, 0, 0.7]
+    actions = np.random.default_rng(0).uniform(-1, 1, (12, 3)) - [0, 0, 0.3]
     runs = []
     for _ in range(2):
-        observation, drawn = env.reset(seed=11, options={"new_run": True})
+        observation, drawn = env.reset(seed=12, options={"new_run": True})
         steps = [observation] + [env.step(action)[0] for action in actions]
         runs.append((np.array(steps), drawn["grasp_offset"], drawn["table_offset"]))
     for first, second in zip(*runs, strict=True):
@@ -141,8 +153,8 @@ def test_checkers_are_content():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_the_arm_inserts_too(arm, seed):
-    """At half the speed: an arm that descends faster is pulled sideways by more than a chamfer leads back."""
-    info, _, _ = play(arm, lambda _: 0.5 * DOWN, seed=seed)
+    """At 12 mm/s: an arm that descends faster is pulled sideways by more than a chamfer leads back."""
+    info, _, _ = play(arm, lambda _: 0.3 * DOWN, seed=seed)
     assert info["is_success"]
     assert info["ledger"]["peak_force"] <= 10.0
     assert info["ledger"]["collisions"] == 0
@@ -155,10 +167,10 @@ class TestUncertainty:
             np.array(column) for column in zip(*[uncertainty.draw(rng, {}) for _ in range(60)], strict=True)
         )
         assert (tables == tables[0]).all()
-        assert 1.0 * MM <= np.linalg.norm(tables[0]) <= 1.3 * MM
+        assert 1.8 * MM <= np.linalg.norm(tables[0]) <= 2.2 * MM
         # Pick-ups at one place lie within its repeatability; sorted along the jaws, six places show.
         gaps = np.diff(np.sort(grasps[:, 0]))
-        assert 2.0 * MM < np.ptp(grasps[:, 0]) < 4.8 * MM
+        assert 0.8 * MM < np.ptp(grasps[:, 0]) < 2.4 * MM
         assert (gaps > 0.2 * MM).sum() <= 5
 
     @pytest.mark.parametrize("kind", ["calibration", "disc", "known"])

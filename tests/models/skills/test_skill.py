@@ -69,6 +69,12 @@ def test_scaled_slows_down_near_the_object():
     np.testing.assert_allclose(speeds, [0.2, 0.6, 1.0])
 
 
+def test_uneven_leads_one_way_on_average():
+    mapping = im.Uneven(above=0.4, below=1.0, of=im.Translation((0,), 1.0, axes=((0.0, 0.0, 1.0),)))
+    speeds = [mapping.displacement(np.array([u]), RigidTransform(), {}, 1.0).translation()[2] for u in (-1, 0, 0.5, 1)]
+    np.testing.assert_allclose(speeds, [-1.0, 0.0, 0.2, 0.4])
+
+
 def test_inputs_beyond_one_are_one(pouring):
     X_WE = in_mug([0.0, -0.3, 0.1])
     one = pouring.map(0, np.array([1.0, -1.0, 0.0]), X_WE, MUG, PERIOD)

@@ -1,0 +1,197 @@
+"""Who learns to insert the grid clamp, how soon, and with how much force: `python -m guiderail.tools.clamp_study`.
+
+Policies that learned with and without the cost of force, others' guidance, the straight descent and a rule written by
+hand meet the same held-out offsets. Each seed has a row of its own: what failed on one is not averaged away. A study
+that was interrupted goes on where it was.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+from guiderail.tools.clamp_rule import searching_rule, straight_descent
+from guiderail.tools.episodes import make_environment, run_episode
+from guiderail.tools.files import write_atomically
+from guiderail.tools.policy import Policy
+from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after, read_table, table_text
+from guiderail.tools.study import write_table
+from guiderail.tools.train import train
+from guiderail.tools.training import configure
+
+TASK, ALGORITHM, PRESET = "GridClamp", "sac", "clamp"
+LEARNED: dict[str, dict[str, Any]] = {
+    "sct": {"guidance": "sct", "reward": "shaped"},
+    "sct_no_force": {"guidance": "sct", "reward": "no_force"},
+    "residual": {"guidance": "residual", "reward": "shaped"},
+    "none": {"guidance": "none", "reward": "shaped"},
+}
+UNLEARNED: dict[str, Callable[[np.ndarray], np.ndarray]] = {"straight": straight_descent, "rule": searching_rule}
+HELD_OUT_SEED = 1_000_000
+VIOLATION = 1e-9  # [m] more than this outside of the cuboid counts
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method, one seed."""
+
+    method: str
+    uncertainty: str
+    seed: int
+    episodes: int
+    evaluations: int
+
+    def config(self) -> RunConfig:
+        """Its run."""
+        environment = {**LEARNED.get(self.method, LEARNED["sct"]), "uncertainty": self.uncertainty}
+        return configure(TASK, environment, algorithm=ALGORITHM, preset=PRESET, episodes=self.episodes, seed=self.seed)
+
+
+def clamp_study(
+    out: Path,
+    *,
+    methods: Sequence[str] = ("straight", "rule", "sct", "sct_no_force"),
+    uncertainty: str = "calibration",
+    seeds: Sequence[int] = (10, 11, 12),
+    episodes: int = 50,
+    evaluations: int = 100,
+    report: Callable[[dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
+    """Trains, judges, and writes `clamp-<uncertainty>.csv` and `.md`.
+
+    Args:
+        out: the folder; runs in it are used again.
+        methods: of `UNLEARNED` and `LEARNED`.
+        uncertainty: "calibration" or "disc".
+        seeds: of the runs, and with them of the hidden offsets.
+        episodes: of training.
+        evaluations: held-out episodes afterwards.
+        report: called with each row.
+
+    Raises:
+        InputError: for an unknown method, a number out of range, or a folder that holds other runs.
+    """
+    unknown = [method for method in methods if method not in (*LEARNED, *UNLEARNED)]
+    if unknown:
+        raise InputError(f"there is no method {unknown[0]!r}: choose of {', '.join((*UNLEARNED, *LEARNED))}")
+    if episodes < 1 or evaluations < 1 or not seeds or not methods:
+        raise InputError("a study of the grid clamp needs methods, seeds, training episodes and held-out ones")
+    rows = []
+    for seed in seeds:
+        for method in methods:
+            rows.append(judge(Cell(method, uncertainty, seed, episodes, evaluations), out))
+            if report is not None:
+                report(rows[-1])
+    table = write_table(out / f"clamp-{uncertainty}", rows)
+    by_method = {method: [row for row in rows if row["method"] == method] for method in methods}
+    result: dict[str, Any] = {"table": str(table), "rows": len(rows)}
+    for method, of_seeds in by_method.items():
+        result[f"{method}, held-out success of each seed"] = ", ".join(
+            f"{row['held_out_success']:.0%}" for row in of_seeds
+        )
+    if {"sct", "sct_no_force"} <= set(methods):
+        pairs = zip(by_method["sct"], by_method["sct_no_force"], strict=True)
+        result["squared force in training, with its cost as a part of without, each seed"] = ", ".join(
+            f"{a['training_squared_force'] / b['training_squared_force']:.2f}" for a, b in pairs
+        )
+    return result
+
+
+def judge(cell: Cell, out: Path) -> dict[str, Any]:
+    """The row of a cell, trained and judged where it is not yet."""
+    folder = RunFolder(out / f"{cell.method}-{cell.uncertainty}-{cell.seed}")
+    trained: list[dict[str, Any]] = []
+    if cell.method in LEARNED:
+        begun = (folder.path / "config.yaml").exists()
+        if begun:
+            _refuse_another(folder, cell)
+        finished = begun and (folder.path / "policy.json").exists()
+        trained = folder.episodes() if finished else train(folder, cell.config(), resume=begun)
+    return _row(cell, trained, _held_out(cell, folder))
+
+
+def _refuse_another(folder: RunFolder, cell: Cell) -> None:
+    """A run with other settings is neither trained further nor judged as if it were this one."""
+    found, wanted = folder.config(), cell.config()
+    for key in ("environment", "learner", "seed", "episodes"):
+        if getattr(found, key) != getattr(wanted, key):
+            raise InputError(f"{folder.path} holds a run with another {key}: name another folder with --out")
+
+
+def _held_out(cell: Cell, folder: RunFolder) -> list[dict[str, Any]]:
+    """Rows of held-out episodes, from the file where they are known already."""
+    file = folder.path / f"held_out-{cell.evaluations}.csv"
+    if file.exists():
+        return read_table(file)
+    config = cell.config()
+    env = make_environment(config.task, config.environment)
+    env.reset(seed=cell.seed)  # the hidden offsets of this run
+    act = UNLEARNED.get(cell.method) or Policy.load(folder.path)
+    rows = [run_episode(env, act, held_out_seed=HELD_OUT_SEED + i, episode=i) for i in range(cell.evaluations)]
+    env.close()
+    write_atomically(file, table_text(rows).encode())
+    return rows
+
+
+def _row(cell: Cell, trained: Sequence[dict[str, Any]], judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What a cell came to. A mean squared force is an episode's, over its control steps; then over episodes."""
+
+    def mean(rows: Sequence[dict[str, Any]], key: str) -> float | None:
+        return float(np.mean([row[key] for row in rows])) if rows else None
+
+    def worst(rows: Sequence[dict[str, Any]], key: str) -> float | None:
+        return float(np.max([row[key] for row in rows])) if rows else None
+
+    converged = converged_after(bool(row["success"]) for row in trained)
+    return {
+        "method": cell.method,
+        "uncertainty": cell.uncertainty,
+        "seed": cell.seed,
+        "episodes": len(trained),
+        "held_out_success": mean(judged, "success"),
+        "held_out_squared_force": mean(judged, "mean_squared_force"),
+        "held_out_peak_force": worst(judged, "peak_force"),
+        "held_out_steps": mean(judged, "steps"),
+        "held_out_return": mean(judged, "return"),
+        "converged_after": converged,
+        "training_success": mean(trained, "success"),
+        "training_squared_force": mean(trained, "mean_squared_force"),
+        "squared_force_since_converged": None if converged is None else mean(trained[converged:], "mean_squared_force"),
+        "training_peak_force": worst(trained, "peak_force"),
+        "episodes_commanded_outside": sum(row["worst_violation"] > VIOLATION for row in (*trained, *judged)),
+        "worst_violation": worst([*trained, *judged], "worst_violation"),
+        "collisions": sum(row["collisions"] for row in (*trained, *judged)),
+        "training_steps": sum(row["steps"] for row in trained) if trained else None,
+        "training_seconds": float(sum(row["wall_time"] for row in trained)) if trained else None,
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Prints a line for every row, and what they come to."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="the folder; runs in it are used again")
+    parser.add_argument("--methods", default="straight,rule,sct,sct_no_force", help="separated by commas")
+    parser.add_argument("--uncertainty", default="calibration", help="calibration or disc")
+    parser.add_argument("--seeds", default="10,11,12", help="separated by commas")
+    parser.add_argument("--episodes", type=int, default=50, help="of training")
+    parser.add_argument("--evaluations", type=int, default=100, help="held-out episodes afterwards")
+    given = parser.parse_args(arguments)
+    result = clamp_study(
+        given.out,
+        methods=given.methods.split(","),
+        uncertainty=given.uncertainty,
+        seeds=[int(seed) for seed in given.seeds.split(",")],
+        episodes=given.episodes,
+        evaluations=given.evaluations,
+        report=lambda row: print(json.dumps(row), flush=True),
+    )
+    print(json.dumps(result, indent=2, ensure_ascii=False))
+
+
+if __name__ == "__main__":
+    main()
