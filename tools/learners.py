@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
@@ -20,6 +21,7 @@ from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.task import Symmetry
 from guiderail.tools.presets import ALGORITHMS, Preset, decision_discount
+from guiderail.tools.proving import Proving
 
 IMAGE_POOL = 5  # pixels; 110×144×3 becomes 22×28×3
 
@@ -46,6 +48,16 @@ class PooledImage(BaseFeaturesExtractor):
         return torch.nn.functional.avg_pool2d(observations, self.pool).flatten(1)
 
 
+class NormalizedReLU(torch.nn.Module):
+    """A layer's outputs, normalized without learned parameters, and rectified."""
+
+    kind = "normalized_relu"
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """(…, units) to the same shape."""
+        return torch.relu(torch.nn.functional.layer_norm(features, features.shape[-1:]))
+
+
 class Learner:
     """An off-policy algorithm of Stable-Baselines3 that is told when to act, to remember and to learn."""
 
@@ -69,9 +81,10 @@ class Learner:
             symmetry: of the task, where it has one; used if the preset says so.
         """
         self.symmetry = symmetry if preset.symmetry else None
-        if self.symmetry is not None:
-            decisions *= 2
+        self._sides = 1 if self.symmetry is None else 2
         networks: dict[str, Any] = {"net_arch": list(preset.units), "optimizer_kwargs": {"fused": True}}
+        if preset.layer_norm:
+            networks["activation_fn"] = NormalizedReLU
         if is_image_space(env.observation_space):
             networks |= {"features_extractor_class": PooledImage, "features_extractor_kwargs": {"pool": IMAGE_POOL}}
         self.preset = preset
@@ -89,9 +102,19 @@ class Learner:
             seed=seed,
             device="cpu",
         )
+        self.model.replay_buffer = NStepReplayBuffer(
+            self._sides * self.model.buffer_size,
+            self.model.observation_space,
+            self.model.action_space,
+            device="cpu",
+            n_envs=self._sides,
+            n_steps=preset.n_steps,
+            gamma=self.model.gamma,
+        )
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.random = np.random.default_rng(seed)
         self.averaged = copy.deepcopy(self.model.actor) if preset.averaging else None
+        self.proving = Proving(preset.proven_by) if preset.proven_by else None
         self.episodes = 0
         self._practises = False
         self._steady: np.ndarray | None = None
@@ -102,6 +125,13 @@ class Learner:
         share = self.preset.practise
         self._practises = int(self.episodes * share) > int((self.episodes - 1) * share)
         self._steady = self._uniform() if self.episodes <= self.preset.steady_episodes else None
+        if self.proving is not None and self._practises:
+            self.proving.begin(self.actor())
+
+    def finish(self, success: bool) -> None:
+        """Ends an episode."""
+        if self.proving is not None and self._practises:
+            self.proving.finish(success)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """An exploring action: uniform until learning starts, then drawn from the policy.
@@ -129,11 +159,20 @@ class Learner:
         action = self.model.policy.scale_action(np.asarray(action)[None])
         if np.ndim(observation) == 3:  # an image; Stable-Baselines3 keeps channels first
             observation, following = np.moveaxis(observation, -1, 0), np.moveaxis(following, -1, 0)
-        rest = np.array([reward]), np.array([terminated or truncated]), infos
-        self.model.replay_buffer.add(observation, following, action, *rest)
+        seen, did, then = [observation], [action[0]], [following]
         if self.symmetry is not None:
-            sides, turned = np.array(self.symmetry.observation), np.array(self.symmetry.action)
-            self.model.replay_buffer.add(sides * observation, sides * following, turned * action, *rest)
+            signs = np.array(self.symmetry.observation)
+            seen.append(signs * observation)
+            did.append(np.array(self.symmetry.action) * action[0])
+            then.append(signs * following)
+        self.model.replay_buffer.add(
+            np.array(seen),
+            np.array(then),
+            np.array(did),
+            np.full(self._sides, reward),
+            np.full(self._sides, terminated or truncated),
+            infos * self._sides,
+        )
         self.decisions += 1
 
     def learn(self) -> None:
@@ -148,8 +187,16 @@ class Learner:
                     mean.lerp_(value, follow)
 
     def actor(self) -> Any:
-        """The network whose mean action is the result: the averaged one where there is one."""
+        """The network whose mean action is practised: the averaged one where there is one."""
         return self.model.actor if self.averaged is None else self.averaged
+
+    def result(self) -> Any:
+        """What a run leaves: the actor that proved itself, or the last one where none had the time to."""
+        if self.proving is None or self.proving.proven is None:
+            return self.actor()
+        proven = copy.deepcopy(self.actor())
+        proven.load_state_dict(self.proving.proven)
+        return proven
 
     def has_diverged(self) -> bool:
         """Whether the actor holds anything that is not a finite number."""
@@ -174,6 +221,10 @@ class Learner:
                 arrays |= {f"optimizer/{name}/{index}/{key}": value.numpy() for key, value in moments.items()}
         if self.model.log_ent_coef is not None:
             arrays["log_ent_coef"] = self.model.log_ent_coef.detach().numpy()
+        proving: dict[str, Any] = {}
+        if self.proving is not None:
+            actors, proving = self.proving.state()
+            arrays |= {f"proving/{key}": value.numpy() for key, value in actors.items()}
         buffer = self.model.replay_buffer
         arrays |= {f"buffer/{k}": getattr(buffer, k)[: buffer.size()] for k in self._buffer_names()}
         arrays["random/torch"] = torch.get_rng_state().numpy()
@@ -182,6 +233,7 @@ class Learner:
         return arrays, {
             "decisions": self.decisions,
             "episodes": self.episodes,
+            "proving": proving,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
             "numpy": [kind, *rest],
@@ -211,6 +263,9 @@ class Learner:
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
         self.episodes = values["episodes"]
+        if self.proving is not None:
+            actors = {key.removeprefix("proving/"): v for key, v in tensors.items() if key.startswith("proving/")}
+            self.proving.restore(actors, values["proving"])
         torch.set_rng_state(tensors["random/torch"])
         kind, *rest = values["numpy"]
         np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002

@@ -26,12 +26,13 @@ class Policy:
         """
         Args:
             layers: weight (out, in) and bias (out,) of each layer, first to last.
-            description: what `policy.json` holds: the shapes and limits of observation and action, and `pool`, the
-                side of the squares of pixels that an image is averaged over.
+            description: what `policy.json` holds: the shapes and limits of observation and action, `activation`, and
+                `pool`, the side of the squares of pixels that an image is averaged over.
         """
         self._layers = layers
         self.description = dict(description)
         self._shape = tuple(description["observation_shape"])
+        self._normalizes = description["activation"] == "normalized_relu"
         self._low = np.asarray(description["action_low"], np.float32)
         self._high = np.asarray(description["action_high"], np.float32)
 
@@ -40,6 +41,7 @@ class Policy:
         """The policy of a Stable-Baselines3 actor of SAC or TQC."""
         linear = [layer for layer in actor.latent_pi if hasattr(layer, "weight")] + [actor.mu]
         space = actor.action_space
+        activations = {getattr(layer, "kind", "relu") for layer in actor.latent_pi if not hasattr(layer, "weight")}
         return cls(
             [(m.weight.detach().numpy().copy(), m.bias.detach().numpy().copy()) for m in linear],
             {
@@ -47,7 +49,7 @@ class Policy:
                 "pool": getattr(actor.features_extractor, "pool", 1),
                 "action_low": space.low.tolist(),
                 "action_high": space.high.tolist(),
-                "activation": "relu",
+                "activation": activations.pop(),
                 "squash": "tanh",
                 **description,
             },
@@ -98,10 +100,16 @@ class Policy:
             raise ValueError(f"the policy was trained on observations {self._shape}, not {observation.shape}")
         hidden = self._features(observation)
         for weight, bias in self._layers[:-1]:
-            hidden = np.maximum(weight @ hidden + bias, np.float32(0))
+            hidden = self._activate(weight @ hidden + bias)
         weight, bias = self._layers[-1]
         squashed = np.tanh(weight @ hidden + bias)
         return self._low + np.float32(0.5) * (squashed + np.float32(1)) * (self._high - self._low)
+
+    def _activate(self, features: np.ndarray) -> np.ndarray:
+        if self._normalizes:
+            features = features - features.mean()
+            features = features / np.sqrt((features * features).mean() + np.float32(1e-5))
+        return np.maximum(features, np.float32(0))
 
     def _features(self, observation: np.ndarray) -> np.ndarray:
         """What the first layer sees: the numbers as they are, an image channel by channel in [0, 1], averaged."""

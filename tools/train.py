@@ -64,6 +64,7 @@ def train(
             learner.remember(observation, action, float(reward), following, terminated, truncated)
             learner.learn()
             observation, finished = following, terminated or truncated
+        learner.finish(bool(info["is_success"]))
         if learner.has_diverged():
             raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
         rows.append(record.row(episode) | {"wall_time": time.perf_counter() - started})
@@ -75,7 +76,7 @@ def train(
             _save(folder, rows, learner, env)
             spent_saving += time.perf_counter() - started
     Policy.from_actor(
-        learner.actor(), {"task": config.task, "observation_shape": list(env.observation_space.shape or ())}
+        learner.result(), {"task": config.task, "observation_shape": list(env.observation_space.shape or ())}
     ).save(folder.path)
     env.close()
     return rows

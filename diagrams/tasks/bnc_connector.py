@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
@@ -90,6 +90,7 @@ def make_env(
     reward: str = "sparse",
     observation: str = "state",
     uncertainty: str = "calibration",
+    grasp_angle: float = 0.0,
     station: str = "rails",
     render_mode: str | None = None,
     hold: int = 10,
@@ -108,6 +109,7 @@ def make_env(
         reward: "sparse" is the thesis's (4.27, 4.28); "shaped" adds the depth gained, in millimetres.
         observation: "state": time, pose and wrench, scaled.
         uncertainty: "calibration", "disc" or "known": see `BncUncertainty`, which also has the options of a reset.
+        grasp_angle: how far the plug tilts in the tool at most, degrees, anew every episode.
         station: "rails" or "arm".
         render_mode: None, "human" (a browser view) or "rgb_array".
         hold: control steps per decision.
@@ -120,7 +122,7 @@ def make_env(
         raise InputError(f"there is no reward '{reward}': use 'sparse' or 'shaped'")
     if observation != "state":
         raise InputError(f"BncConnector has no observation '{observation}': use 'state', time, pose and wrench")
-    uncertain = BncUncertainty(uncertainty)
+    uncertain = BncUncertainty(uncertainty, grasp_angle)
     skill = PrimitiveSkill(
         reference=reference_trajectory(),
         constraints=alignment_constraints(),
@@ -140,7 +142,7 @@ def make_env(
         make_station(station, workcell),
         build_guidance(guidance, skill, "BncConnector"),
         uncertain,
-        explored=skill.explored,
+        explored=skill.explored_outputs,
         shaped=reward == "shaped",
         render_mode=render_mode,
     )
@@ -210,7 +212,7 @@ def build_task(
         jack, grasp = uncertain.draw(rng, options)
         plant_context = plant.GetMyMutableContextFromRoot(context)
         workcell.set_jack_offset(plant, plant_context, RigidTransform([*jack, 0.0]))
-        workcell.set_grasp_offset(plant, plant_context, RigidTransform([*grasp, 0.0]))
+        workcell.set_grasp_offset(plant, plant_context, _grasp(grasp))
         station.set_pose(context, start)
         return {"jack_offset": jack.copy(), "grasp_offset": grasp.copy()}
 
@@ -231,6 +233,12 @@ def build_task(
         meshcat=meshcat,
         symmetry=Symmetry((1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH), tuple(HALF_TURN[list(explored)])),
     )
+
+
+def _grasp(offset: np.ndarray) -> RigidTransform:
+    """X_PPlug of an offset: x, y, and where the plug tilts its angles about x and y."""
+    tilt = RotationMatrix(RollPitchYaw(*offset[2:], 0.0)) if len(offset) > 2 else RotationMatrix()
+    return RigidTransform(tilt, [*offset[:2], 0.0])
 
 
 def _conditions(workcell: BncWorkcell) -> list[Condition]:
@@ -281,4 +289,4 @@ def _add_observation(builder: DiagramBuilder, pose: OutputPort, wrench: OutputPo
 
 def view_of_jack(workcell: BncWorkcell) -> RigidTransform:
     """A camera that looks slightly down at the jack."""
-    return look_from_front(np.array(workcell.p_WJ) + [0.0, 0.0, 0.02], distance=0.16, height=0.06)
+    return look_from_front(np.array(workcell.p_WJ) + [0.0, 0.0, 0.02], distance=0.11, height=0.05)

@@ -19,7 +19,7 @@ class Bead(gymnasium.Env):
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
         self.hold, self.render_mode = hold, render_mode
-        self.task = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1)
+        self.task = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1, symmetry=None)
         self.trace = Trace(12, 2, 0.1)
 
     def reset(self, *, seed=None, options=None):

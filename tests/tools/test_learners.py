@@ -110,14 +110,25 @@ def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
     for one in (learner, plain):
         one.remember(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True, False)
     buffer = learner.model.replay_buffer
-    assert (buffer.size(), plain.model.replay_buffer.size(), learner.decisions) == (2, 1, 1)
-    np.testing.assert_array_equal(buffer.observations[:2, 0], [[1, 2, 3], [-1, -2, 3]])
-    np.testing.assert_array_equal(buffer.next_observations[:2, 0], [[4, 5, 6], [-4, -5, 6]])
-    np.testing.assert_array_equal(buffer.actions[:2, 0], [[0.5, 0.25], [-0.5, 0.25]])
-    np.testing.assert_array_equal(buffer.rewards[:2, 0], [7, 7])
-    np.testing.assert_array_equal(buffer.dones[:2, 0], [1, 1])
+    assert (buffer.size(), plain.model.replay_buffer.n_envs, learner.decisions) == (1, 1, 1)
+    np.testing.assert_array_equal(buffer.observations[0], [[1, 2, 3], [-1, -2, 3]])
+    np.testing.assert_array_equal(buffer.next_observations[0], [[4, 5, 6], [-4, -5, 6]])
+    np.testing.assert_array_equal(buffer.actions[0], [[0.5, 0.25], [-0.5, 0.25]])
+    np.testing.assert_array_equal(buffer.rewards[0], [7, 7])
+    np.testing.assert_array_equal(buffer.dones[0], [1, 1])
     live(learner, 49)  # and the buffer has room for all of it
-    assert (buffer.size(), buffer.full) == (100, False)
+    assert (buffer.size(), buffer.full) == (50, False)
+
+
+def test_returns_of_several_steps_stop_where_an_episode_does(preset):
+    learner = make(replace(preset, n_steps=3, discount=0.5))
+    zero = np.zeros(3, np.float32)
+    for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
+        learner.remember(zero, np.zeros(2), reward, zero, terminated, False)
+    samples = learner.model.replay_buffer._get_samples(np.arange(4))
+    np.testing.assert_allclose(samples.rewards[:, 0], [1 + 2 / 2, 2, 4 + 8 / 2 + 16 / 4, 8 + 16 / 2 + 32 / 4])
+    np.testing.assert_array_equal(samples.dones[:, 0], [1, 1, 0, 0])
+    np.testing.assert_allclose(samples.discounts[2:, 0], 0.125)
 
 
 def test_a_restored_learner_goes_on_as_the_first_would_have(preset):
@@ -191,7 +202,23 @@ def test_a_restored_learner_is_in_the_same_episode(preset):
     np.testing.assert_array_equal(acted(second, 3), expected)
 
 
-@pytest.mark.parametrize("settings", [{"steady_episodes": -1}, {"practise": -1}, {"practise": 1.5}])
+def test_the_result_is_the_actor_that_proved_itself_also_after_a_restart(preset):
+    first = make(replace(preset, steady_episodes=0, practise=1.0, proven_by=2, learning_starts=1))
+    practised = []
+    for episode, success in enumerate([True, True, False]):
+        first.begin()
+        practised.append(first.actor().state_dict()["mu.weight"].clone())
+        live(first, 8, seed=episode)
+        first.finish(success)
+    arrays, values = first.state()
+    second = make(first.preset, seed=9)
+    second.restore({key: value.copy() for key, value in arrays.items()}, values)
+    for learner in (first, second):
+        torch.testing.assert_close(learner.result().state_dict()["mu.weight"], practised[0], rtol=0, atol=0)
+    assert not torch.equal(practised[0], first.actor().state_dict()["mu.weight"])
+
+
+@pytest.mark.parametrize("settings", [{"steady_episodes": -1}, {"practise": -1}, {"practise": 1.5}, {"proven_by": -1}])
 def test_episodes_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError):
         resolve_preset("robust", "tqc", settings)

@@ -20,11 +20,20 @@ STATE = spaces.Box(-np.inf, np.inf, (5,))
 IMAGE = spaces.Box(0, 255, (22, 29, 3), np.uint8)
 
 
-@pytest.fixture(params=[("tqc", STATE), ("sac", STATE), ("tqc", IMAGE)], ids=["tqc", "sac", "image"])
+@pytest.fixture(
+    params=[("tqc", STATE, 0), ("sac", STATE, 0), ("tqc", STATE, 1), ("tqc", IMAGE, 0)],
+    ids=["tqc", "sac", "normalized", "image"],
+)
 def learner(request):
-    algorithm, observation_space = request.param
+    algorithm, observation_space, layer_norm = request.param
     env = Spaces(observation_space, spaces.Box(np.array([-1, -2]), np.array([1, 3]), dtype=np.float32))
-    return Learner(resolve_preset("robust", algorithm, {"units": "32,16"}), env, hold=1, seed=3, decisions=10)
+    return Learner(
+        resolve_preset("robust", algorithm, {"units": "32,16", "layer_norm": layer_norm}),
+        env,
+        hold=1,
+        seed=3,
+        decisions=10,
+    )
 
 
 def test_does_what_stable_baselines_predicts(learner, tmp_path):

@@ -1,0 +1,49 @@
+"""Where jack and plug really are."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.tasks.bnc_connector import make_env
+from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
+from guiderail.models.errors import InputError
+from guiderail.tools.bnc_rule import reactive_rule, success_rate
+
+
+def drawn(uncertain, count, seed=0):
+    rng = np.random.default_rng(seed)
+    return [np.concatenate(uncertain.draw(rng, {})) for _ in range(count)]
+
+
+@pytest.mark.parametrize("kind", BncUncertainty.kinds)
+def test_a_tilt_is_drawn_anew_within_its_bound_and_changes_nothing_else(kind):
+    straight, tilted = drawn(BncUncertainty(kind), 50), drawn(BncUncertainty(kind, grasp_angle=1.0), 50)
+    assert np.shape(straight) == (50, 4)
+    angles = np.linalg.norm(np.array(tilted)[:, 4:], axis=1)
+    assert 0.8 < np.rad2deg(angles.max()) <= 1.0
+    assert len(np.unique(angles)) == 50
+    np.testing.assert_array_equal(np.array(tilted)[:, :4], straight)
+
+
+def test_a_given_offset_is_without_a_tilt():
+    _, plug = BncUncertainty("disc", grasp_angle=1.0).draw(np.random.default_rng(0), {"offset": (0.0, 1e-3)})
+    np.testing.assert_array_equal(plug, 0.0)
+
+
+@pytest.mark.parametrize("angle", [-0.1, LARGEST_GRASP_ANGLE + 0.1, np.nan])
+def test_refuses_an_angle_that_is_none(angle):
+    with pytest.raises(InputError, match="grasp_angle"):
+        BncUncertainty("disc", grasp_angle=angle)
+
+
+def test_the_plug_in_the_tool_is_tilted():
+    env = make_env(guidance="kmp", uncertainty="disc", grasp_angle=1.0)
+    _, info = env.reset(seed=0)
+    plant = env.task.diagram.GetSubsystemByName("station").plant
+    context = plant.GetMyContextFromRoot(env.simulator.get_context())
+    tool, plug = plant.GetBodyByName("tool_centre"), plant.GetBodyByName("plug")
+    tilt = plug.body_frame().CalcRotationMatrix(context, tool.body_frame()).ToAngleAxis().angle()
+    assert tilt == pytest.approx(np.linalg.norm(info["grasp_offset"][2:]), rel=1e-3)
+
+
+def test_a_rule_that_feels_the_torque_locks_a_tilted_plug_too():
+    assert success_rate(make_env(guidance="kgrl", uncertainty="disc", grasp_angle=1.0), reactive_rule, 4)[0] == 1.0
