@@ -103,7 +103,7 @@ def _grid_clamp() -> Scene:
     low, high = -parameters["push_m"], 0.025
     rings = [np.column_stack([square, np.full(5, height)]) for height in (low, high)]
     edges = [np.array([[x, y, low], [x, y, high]]) for x, y in square[:4]]
-    eye, target = to_world(np.array([[0.09, -0.13, 0.075], [0.0, 0.0, 0.014]]))
+    eye, target = to_world(np.array([[0.07, -0.1, 0.05], [0.0, 0.0, 0.008]]))
     near: Camera = (tuple(eye.tolist()), tuple(target.tolist()))
     return Scene(
         to_world=to_world,

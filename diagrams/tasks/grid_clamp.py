@@ -48,7 +48,7 @@ SEATED = 0.5 * MM  # a clamp that is lower than this has snapped in
 SEATED_BESIDE = 1.0 * MM  # a clamp that is as low beside its holes has not
 SEATED_STEPS = 3  # control steps for which it must be seated before that counts
 
-# The command waits while the clamp is farther than this from it: 12 N, more than the snap asks for.
+# The command waits while the clamp is farther than this from it: 12 N, twice what the snap asks for.
 LEASH = 8.0 * MM
 
 # The hand-designed skill before hands over a clamp above the hole, about here.
