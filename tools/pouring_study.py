@@ -42,15 +42,17 @@ class Method:
     label: str
     guidance: str
     reward: str
-    hold: int  # twice as long where success alone is rewarded: it is found only if random inputs sometimes have it
+    # Longer where success alone is rewarded: it is found only if random inputs sometimes have it. Through the template
+    # they tilt the thermos over in 2 of 24 episodes at 20 control steps a decision, and in 9 of 24 at 40.
+    hold: int
     episodes: int  # of a run
     active_constraints: bool | None = None  # the guidance's own unless given
 
 
 METHODS = {
-    "rl_sparse": Method("RL-Sparse", "none", "sparse", 20, 300),
+    "rl_sparse": Method("RL-Sparse", "none", "sparse", 40, 300),
     "rl_shaped": Method("RL-Shaped", "none", "hand_shaped", 10, 300),
-    "rl_sct_sparse": Method("RL-SCT-Sparse", "sct", "sparse", 20, 60),
+    "rl_sct_sparse": Method("RL-SCT-Sparse", "sct", "sparse", 40, 60),
     "rl_sct_shaped": Method("RL-SCT-Shaped", "sct", "shaped", 10, 60),
 }
 # Nobody learns here: a scripted person's three axes, and the same person's with nothing that holds them back.

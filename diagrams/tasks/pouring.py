@@ -104,7 +104,7 @@ def make_env(
         active_constraints: the template's; by default with "sct" only. With "none" they are a safety filter.
         input_speed: how much faster than meant the template's inputs are, 0.2 to 2. Unless given it is 1, and 1.7 for a
             sparse reward through the template: what is rewarded only once it is done is found only if random inputs
-            sometimes do it. Then also let an action last longer, such as hold=20.
+            sometimes do it. Then also let an action last longer, such as hold=40.
         mug_inner_diameter: m, of the mug that stands there.
         mug_depth: m.
         mug_offset: m, up to which the mug is moved along x and y, drawn at every reset.

@@ -1,5 +1,6 @@
 """Figures 3.5, 3.6 and 3.8 and table 3.3: pouring learned with and without a shared control template."""
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ COLOURS = {"rl_sparse": "#d62728", "rl_shaped": "#e6a700", "rl_sct_sparse": "#1f
 ENDINGS = ("success", "spill", "collision")
 TICKS = (10, 20, 50, 100, 200, 500)  # episodes
 CONDITION = (
-    "an iiwa in simulation; the preset 'pouring'; an action lasts 10 control steps, and 20 where the reward is sparse; "
+    "an iiwa in simulation; the preset 'pouring'; an action lasts 10 control steps, and 40 where the reward is sparse; "
     "the template's inputs are 1.7 times as fast there"
 )
 
@@ -107,15 +108,15 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
 def _results(
     out: Path, methods: Iterable[str], algorithm: str, seeds: int, episodes: int | None
 ) -> list[dict[str, Any]]:
-    """Runs and their episodes: those of so many seeds, and those of other seeds that the folder has anyway."""
+    """Runs and their episodes: of whatever seeds the folder has, and of more where those are fewer than `seeds`."""
     jobs: list[Job] = []
     for method in methods:
-        wanted = [job(out, method, algorithm, FIRST_SEED + index, episodes) for index in range(seeds)]
-        folder = wanted[0].folder
-        pattern = folder.name.removesuffix(str(FIRST_SEED)) + "*"
-        found = sorted(int(done.parent.name.split("-")[-1]) for done in folder.parent.glob(f"{pattern}/policy.json"))
-        known = {one.config.seed for one in wanted}
-        jobs += wanted + [job(out, method, algorithm, seed, episodes) for seed in found if seed not in known]
+        folder = job(out, method, algorithm, FIRST_SEED, episodes).folder
+        done = folder.parent.glob(folder.name.removesuffix(str(FIRST_SEED)) + "*/policy.json")
+        found = sorted(int(file.parent.name.split("-")[-1]) for file in done)
+        others = (seed for seed in itertools.count(FIRST_SEED) if seed not in found)
+        wanted = found + list(itertools.islice(others, max(seeds - len(found), 0)))
+        jobs += [job(out, method, algorithm, seed, episodes) for seed in sorted(wanted)]
     return [
         result | {"algorithm": algorithm, "rows": RunFolder(result["folder"]).episodes()} for result in run_jobs(jobs)
     ]
