@@ -24,7 +24,7 @@ from guiderail.tools.train import train
 from guiderail.tools.training import configure
 
 TASK = "BncConnector"
-LEARNED = ("kgrl", "skgrl", "skgrl_adaptive", "residual")
+LEARNED = ("kgrl", "skgrl", "skgrl_adaptive", "residual", "safe_residual")
 UNLEARNED = ("demonstration", "rule")
 HELD_OUT_SEED = 1_000_000
 

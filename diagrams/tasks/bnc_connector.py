@@ -33,6 +33,7 @@ from guiderail.diagrams.tasks.insertion import (
 )
 from guiderail.models.demonstrations import bnc_connector as demonstrations
 from guiderail.models.errors import InputError
+from guiderail.models.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import TERMINATIONS, Condition, EpisodeMonitor
@@ -41,7 +42,7 @@ from guiderail.systems.safety_ledger import SafetyLedger
 
 MM, DEGREE = 1e-3, np.deg2rad(1.0)
 NUM_STEPS = demonstrations.NUM_STEPS
-SENSIBLE_GUIDANCE = ("kmp", "residual", "kgrl", "skgrl")
+SENSIBLE_GUIDANCE = ("kmp", "residual", "safe_residual", "kgrl", "skgrl")
 
 COMPONENTS = 16
 # How well a hand repeats itself: added to the demonstrations' covariance as a standard deviation.
@@ -105,7 +106,7 @@ def make_env(
     """`gymnasium.make("guiderail/BncConnector-v0", ...)`.
 
     Args:
-        guidance: "kmp", "residual", "kgrl" or "skgrl".
+        guidance: "kmp", "residual", "safe_residual", "kgrl" or "skgrl".
         reward: "sparse" is the thesis's (4.27, 4.28); "shaped" adds the depth gained, in millimetres.
         observation: "state": time, pose and wrench, scaled.
         uncertainty: "calibration", "disc" or "known": see `BncUncertainty`, which also has the options of a reset.
@@ -135,6 +136,8 @@ def make_env(
         adaptive_history=adaptive_history,
         gains=None if gains is None else tuple(gains),
         isotropic_groups=((0, 1, 2), (3, 4, 5)),
+        # No walls are known here: what safe residual learning is projected to is the alignment alone.
+        keep_out=KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), alignment_constraints(), margin=0.0),
     )
     workcell = BncWorkcell()
     task = build_task(

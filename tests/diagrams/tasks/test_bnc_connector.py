@@ -83,10 +83,11 @@ def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
     assert worst <= 1e-9
 
 
-@pytest.mark.parametrize("guidance", ["kgrl", "skgrl"])
+@pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
 def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
     """Corner actions that change at every decision, into every corner of the square."""
-    env = {"kgrl": kgrl, "skgrl": skgrl}[guidance]
+    safe_residual = make_env(guidance="safe_residual", kappa=3.0)
+    env = {"kgrl": kgrl, "skgrl": skgrl, "safe_residual": safe_residual}[guidance]
     rng = np.random.default_rng(3)
     _, info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
     assert info["ledger"]["worst_commanded_violation"] <= 1e-9
@@ -209,7 +210,6 @@ class TestUncertainty:
     "wrong",
     [
         {"guidance": "sct"},
-        {"guidance": "safe_residual"},
         {"reward": "dense"},
         {"observation": "image"},
         {"uncertainty": "none"},
