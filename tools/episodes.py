@@ -7,6 +7,7 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
+from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
 from guiderail.diagrams.trace import mean_jerk
@@ -43,11 +44,15 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
-    """The environment of a task.
+    """The environment of a task. From here on this process calculates with one thread.
+
+    Matrices are small here. Where another process wants the cores too, threads that wait for each other take eighty
+    times as long (a movement primitive with a history: 78 s for 1), and sums would depend on how many there are.
 
     Raises:
         InputError: for an unknown task or argument, or a pairing that makes no sense.
     """
+    threadpool_limits(1)
     arguments = check_environment(task, arguments)
     return gymnasium.make(f"guiderail/{task}-v0", disable_env_checker=True, render_mode=render_mode, **arguments)
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import threadpoolctl
 from safetensors.numpy import load_file
 
 from guiderail.models.errors import InputError
+from guiderail.tools.episodes import make_environment
 from guiderail.tools.run_folder import RunFolder
 from guiderail.tools.train import train
 from guiderail.tools.training import run
@@ -127,3 +129,9 @@ def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
         run(None, tmp_path / "run", environment={}, seed=7, resume=True)
     with pytest.raises(InputError, match="other learner settings"):
         run(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
+
+
+def test_one_thread_does_the_sums():
+    threadpoolctl.threadpool_limits(2)
+    make_environment("Bead", {})
+    assert {pool["num_threads"] for pool in threadpoolctl.threadpool_info()} == {1}
