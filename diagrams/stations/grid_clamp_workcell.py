@@ -18,7 +18,7 @@ from guiderail.models.parsing import add_model
 STICTION_TOLERANCE = 1e-5
 """How fast a contact that sticks may creep [m/s]. With Drake's 1e-3 a clamp that stands beside its holes, pressed with
 27 N and pushed sideways with 2 N, a third of what friction bears, drifts at 0.18 mm/s; so, at 0.004 mm/s. Over an
-episode of 15 s that is the difference between slipping in by itself and standing still."""
+episode of 10 s that is the difference between slipping in by itself and standing still."""
 HOLES = tuple(f"hole_{number}" for number in range(5))
 PEGS = tuple(f"peg_{number}" for number in range(5))
 # A peg meets its own hole, the bead the lip, the pad the slab: nothing else.
