@@ -14,6 +14,8 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 
+import numpy as np
+
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.station import Station
@@ -23,8 +25,14 @@ from guiderail.tools.stress import Case, Witness, run
 
 EXPLORED = {"x, y": (0, 1), "all six": (0, 1, 2, 3, 4, 5)}
 STANDING = 5  # control steps that make the difference between an impact and a plug that stands within the jack
-# Compliant surfaces give way. In an impact they may, but a lug whose middle is behind a wall may come out behind it.
-LIMITS = {"impact_mm": BncWorkcell().dimensions.lug_radius / MM, "standing_mm": 0.6}
+_D = BncWorkcell().dimensions
+# Compliant surfaces give way. In an impact they may, but a lug whose middle is behind a wall may come out behind it,
+# and so may a barrel that is as deep in the ring as the ring is thick. (A plug that drops into its bore bounces.)
+LIMITS = {
+    "lug_impact_mm": _D.lug_radius / MM,
+    "barrel_impact_mm": (_D.ring_radius - _D.bore_radius) / MM,
+    "standing_mm": 0.6,
+}
 
 
 class Penetration(Witness):
@@ -39,18 +47,23 @@ class Penetration(Witness):
         station = env.task.diagram.GetSubsystemByName("station")
         assert isinstance(station, Station)
         self._plant, self._dimensions = station.plant, BncWorkcell().dimensions
-        self._depths: list[float] = []
+        self._depths: list[tuple[float, float]] = []
 
     def look(self) -> None:
         """Measures."""
         plant_context = self._plant.GetMyContextFromRoot(self._context)
         X_JP = self._plant.GetFrameByName("plug").CalcPose(plant_context, self._plant.GetFrameByName("jack"))
-        self._depths.append(interference(self._dimensions, X_JP.rotation().matrix(), X_JP.translation()) / MM)
+        self._depths.append(interference(self._dimensions, X_JP.rotation().matrix(), X_JP.translation()))
 
     def report(self) -> dict[str, float]:
-        """`impact_mm`, the deepest; `standing_mm`, the deepest that it didn't come out of for `STANDING` steps."""
-        windows = (self._depths[i : i + STANDING] for i in range(max(1, len(self._depths) - STANDING + 1)))
-        return {"impact_mm": max(self._depths), "standing_mm": max(min(window) for window in windows)}
+        """How deep lugs and barrel were in the plug, and what either didn't come out of for `STANDING` steps."""
+        depths = np.array(self._depths) / MM
+        windows = np.lib.stride_tricks.sliding_window_view(depths.max(axis=1), min(STANDING, len(depths)))
+        return {
+            "lug_impact_mm": float(depths[:, 0].max()),
+            "barrel_impact_mm": float(depths[:, 1].max()),
+            "standing_mm": float(windows.min(axis=1).max()),
+        }
 
 
 def cases(station: str = "rails") -> list[Case]:

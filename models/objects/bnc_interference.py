@@ -7,8 +7,8 @@ import numpy as np
 from guiderail.models.objects.bnc_connector import BncDimensions
 
 
-def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) -> float:
-    """The greatest depth [m] at which a lug or the barrel's end is inside of the plug; 0 where nothing is.
+def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) -> tuple[float, float]:
+    """How deep [m] the deeper lug, and the barrel's end, are inside of the plug's walls; 0 where they are not.
 
     As on the drawing: rigid, the slot unrolled. The gasket's pad is soft and not counted. Of the barrel, its end is
     looked at, so that a plug is taken to be roughly upright.
@@ -22,7 +22,7 @@ def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) 
     reach = d.slot_radius
     lugs_J = np.array([[reach, 0.0, d.lug_height], [-reach, 0.0, d.lug_height], [0.0, 0.0, d.barrel_height]])
     lug, other_lug, barrel_end = (lugs_J - p_JP) @ R_JP
-    return float(max(_lug_inside(d, lug), _lug_inside(d, other_lug), _barrel_inside(d, barrel_end)))
+    return float(max(_lug_inside(d, lug), _lug_inside(d, other_lug))), float(_barrel_inside(d, barrel_end))
 
 
 def _lug_inside(d: BncDimensions, p_P: np.ndarray) -> float:

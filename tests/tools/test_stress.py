@@ -111,7 +111,7 @@ def test_the_connector_withstands_white_actions():
     (row,) = campaign([case], at_least(1))
     assert complaints(summary([row]), stress_bnc.LIMITS) == []
     # They did touch: the surfaces gave way a little.
-    assert row["impact_mm"] > 0.05
+    assert max(row["lug_impact_mm"], row["barrel_impact_mm"]) > 0.05
     assert row["peak_force"] > 5.0
 
 

@@ -12,7 +12,7 @@ D = BncDimensions()
 def depth(lug_angle, lug_depth, x=0.0, y=0.0):
     """Interference [mm] of an upright plug with the lug `lug_angle` degrees along its slot, `lug_depth` mm deep."""
     R_JP = RotationMatrix.MakeZRotation(-np.deg2rad(lug_angle)).matrix()
-    return interference(D, R_JP, np.array([x * MM, y * MM, D.lug_height - lug_depth * MM])) / MM
+    return max(interference(D, R_JP, np.array([x * MM, y * MM, D.lug_height - lug_depth * MM]))) / MM
 
 
 def test_nothing_is_in_the_way_of_the_lugs_own_path():
@@ -36,6 +36,16 @@ def test_the_slots_walls_stop_the_lugs():
     assert depth(45.0, 3.0) > 0.8
     assert depth(100.0, 5.0) == pytest.approx(np.deg2rad(10.0) * D.slot_radius / MM - clearance, abs=1e-6)
     assert depth(20.0, 1.5) > 1.0
+
+
+def test_lugs_and_barrel_are_told_apart():
+    upright = np.eye(3)
+    lugs, barrel = interference(D, upright, np.array([0.0, 0.0, D.lug_height - 4.4 * MM]))
+    assert lugs > 0.8 * MM
+    assert barrel == 0.0
+    lugs, barrel = interference(D, upright, np.array([3.0 * MM, 0.0, D.barrel_height - 0.2 * MM]))
+    assert lugs == 0.0
+    assert barrel == pytest.approx(0.2 * MM)
 
 
 def test_the_bore_stops_the_barrel():
