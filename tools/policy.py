@@ -26,13 +26,20 @@ class Policy:
         """
         Args:
             layers: weight (out, in) and bias (out,) of each layer, first to last.
-            description: what `policy.json` holds: the shapes and limits of observation and action, `activation`, and
-                `pool`, the side of the squares of pixels that an image is averaged over.
+            description: what `policy.json` holds: the shapes and limits of observation and action, `activation`
+                ("relu" unless given, or "normalized_relu"), and `pool`, the side of the squares of pixels that an image
+                is averaged over.
+
+        Raises:
+            ValueError: for an activation that it does not know.
         """
         self._layers = layers
         self.description = dict(description)
         self._shape = tuple(description["observation_shape"])
-        self._normalizes = description["activation"] == "normalized_relu"
+        activation = self.description.setdefault("activation", "relu")
+        if activation not in ("relu", "normalized_relu"):
+            raise ValueError(f"a policy has no activation {activation!r}")
+        self._normalizes = activation == "normalized_relu"
         self._low = np.asarray(description["action_low"], np.float32)
         self._high = np.asarray(description["action_high"], np.float32)
 

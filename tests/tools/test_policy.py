@@ -1,3 +1,5 @@
+import json
+
 import gymnasium
 import numpy as np
 import pytest
@@ -66,6 +68,15 @@ def test_a_truncated_policy_is_refused_in_a_sentence(learner, tmp_path):
     weights = tmp_path / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-5])
     with pytest.raises(InputError, match="damaged"):
+        Policy.load(tmp_path)
+
+
+def test_a_policy_with_an_unknown_activation_is_refused_in_a_sentence(learner, tmp_path):
+    shape = list(learner_observation(learner, 0).shape)
+    Policy.from_actor(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+    description = json.loads((tmp_path / "policy.json").read_text())
+    (tmp_path / "policy.json").write_text(json.dumps(description | {"activation": "gelu"}))
+    with pytest.raises(InputError, match="of another version"):
         Policy.load(tmp_path)
 
 
