@@ -67,7 +67,13 @@ def train(
         learner.finish(bool(info["is_success"]))
         if learner.has_diverged():
             raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
-        rows.append(record.row(episode) | {"wall_time": time.perf_counter() - started})
+        row = record.row(episode) | {"wall_time": time.perf_counter() - started}
+        if rows and rows[0].keys() != row.keys():
+            raise InputError(
+                f"the run in {folder.path} was begun by another version of guiderail, whose episodes have other "
+                "numbers: go on with that one, or train anew"
+            )
+        rows.append(row)
         spent_training += time.perf_counter() - started
         if report is not None:
             report(rows[-1])

@@ -11,6 +11,7 @@ import threadpoolctl
 from safetensors.numpy import load_file
 
 from guiderail.models.errors import InputError
+from guiderail.tools.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.episodes import make_environment
 from guiderail.tools.run_folder import RunFolder
 from guiderail.tools.train import train
@@ -129,6 +130,19 @@ def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
         run(None, tmp_path / "run", environment={}, seed=7, resume=True)
     with pytest.raises(InputError, match="other learner settings"):
         run(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
+
+
+def test_a_run_of_another_version_is_left_as_it_is(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    rows = train(folder, bead_config)
+    arrays, values = load_checkpoint(folder.checkpoint)
+    older = [{key: value for key, value in row.items() if key != "mean_force"} for row in rows]
+    save_checkpoint(folder.checkpoint, arrays, values | {"rows": older})
+    folder.write_episodes(older)
+    before = (folder.path / "episodes.csv").read_bytes()
+    with pytest.raises(InputError, match="another version"):
+        train(folder, replace(bead_config, episodes=9), resume=True)
+    assert (folder.path / "episodes.csv").read_bytes() == before
 
 
 def test_one_thread_does_the_sums():
