@@ -5,8 +5,6 @@ hand meet the same held-out offsets. Each seed has a row of its own: what failed
 that was interrupted goes on where it was.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +19,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.policy import Policy
 from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after, read_table, table_text
 from guiderail.tools.study import write_table
+from guiderail.tools.study_command import run_study, study_parser
 from guiderail.tools.train import train
 from guiderail.tools.training import configure
 
@@ -173,24 +172,10 @@ def _row(cell: Cell, trained: Sequence[dict[str, Any]], judged: Sequence[dict[st
 
 def main(arguments: list[str] | None = None) -> None:
     """Prints a line for every row, and what they come to."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="the folder; runs in it are used again")
-    parser.add_argument("--methods", default="straight,rule,sct,sct_no_force", help="separated by commas")
+    parser = study_parser(__doc__, methods="straight,rule,sct,sct_no_force", seeds="30,31,32")
     parser.add_argument("--uncertainty", default="calibration", help="calibration or disc")
-    parser.add_argument("--seeds", default="30,31,32", help="separated by commas")
     parser.add_argument("--episodes", type=int, default=50, help="of training")
-    parser.add_argument("--evaluations", type=int, default=100, help="held-out episodes afterwards")
-    given = parser.parse_args(arguments)
-    result = clamp_study(
-        given.out,
-        methods=given.methods.split(","),
-        uncertainty=given.uncertainty,
-        seeds=[int(seed) for seed in given.seeds.split(",")],
-        episodes=given.episodes,
-        evaluations=given.evaluations,
-        report=lambda row: print(json.dumps(row), flush=True),
-    )
-    print(json.dumps(result, indent=2, ensure_ascii=False))
+    run_study(clamp_study, parser, arguments)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,6 @@ Learned policies, the demonstrations alone and a rule written by hand meet the s
 row of its own: what failed on one is not averaged away. A study that was interrupted goes on where it was.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +18,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.policy import Policy
 from guiderail.tools.run_folder import RunConfig, RunFolder, read_table, table_text
 from guiderail.tools.study import write_table
+from guiderail.tools.study_command import numbers, run_study, study_parser
 from guiderail.tools.train import train
 from guiderail.tools.training import configure
 
@@ -185,26 +184,11 @@ def _still(observation: np.ndarray) -> np.ndarray:
 
 def main(arguments: list[str] | None = None) -> None:
     """Prints a line for every row, and what they come to."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="the folder; runs in it are used again")
-    parser.add_argument("--methods", default="demonstration,rule,kgrl,skgrl", help="separated by commas")
+    parser = study_parser(__doc__, methods="demonstration,rule,kgrl,skgrl", seeds="10,11,12,13,14")
     parser.add_argument("--uncertainty", default="calibration", help="calibration or disc")
-    parser.add_argument("--seeds", default="10,11,12,13,14", help="separated by commas")
-    parser.add_argument("--marks", default="40", help="training episodes after which a policy is judged")
-    parser.add_argument("--evaluations", type=int, default=100, help="held-out episodes each time")
+    parser.add_argument("--marks", type=numbers, default="40", help="training episodes after which a policy is judged")
     parser.add_argument("--station", default="rails", help="rails, or arm: what policies are judged on")
-    given = parser.parse_args(arguments)
-    result = connector_study(
-        given.out,
-        methods=given.methods.split(","),
-        uncertainty=given.uncertainty,
-        seeds=[int(seed) for seed in given.seeds.split(",")],
-        marks=[int(mark) for mark in given.marks.split(",")],
-        evaluations=given.evaluations,
-        station=given.station,
-        report=lambda row: print(json.dumps(row), flush=True),
-    )
-    print(json.dumps(result, indent=2, ensure_ascii=False))
+    run_study(connector_study, parser, arguments)
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@ held-out starts and on mugs that training never saw. Each seed has a row of its 
 away. A study that was interrupted goes on where it was, and the figures use the same runs.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +20,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.policy import Policy
 from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after, read_table, table_text
 from guiderail.tools.study import Job, run_job, write_table
+from guiderail.tools.study_command import run_study, study_parser
 from guiderail.tools.training import configure
 
 TASK, PRESET = "Pouring", "pouring"
@@ -213,26 +212,11 @@ def _judged(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Prints a line for every row, and what they come to."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="the folder; runs in it are used again")
-    parser.add_argument("--methods", default="rl_sct_shaped", help=f"of {', '.join(METHODS | PERSONS)}")
+    parser = study_parser(__doc__, methods="rl_sct_shaped", seeds="10,11,12,13,14")
     parser.add_argument("--algorithm", default="sac", help="sac or tqc")
-    parser.add_argument("--seeds", default="10,11,12,13,14", help="separated by commas")
     parser.add_argument("--episodes", type=int, help="of each run; the method's own number unless given")
-    parser.add_argument("--evaluations", type=int, default=100, help="episodes with held-out starts")
     parser.add_argument("--mugs", type=int, default=0, help="episodes with mugs that training did not see")
-    given = parser.parse_args(arguments)
-    result = pouring_study(
-        given.out,
-        methods=given.methods.split(","),
-        algorithm=given.algorithm,
-        seeds=[int(seed) for seed in given.seeds.split(",")],
-        episodes=given.episodes,
-        evaluations=given.evaluations,
-        mugs=given.mugs,
-        report=lambda row: print(json.dumps(row), flush=True),
-    )
-    print(json.dumps(result, indent=2, ensure_ascii=False))
+    run_study(pouring_study, parser, arguments)
 
 
 if __name__ == "__main__":
