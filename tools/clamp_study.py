@@ -14,10 +14,9 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.tools.clamp_rule import searching_rule, straight_descent
-from guiderail.tools.episodes import make_environment, run_episode
-from guiderail.tools.files import write_atomically
+from guiderail.tools.judging import held_out, kept, mean, refuse_another, total, worst
 from guiderail.tools.policy import Policy
-from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after, read_table, table_text
+from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after
 from guiderail.tools.study import write_table
 from guiderail.tools.study_command import run_study, study_parser
 from guiderail.tools.train import train
@@ -31,7 +30,6 @@ LEARNED: dict[str, dict[str, Any]] = {
     "none": {"guidance": "none", "reward": "shaped"},
 }
 UNLEARNED: dict[str, Callable[[np.ndarray], np.ndarray]] = {"straight": straight_descent, "rule": searching_rule}
-HELD_OUT_SEED = 1_000_000
 VIOLATION = 1e-9  # [m] more than this outside of the cuboid counts
 
 
@@ -108,43 +106,24 @@ def judge(cell: Cell, out: Path) -> dict[str, Any]:
     if cell.method in LEARNED:
         begun = (folder.path / "config.yaml").exists()
         if begun:
-            _refuse_another(folder, cell)
+            refuse_another(folder, cell.config(), also=["episodes"])
         finished = begun and (folder.path / "policy.json").exists()
         trained = folder.episodes() if finished else train(folder, cell.config(), resume=begun)
     return _row(cell, trained, _held_out(cell, folder))
 
 
-def _refuse_another(folder: RunFolder, cell: Cell) -> None:
-    """A run with other settings is neither trained further nor judged as if it were this one."""
-    found, wanted = folder.config(), cell.config()
-    for key in ("environment", "learner", "seed", "episodes"):
-        if getattr(found, key) != getattr(wanted, key):
-            raise InputError(f"{folder.path} holds a run with another {key}: name another folder with --out")
-
-
 def _held_out(cell: Cell, folder: RunFolder) -> list[dict[str, Any]]:
     """Rows of held-out episodes, from the file where they are known already."""
-    file = folder.path / f"held_out-{cell.evaluations}.csv"
-    if file.exists():
-        return read_table(file)
-    config = cell.config()
-    env = make_environment(config.task, config.environment)
-    env.reset(seed=cell.seed)  # the hidden offsets of this run
-    act = UNLEARNED.get(cell.method) or Policy.load(folder.path)
-    rows = [run_episode(env, act, held_out_seed=HELD_OUT_SEED + i, episode=i) for i in range(cell.evaluations)]
-    env.close()
-    write_atomically(file, table_text(rows).encode())
-    return rows
+    return kept(
+        folder.path / f"held_out-{cell.evaluations}.csv",
+        lambda: held_out(
+            cell.config(), UNLEARNED.get(cell.method) or Policy.load(folder.path), episodes=cell.evaluations
+        ),
+    )
 
 
 def _row(cell: Cell, trained: Sequence[dict[str, Any]], judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """What a cell came to. A mean squared force is an episode's, over its control steps; then over episodes."""
-
-    def mean(rows: Sequence[dict[str, Any]], key: str) -> float | None:
-        return float(np.mean([row[key] for row in rows])) if rows else None
-
-    def worst(rows: Sequence[dict[str, Any]], key: str) -> float | None:
-        return float(np.max([row[key] for row in rows])) if rows else None
 
     converged = converged_after(bool(row["success"]) for row in trained)
     return {
@@ -165,8 +144,8 @@ def _row(cell: Cell, trained: Sequence[dict[str, Any]], judged: Sequence[dict[st
         "episodes_commanded_outside": sum(row["worst_violation"] > VIOLATION for row in (*trained, *judged)),
         "worst_violation": worst([*trained, *judged], "worst_violation"),
         "collisions": sum(row["collisions"] for row in (*trained, *judged)),
-        "training_steps": sum(row["steps"] for row in trained) if trained else None,
-        "training_seconds": float(sum(row["wall_time"] for row in trained)) if trained else None,
+        "training_steps": total(trained, "steps"),
+        "training_seconds": total(trained, "wall_time"),
     }
 
 

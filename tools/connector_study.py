@@ -13,10 +13,9 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.tools.bnc_rule import reactive_rule
-from guiderail.tools.episodes import make_environment, run_episode
-from guiderail.tools.files import write_atomically
+from guiderail.tools.judging import held_out, kept, mean, refuse_another, total, worst
 from guiderail.tools.policy import Policy
-from guiderail.tools.run_folder import RunConfig, RunFolder, read_table, table_text
+from guiderail.tools.run_folder import RunConfig, RunFolder
 from guiderail.tools.study import write_table
 from guiderail.tools.study_command import numbers, run_study, study_parser
 from guiderail.tools.train import train
@@ -25,7 +24,7 @@ from guiderail.tools.training import configure
 TASK = "BncConnector"
 LEARNED = ("kgrl", "skgrl", "skgrl_adaptive", "residual", "safe_residual")
 UNLEARNED = ("demonstration", "rule")
-HELD_OUT_SEED = 1_000_000
+Act = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -107,12 +106,12 @@ def judge(cell: Cell, out: Path) -> list[dict[str, Any]]:
     for mark in cell.marks:
         trained = _trained(folder)
         if trained:
-            _refuse_another(folder, cell)
+            refuse_another(folder, cell.config(mark))
         if len(trained) < mark:
             trained = train(folder, cell.config(mark), resume=bool(trained))
         elif len(trained) > mark and not _file(folder, cell, mark).exists():
             continue  # the policy of back then is gone: it went on learning
-        judged = _held_out(cell, folder, mark, None)
+        judged = _held_out(cell, folder, mark)
         rows.append(_row(cell, mark, trained[:mark], judged))
     return rows
 
@@ -121,41 +120,20 @@ def _trained(folder: RunFolder) -> list[dict[str, Any]]:
     return folder.episodes() if (folder.path / "episodes.csv").exists() else []
 
 
-def _refuse_another(folder: RunFolder, cell: Cell) -> None:
-    """A run with other settings is neither trained further nor judged as if it were this one."""
-    found, wanted = folder.config(), cell.config(1)
-    if (found.environment, found.learner, found.seed) != (wanted.environment, wanted.learner, wanted.seed):
-        raise InputError(f"{folder.path} holds a run with other settings: name another folder with --out")
+def _held_out(cell: Cell, folder: RunFolder, mark: int, act: Act | None = None) -> list[dict[str, Any]]:
+    """Rows of held-out episodes after so many of training; of the policy in the folder where nobody else acts."""
+    config = cell.config(max(mark, 1), cell.station)
+    return kept(
+        _file(folder, cell, mark),
+        lambda: held_out(config, act or Policy.load(folder.path), episodes=cell.evaluations),
+    )
 
 
 def _file(folder: RunFolder, cell: Cell, mark: int) -> Path:
     return folder.path / f"held_out-{cell.station}-{mark}-{cell.evaluations}.csv"
 
 
-def _held_out(
-    cell: Cell, folder: RunFolder, mark: int, act: Callable[[np.ndarray], np.ndarray] | None
-) -> list[dict[str, Any]]:
-    """Rows of held-out episodes, from the file where they are known already."""
-    file = _file(folder, cell, mark)
-    if file.exists():
-        return read_table(file)
-    config = cell.config(max(mark, 1), cell.station)
-    env = make_environment(config.task, config.environment)
-    env.reset(seed=cell.seed)  # the hidden offset of this run
-    policy = Policy.load(folder.path) if act is None else act
-    rows = [run_episode(env, policy, held_out_seed=HELD_OUT_SEED + i, episode=i) for i in range(cell.evaluations)]
-    env.close()
-    write_atomically(file, table_text(rows).encode())
-    return rows
-
-
 def _row(cell: Cell, mark: int, trained: Sequence[dict[str, Any]], judged: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    def mean(rows: Sequence[dict[str, Any]], key: str) -> float | None:
-        return float(np.mean([row[key] for row in rows])) if rows else None
-
-    def worst(rows: Sequence[dict[str, Any]], key: str) -> float | None:
-        return float(np.max([row[key] for row in rows])) if rows else None
-
     return {
         "method": cell.method,
         "uncertainty": cell.uncertainty,
@@ -174,7 +152,7 @@ def _row(cell: Cell, mark: int, trained: Sequence[dict[str, Any]], judged: Seque
         "worst_violation": worst([*trained, *judged], "worst_violation"),
         "jerk_commanded_linear": mean(trained[:10], "jerk_commanded_linear"),
         "jerk_commanded_angular": mean(trained[:10], "jerk_commanded_angular"),
-        "training_seconds": float(sum(row["wall_time"] for row in trained)) if trained else None,
+        "training_seconds": total(trained, "wall_time"),
     }
 
 

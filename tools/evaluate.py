@@ -3,16 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import track
-
-from guiderail.models.errors import InputError
-from guiderail.tools.episodes import DEMONSTRATED, make_environment, run_episode, standing_still
+from guiderail.tools.episodes import DEMONSTRATED
+from guiderail.tools.judging import HELD_OUT_SEED, held_out
 from guiderail.tools.policy import Policy
-from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after
+from guiderail.tools.run_folder import RunFolder, converged_after
 
 
-def evaluate(run: Path, *, episodes: int = 100, seed: int = 1_000_000) -> dict[str, Any]:
+def evaluate(run: Path, *, episodes: int = 100, seed: int = HELD_OUT_SEED) -> dict[str, Any]:
     """Judges the exported policy of a run.
 
     Args:
@@ -50,21 +47,3 @@ def evaluate(run: Path, *, episodes: int = 100, seed: int = 1_000_000) -> dict[s
         "trained_episodes": len(folder.episodes()),
         "seed": seed,
     }
-
-
-def held_out(config: RunConfig, policy: Policy | None, *, episodes: int, seed: int) -> list[dict[str, Any]]:
-    """Rows of held-out episodes of a run's environment under a policy; None stands for an action of zero."""
-    if episodes < 1:
-        raise InputError(f"an evaluation needs at least one episode, not {episodes}")
-    if not 0 <= seed < 2**31:
-        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
-    env = make_environment(config.task, config.environment)
-    try:
-        act = standing_still(env) if policy is None else policy
-        env.reset(seed=config.seed)  # what is hidden and constant in the run is drawn as it was for training
-        console = Console(stderr=True)
-        words = "demonstration alone" if policy is None else "held-out episodes"
-        indices = track(range(episodes), words, console=console, transient=True, disable=not console.is_terminal)
-        return [run_episode(env, act, held_out_seed=seed + index, episode=index) for index in indices]
-    finally:
-        env.close()

@@ -16,15 +16,14 @@ from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring_inputs import Inputs, person
 from guiderail.models.errors import InputError
 from guiderail.tools.episodes import make_environment, run_episode
-from guiderail.tools.files import write_atomically
+from guiderail.tools.judging import HELD_OUT_SEED, held_out, kept, mean, total, worst
 from guiderail.tools.policy import Policy
-from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after, read_table, table_text
+from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after
 from guiderail.tools.study import Job, run_job, write_table
 from guiderail.tools.study_command import run_study, study_parser
 from guiderail.tools.training import configure
 
 TASK, PRESET = "Pouring", "pouring"
-HELD_OUT_SEED = 1_000_000
 FIRST_SEED = 10  # the ones before were used up in development
 IN_A_ROW = 10
 
@@ -135,8 +134,11 @@ def judge(one: Job, evaluations: int, mugs: int) -> dict[str, Any]:
     def act() -> Inputs:
         return Policy.load(one.folder) if one.name in METHODS else person
 
-    judged = _kept(one.folder / f"held_out-{evaluations}.csv", lambda: held_out_starts(one.config, act(), evaluations))
-    unseen = _kept(one.folder / f"unseen_mugs-{mugs}.csv", lambda: unseen_mugs(one.config, act(), mugs))
+    judged = []
+    if evaluations:
+        file = one.folder / f"held_out-{evaluations}.csv"
+        judged = kept(file, lambda: held_out(one.config, act(), episodes=evaluations))
+    unseen = kept(one.folder / f"unseen_mugs-{mugs}.csv", lambda: unseen_mugs(one.config, act(), mugs))
     return {
         "method": one.name,
         "algorithm": one.config.learner.algorithm,
@@ -144,8 +146,8 @@ def judge(one: Job, evaluations: int, mugs: int) -> dict[str, Any]:
         **training_row(trained),
         **_judged("held_out", judged),
         **_judged("unseen_mugs", unseen),
-        "worst_violation": max((row["worst_violation"] for row in (*trained, *judged, *unseen)), default=None),
-        "training_seconds": float(sum(row["wall_time"] for row in trained)),
+        "worst_violation": worst([*trained, *judged, *unseen], "worst_violation"),
+        "training_seconds": total(trained, "wall_time"),
     }
 
 
@@ -166,14 +168,6 @@ def ended(rows: Sequence[Mapping[str, Any]], how: str) -> int:
     return sum(row["termination"] == how for row in rows)
 
 
-def held_out_starts(config: RunConfig, act: Inputs, episodes: int, seed: int = HELD_OUT_SEED) -> list[dict[str, Any]]:
-    """Rows of episodes with held-out starts."""
-    env = make_environment(config.task, config.environment)
-    rows = [run_episode(env, act, held_out_seed=seed + index, episode=index) for index in range(episodes)]
-    env.close()
-    return rows
-
-
 def unseen_mugs(config: RunConfig, act: Inputs, episodes: int, seed: int = HELD_OUT_SEED) -> list[dict[str, Any]]:
     """Rows of episodes with held-out starts and mugs of other sizes in other places, drawn within the bounds above."""
     rows: list[dict[str, Any]] = []
@@ -190,23 +184,13 @@ def unseen_mugs(config: RunConfig, act: Inputs, episodes: int, seed: int = HELD_
     return rows
 
 
-def _kept(file: Path, judge: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:
-    """The rows in a file; where there is none yet, those that come of judging, and then they are in it."""
-    if file.exists():
-        return read_table(file)
-    rows = judge()
-    if rows:
-        write_atomically(file, table_text(rows).encode())
-    return rows
-
-
 def _judged(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {
         f"{name}_episodes": len(rows),
         f"{name}_success": ended(rows, "success") / len(rows) if rows else None,
         f"{name}_spills": ended(rows, "spill"),
         f"{name}_collisions": ended(rows, "collision"),
-        f"{name}_steps": float(np.mean([row["steps"] for row in rows])) if rows else None,
+        f"{name}_steps": mean(rows, "steps"),
     }
 
 

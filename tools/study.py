@@ -71,7 +71,7 @@ def _run_in_processes(jobs: Sequence[Job], indices: Sequence[int], processes: in
 
 def run_job(job: Job) -> dict[str, Any]:
     """Trains one run of a study, or finds it finished; returns what it came to."""
-    from guiderail.tools.evaluate import held_out
+    from guiderail.tools.judging import held_out
     from guiderail.tools.policy import Policy
     from guiderail.tools.train import train
 
@@ -80,7 +80,7 @@ def run_job(job: Job) -> dict[str, Any]:
     rows = folder.episodes() if _finished(job) else train(folder, job.config, resume=_begun(job))
     result = {"name": job.name, "seed": job.config.seed, **summary(rows), "folder": str(job.folder)}
     if job.evaluations:
-        judged = held_out(job.config, Policy.load(job.folder), episodes=job.evaluations, seed=1_000_000)
+        judged = held_out(job.config, Policy.load(job.folder), episodes=job.evaluations)
         result["held_out_success"] = float(np.mean([row["success"] for row in judged]))
         result["held_out_return"] = float(np.mean([row["return"] for row in judged]))
     return result
