@@ -192,10 +192,11 @@ class Learner:
 
     def result(self) -> Any:
         """What a run leaves: the actor that proved itself, or the last one where none had the time to."""
-        if self.proving is None or self.proving.proven is None:
+        weights = None if self.proving is None else self.proving.result()
+        if weights is None:
             return self.actor()
         proven = copy.deepcopy(self.actor())
-        proven.load_state_dict(self.proving.proven)
+        proven.load_state_dict(weights)
         return proven
 
     def has_diverged(self) -> bool:

@@ -36,7 +36,7 @@ class Preset:
         False  # of the hidden layers, before their activation: critics that stay bounded where nobody was
     )
     symmetry: bool = False  # remember what was seen as seen from the other side too, where the task has one
-    proven_by: int = 0  # practising episodes in a row that a result had to prove itself in; 0 takes the last actor
+    proven_by: int = 0  # practised successes, before and after an actor, that prove it a result; 0 takes the last actor
     averaging: float = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
 
 
@@ -63,7 +63,7 @@ PRESETS = {
         steady_episodes=8,
         practise=0.8,
         symmetry=True,
-        proven_by=6,
+        proven_by=8,
         averaging=0.003,
     ),
     # Measured on the grid clamp with SAC. A cost of force is known long before a success is: an entropy that is worth 2

@@ -1,55 +1,92 @@
 """Which of a run's actors is its result: one that proved itself, by nothing but the training's own episodes."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 
+Actor = dict[str, torch.Tensor]
+
+
+@dataclass
+class Candidate:
+    """An actor, and how many practising episodes in a row succeeded before it and, itself included, since."""
+
+    actor: Actor
+    before: int
+    since: int = 0
+
+    def proof(self) -> int:
+        """Successes on both sides: what acts well by luck, or only just learned to, has few on one of them."""
+        return min(self.before, self.since)
+
 
 class Proving:
-    """Keeps the latest actor whose next so many practising episodes went at least as well as any before.
+    """Keeps the latest actor in the midst of the longest row of practising episodes that succeeded.
 
     Learning on the edge of contact swings: a policy that succeeds for twenty episodes can fail for two and recover. The
-    last one of a run is therefore a poor choice, and choosing by held-out conditions would be no choice at all.
+    last one of a run is therefore a poor choice, and choosing by held-out conditions would be no choice at all. Nor is
+    it enough that the next few episodes succeeded: the actors that did so were its successors, and were better.
     """
 
     def __init__(self, episodes: int):
         """
         Args:
-            episodes: practising episodes, each acted by an actor or its close successors, that prove it.
+            episodes: successes before and after an actor, beyond which more prove nothing and the later one is taken.
         """
         self.episodes = episodes
-        self.proven: dict[str, torch.Tensor] | None = None
-        self._best = 0
-        self._candidates: list[dict[str, torch.Tensor]] = []
-        self._outcomes: list[bool] = []
+        self._row = 0
+        self._proven: Candidate | None = None
+        self._open: list[Candidate] = []  # whose row goes on
 
     def begin(self, actor: torch.nn.Module) -> None:
         """A practising episode begins, acted by this actor."""
-        self._candidates.append({key: value.detach().clone() for key, value in actor.state_dict().items()})
+        copy = {key: value.detach().clone() for key, value in actor.state_dict().items()}
+        self._open.append(Candidate(copy, min(self._row, self.episodes)))
 
     def finish(self, success: bool) -> None:
         """It is over."""
-        self._outcomes.append(success)
-        if len(self._outcomes) < self.episodes:
+        if not success:
+            self._proven, self._row, self._open = self._best(), 0, []
             return
-        passed = sum(self._outcomes)
-        if passed >= self._best:
-            self.proven, self._best = self._candidates[0], passed
-        del self._candidates[0], self._outcomes[0]
+        self._row += 1
+        for candidate in self._open:
+            candidate.since += 1
+        while self._open and self._open[0].since >= self.episodes:
+            self._proven = self._better(self._proven, self._open.pop(0))
 
-    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    def result(self) -> Actor | None:
+        """The actor that proved itself best so far; None where none has any proof."""
+        best = self._best()
+        return None if best is None else best.actor
+
+    def _best(self) -> Candidate | None:
+        best = self._proven
+        for candidate in self._open:
+            best = self._better(best, candidate)
+        return best
+
+    @staticmethod
+    def _better(best: Candidate | None, candidate: Candidate) -> Candidate | None:
+        least = 1 if best is None else best.proof()
+        return candidate if candidate.proof() >= least else best
+
+    def state(self) -> tuple[Actor, dict[str, Any]]:
         """Between episodes: tensors by name, and what JSON can hold."""
-        kept = dict(enumerate(self._candidates)) | ({} if self.proven is None else {"proven": self.proven})
-        tensors = {f"{name}/{key}": value for name, actor in kept.items() for key, value in actor.items()}
-        return tensors, {"best": self._best, "outcomes": list(self._outcomes)}
+        kept = {str(index): candidate for index, candidate in enumerate(self._open)}
+        if self._proven is not None:
+            kept["proven"] = self._proven
+        tensors = {f"{name}/{key}": value for name, one in kept.items() for key, value in one.actor.items()}
+        return tensors, {"row": self._row, "rows": {name: [one.before, one.since] for name, one in kept.items()}}
 
     def restore(self, tensors: Mapping[str, torch.Tensor], values: Mapping[str, Any]) -> None:
         """Becomes what it was when `state` was called."""
-        actors: dict[str, dict[str, torch.Tensor]] = {}
+        actors: dict[str, Actor] = {name: {} for name in values["rows"]}
         for name, value in tensors.items():
             actor, key = name.split("/", 1)
-            actors.setdefault(actor, {})[key] = value
-        self.proven = actors.pop("proven", None)
-        self._candidates = [actors[key] for key in sorted(actors, key=int)]
-        self._best, self._outcomes = values["best"], list(values["outcomes"])
+            actors[actor][key] = value
+        kept = {name: Candidate(actors[name], *rows) for name, rows in values["rows"].items()}
+        self._row = values["row"]
+        self._proven = kept.pop("proven", None)
+        self._open = [kept[name] for name in sorted(kept, key=int)]
