@@ -13,10 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, POSE_CENTRE, POSE_SCALE, make_env
 from guiderail.models.objects.bnc_motion import MM, RIM
+from guiderail.tools.episodes import standing_still
 from guiderail.tools.film import Shown, outcome, write_film
+from guiderail.tools.judging import HELD_OUT_SEED, mean, trials
 from guiderail.tools.replay import write_page
 
 GAIN = 1.5  # of the action per scaled contact torque
@@ -34,25 +35,6 @@ def reactive_rule(observation: np.ndarray) -> np.ndarray:
     if not (SEARCH[0] < step < SEARCH[1] and observation[Z] > ON_RIM and observation[FORCE_Z] > PUSHING):
         return np.zeros(2)
     return np.clip(GAIN * np.array([-observation[TORQUE_Y], observation[TORQUE_X]]), -1.0, 1.0)
-
-
-def standing_still(observation: np.ndarray) -> np.ndarray:
-    """The demonstrations alone."""
-    return np.zeros(2)
-
-
-def success_rate(env: GuidedEnv, policy, trials: int, seed: int = 1_000_000) -> tuple[float, float]:
-    """Part of `trials` held-out episodes that end locked, each with an offset of its own, and their worst violation."""
-    successes, worst = 0, -np.inf
-    for trial in range(trials):
-        observation, _ = env.reset(seed=seed + trial, options={"held_out": True, "new_run": True})
-        finished, info = False, {}
-        while not finished:
-            observation, _, terminated, truncated, info = env.step(policy(observation))
-            finished = terminated or truncated
-            worst = max(worst, info["constraint_violation"])
-        successes += info["is_success"]
-    return successes / trials, worst
 
 
 def show(options: argparse.Namespace) -> None:
@@ -83,19 +65,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--replay", type=Path, help="a page (.html) to write of one episode, instead of rates")
     parser.add_argument("--picture", type=Path, help="the same, what a camera sees of it (.png)")
     parser.add_argument("--uncertainty", default="calibration", help="of the episode shown")
-    parser.add_argument("--seed", type=int, default=1_000_000, help="of the episode shown")
+    parser.add_argument("--seed", type=int, default=HELD_OUT_SEED, help="of the episode shown")
     options = parser.parse_args(arguments)
     if options.replay is not None or options.picture is not None:
         show(options)
         return
-    rates = {}
     for uncertainty in ("known", "calibration", "disc"):
         env = make_env(guidance=options.guidance, uncertainty=uncertainty, station=options.station)
-        rates[uncertainty] = {
-            "demonstration": success_rate(env, standing_still, options.trials)[0],
-            "rule": success_rate(env, reactive_rule, options.trials)[0],
+        rates = {
+            name: mean(trials(env, act, options.trials), "success")
+            for name, act in (("demonstration", standing_still(env)), ("rule", reactive_rule))
         }
-        print(json.dumps({uncertainty: rates[uncertainty], "trials": options.trials}), flush=True)
+        print(json.dumps({uncertainty: rates, "trials": options.trials}), flush=True)
 
 
 if __name__ == "__main__":

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
 
 import numpy as np
 
-from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.grid_clamp import CENTRE, MM, SCALE, make_env, make_skill
 from guiderail.models.objects.grid_clamp import GridClampDimensions
+from guiderail.tools.judging import total, trials, worst
 
 _D = GridClampDimensions()
 ON_TABLE = _D.peg_length  # height of the pegs' tips while they stand on the table [m]
@@ -68,22 +67,6 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
     return np.array([0.0, 0.0, -1.0])
 
 
-def trials(
-    env: GuidedEnv, policy: Callable[[np.ndarray], np.ndarray], number: int, seed: int = 1_000_000
-) -> tuple[int, float]:
-    """How many of that many held-out episodes end seated, each with its own offsets, and their greatest force [N]."""
-    successes, peak = 0, 0.0
-    for trial in range(number):
-        observation, _ = env.reset(seed=seed + trial, options={"held_out": True, "new_run": True})
-        finished, info = False, {}
-        while not finished:
-            observation, _, terminated, truncated, info = env.step(policy(observation))
-            finished = terminated or truncated
-            peak = max(peak, info["contact_force"])
-        successes += info["is_success"]
-    return successes, peak
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Prints how many succeed, and with what force."""
     parser = argparse.ArgumentParser(description=main.__doc__)
@@ -93,9 +76,10 @@ def main(arguments: list[str] | None = None) -> None:
     for uncertainty in ("known", "calibration"):
         env = make_env(uncertainty=uncertainty, station=options.station)
         for policy in (straight_descent, searching_rule):
-            successes, peak = trials(env, policy, options.trials)
-            row = {"uncertainty": uncertainty, "policy": policy.__name__, "trials": options.trials}
-            print(json.dumps(row | {"successes": successes, "peak_force": round(peak, 2)}), flush=True)
+            rows = trials(env, policy, options.trials)
+            what = {"uncertainty": uncertainty, "policy": policy.__name__, "trials": options.trials}
+            came = {"successes": total(rows, "success"), "peak_force": worst(rows, "peak_force")}
+            print(json.dumps(what | came), flush=True)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.tools.bnc_rule import reactive_rule
-from guiderail.tools.judging import held_out, kept, mean, refuse_another, total, worst
+from guiderail.tools.judging import Act, held_out, kept, mean, refuse_another, total, worst
 from guiderail.tools.policy import Policy
 from guiderail.tools.run_folder import RunConfig, RunFolder
 from guiderail.tools.study import write_table
@@ -24,7 +24,6 @@ from guiderail.tools.training import configure
 TASK = "BncConnector"
 LEARNED = ("kgrl", "skgrl", "skgrl_adaptive", "residual", "safe_residual")
 UNLEARNED = ("demonstration", "rule")
-Act = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)

@@ -123,14 +123,14 @@ def split_jerk(poses: np.ndarray, period: float) -> dict[str, float]:
     return {"linear": mean_jerk(poses[:, :3], period), "angular": angular}
 
 
-def reset_held_out(env: gymnasium.Env, seed: int) -> np.ndarray:
-    """Starts an episode with conditions that training never drew.
+def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
+    """Starts an episode with conditions that training never drew; `options` are further ones of the reset.
 
     A task draws them by its reset option `held_out`, or at least by the seed, which is none of training's. One in which
     every episode starts from the same place is started a little beside it instead.
     """
     try:
-        return env.reset(seed=seed, options={"held_out": True})[0]
+        return env.reset(seed=seed, options={"held_out": True} | options)[0]
     except InputError as error:
         if "held_out" not in str(error):
             raise
@@ -148,6 +148,7 @@ def run_episode(
     *,
     held_out_seed: int | None = None,
     episode: int = 0,
+    **options: Any,
 ) -> dict[str, Any]:
     """Runs one episode and returns its row; the environment's trace is still that episode's afterwards.
 
@@ -156,8 +157,9 @@ def run_episode(
         act: the policy.
         held_out_seed: draws conditions that training never drew; without it, the next ones that training would draw.
         episode: the row's number.
+        options: further ones of a held-out reset.
     """
-    observation = env.reset()[0] if held_out_seed is None else reset_held_out(env, held_out_seed)
+    observation = env.reset()[0] if held_out_seed is None else reset_held_out(env, held_out_seed, **options)
     record = EpisodeRecord(env)
     finished = False
     while not finished:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 from rich.console import Console
 from rich.progress import track
@@ -15,12 +16,13 @@ from guiderail.tools.run_folder import RunConfig, RunFolder, read_table, table_t
 
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
 
+Act = Callable[[np.ndarray], np.ndarray]
 Rows = Sequence[Mapping[str, Any]]
 
 
 def held_out(
     config: RunConfig,
-    act: Callable[[np.ndarray], np.ndarray] | None,
+    act: Act | None,
     *,
     episodes: int,
     seed: int = HELD_OUT_SEED,
@@ -44,6 +46,13 @@ def held_out(
         return [run_episode(env, policy, held_out_seed=seed + index, episode=index) for index in indices]
     finally:
         env.close()
+
+
+def trials(env: gymnasium.Env, act: Act, number: int, seed: int = HELD_OUT_SEED) -> list[dict[str, Any]]:
+    """Rows of held-out episodes, each of a run of its own: what is hidden in a run is drawn anew."""
+    return [
+        run_episode(env, act, held_out_seed=seed + index, episode=index, new_run=True) for index in range(number)
+    ]
 
 
 def kept(file: Path, judge: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:

@@ -11,12 +11,12 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import AffineSystem, Multiplexer, Saturation
 
 from guiderail.diagrams.cameras import add_camera, add_meshcat
+from guiderail.diagrams.ledger import add_ledger
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.relative_poses import RelativePoses
-from guiderail.systems.safety_ledger import SafetyLedger
 
 CLIP = 3.0
 """A policy sees (value − centre) / scale, clipped to ± this."""
@@ -66,17 +66,15 @@ def add_force_ledger(
     force = station.get_contact_force_output_port()
     too_hard = builder.AddNamedSystem("force_beyond_limit", affine(np.eye(1), [-limit]))
     builder.Connect(force, too_hard.get_input_port())
-    ledger = builder.AddNamedSystem("ledger", SafetyLedger(CONTROL_PERIOD))
-    recorded = {
+    return add_ledger(
+        builder,
+        CONTROL_PERIOD,
         **violations,
-        "contact_force": force,
-        "collision": too_hard.get_output_port(),
-        "saturation": station.get_saturation_output_port(),
-        "fallback": guidance.GetOutputPort("fallback"),
-    }
-    for name, port in recorded.items():
-        builder.Connect(port, ledger.get_record_input_port(name))
-    return ledger.get_ledger_output_port()
+        contact_force=force,
+        collision=too_hard.get_output_port(),
+        saturation=station.get_saturation_output_port(),
+        fallback=guidance.GetOutputPort("fallback"),
+    )
 
 
 def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:

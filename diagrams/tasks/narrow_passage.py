@@ -17,6 +17,7 @@ from guiderail.diagrams.cameras import add_camera, add_meshcat
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.guidance import PRIMITIVE_GUIDANCE, build_guidance, check_guidance
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.diagrams.ledger import add_ledger
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.models.demonstrations import narrow_passage as demonstrations
@@ -152,16 +153,15 @@ def build_task(
     for name, port in (("pose", pose), ("last_pose", last_pose.get_output_port()), ("termination", termination)):
         builder.Connect(port, reward.get_signal_input_port(name))
 
-    ledger = builder.AddNamedSystem("ledger", SafetyLedger(config.control_period, num_actuators=2))
-    recorded = {
+    ledger = add_ledger(
+        builder,
+        config.control_period,
         **violations,
-        "contact_force": force,
-        "collision": force,  # nothing in this world may be touched
-        "saturation": station.GetOutputPort("saturation"),
-        "fallback": fallback,
-    }
-    for name, port in recorded.items():
-        builder.Connect(port, ledger.get_record_input_port(name))
+        contact_force=force,
+        collision=force,  # nothing in this world may be touched
+        saturation=station.GetOutputPort("saturation"),
+        fallback=fallback,
+    )
 
     builder.ExportInput(guidance.GetInputPort("action"), "action")
     space, seen = _add_image(builder, station) if image else _add_phase(builder, config)
@@ -172,7 +172,7 @@ def build_task(
         **{name: reward.get_term_output_port(name) for name in reward.term_names},
         "termination": termination,
         "contact_force": force,
-        "ledger": ledger.get_ledger_output_port(),
+        "ledger": ledger,
         "desired_pose": desired_pose,
         "pose": pose,
     }

@@ -14,6 +14,7 @@ from guiderail.diagrams.cameras import add_camera, add_meshcat
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.guidance import check_guidance
 from guiderail.diagrams.guidance.sct import WRENCH_SIZE, SctGuidance
+from guiderail.diagrams.ledger import add_ledger
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, vessel_or_refuse
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.held_out import episode_stream
@@ -181,18 +182,16 @@ def build_task(
             signals[name] = held.get_output_port()
         builder.Connect(signals[name], rewards.get_signal_input_port(name))
 
-    ledger = SafetyLedger(config.control_period, num_actuators=1)
-    builder.AddNamedSystem("ledger", ledger)
     violations = {name: guidance.GetOutputPort(name) for name in ("commanded_violation", "measured_violation")}
-    recorded = {
+    ledger = add_ledger(
+        builder,
+        config.control_period,
         **violations,
-        "contact_force": station.GetOutputPort("contact_force"),
-        "collision": station.GetOutputPort("touched"),
-        "saturation": station.GetOutputPort("saturation"),
-        "fallback": guidance.GetOutputPort("fallback"),
-    }
-    for name, port in recorded.items():
-        builder.Connect(port, ledger.get_record_input_port(name))
+        contact_force=station.GetOutputPort("contact_force"),
+        collision=station.GetOutputPort("touched"),
+        saturation=station.GetOutputPort("saturation"),
+        fallback=guidance.GetOutputPort("fallback"),
+    )
 
     scale = np.diag([POSITION_SCALE] * 3 + [1.0] * 3)
     observation = builder.AddNamedSystem("observation", MatrixGain(scale))
@@ -205,7 +204,7 @@ def build_task(
         **{name: rewards.get_term_output_port(name) for name in rewards.term_names},
         "termination": termination,
         "contact_force": station.GetOutputPort("contact_force"),
-        "ledger": ledger.get_ledger_output_port(),
+        "ledger": ledger,
         "desired_pose": desired_pose,
         "pose": pose,
         "state": guidance.GetOutputPort("state"),

@@ -15,7 +15,9 @@ from guiderail.diagrams.tasks.bnc_connector import (
 )
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.models.errors import InputError
-from guiderail.tools.bnc_rule import reactive_rule, standing_still, success_rate
+from guiderail.tools.bnc_rule import reactive_rule
+from guiderail.tools.episodes import standing_still
+from guiderail.tools.judging import total, trials, worst
 
 
 def play(env, policy, *, seed=None, options=None):
@@ -59,7 +61,7 @@ def test_spaces(skgrl):
 
 @pytest.mark.parametrize("offset", [(0.3, 0.0), (0.0, -0.3), (-0.2, 0.2)])
 def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
-    _, info, total, _ = play(kmp, standing_still, seed=0, options={"offset": np.array(offset) * MM})
+    _, info, total, _ = play(kmp, standing_still(kmp), seed=0, options={"offset": np.array(offset) * MM})
     assert info["termination"] == "success"
     assert info["control_steps"] < NUM_STEPS
     assert total > 50.0
@@ -67,20 +69,19 @@ def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
 
 def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
     """On the whole at most one in five; here, none of three."""
-    rate, _ = success_rate(skgrl, standing_still, trials=3)
-    assert rate == 0.0
+    assert total(trials(skgrl, standing_still(skgrl), 3), "success") == 0
 
 
 def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
-    rate, worst = success_rate(skgrl, reactive_rule, trials=3)
-    assert rate == 1.0
-    assert worst <= 1e-9
+    rows = trials(skgrl, reactive_rule, 3)
+    assert total(rows, "success") == 3
+    assert worst(rows, "worst_violation") <= 1e-9
 
 
 def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
-    rate, worst = success_rate(kgrl, reactive_rule, trials=3)
-    assert rate == 1.0
-    assert worst <= 1e-9
+    rows = trials(kgrl, reactive_rule, 3)
+    assert total(rows, "success") == 3
+    assert worst(rows, "worst_violation") <= 1e-9
 
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
@@ -101,7 +102,7 @@ def test_half_a_turn_of_everything_is_the_same_task(kmp):
     across = signs < 0
     felt = []
     for side in (1.0, -1.0):
-        observations = play(kmp, standing_still, options={"offset": (side * 1.0 * MM, side * 0.5 * MM)})[3]
+        observations = play(kmp, standing_still(kmp), options={"offset": (side * 1.0 * MM, side * 0.5 * MM)})[3]
         felt.append(observations[6:14].mean(axis=0))  # while the plug stands on the rim
     seen, other = felt[0], signs * felt[1]
     torques = slice(10, 12)

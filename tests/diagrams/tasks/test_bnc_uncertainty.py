@@ -6,7 +6,8 @@ import pytest
 from guiderail.diagrams.tasks.bnc_connector import make_env
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
 from guiderail.models.errors import InputError
-from guiderail.tools.bnc_rule import reactive_rule, success_rate
+from guiderail.tools.bnc_rule import reactive_rule
+from guiderail.tools.judging import total, trials
 
 
 def drawn(uncertain, count, seed=0):
@@ -46,4 +47,5 @@ def test_the_plug_in_the_tool_is_tilted():
 
 
 def test_a_rule_that_feels_the_torque_locks_a_tilted_plug_too():
-    assert success_rate(make_env(guidance="kgrl", uncertainty="disc", grasp_angle=1.0), reactive_rule, 4)[0] == 1.0
+    env = make_env(guidance="kgrl", uncertainty="disc", grasp_angle=1.0)
+    assert total(trials(env, reactive_rule, 4), "success") == 4
