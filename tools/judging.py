@@ -50,9 +50,7 @@ def held_out(
 
 def trials(env: gymnasium.Env, act: Act, number: int, seed: int = HELD_OUT_SEED) -> list[dict[str, Any]]:
     """Rows of held-out episodes, each of a run of its own: what is hidden in a run is drawn anew."""
-    return [
-        run_episode(env, act, held_out_seed=seed + index, episode=index, new_run=True) for index in range(number)
-    ]
+    return [run_episode(env, act, held_out_seed=seed + index, episode=index, new_run=True) for index in range(number)]
 
 
 def kept(file: Path, judge: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:

@@ -118,6 +118,8 @@ class Learner:
         self.episodes = 0
         self._practises = False
         self._steady: np.ndarray | None = None
+        self._burst = 0  # decisions for which it still goes on
+        self._burst_action: np.ndarray | None = None
 
     def begin(self) -> None:
         """Begins an episode, and decides how it explores."""
@@ -125,6 +127,7 @@ class Learner:
         share = self.preset.practise
         self._practises = int(self.episodes * share) > int((self.episodes - 1) * share)
         self._steady = self._uniform() if self.episodes <= self.preset.steady_episodes else None
+        self._burst = 0
         if self.proving is not None and self._practises:
             self.proving.begin(self.actor())
 
@@ -144,9 +147,24 @@ class Learner:
         if self.decisions < self.preset.learning_starts:
             return self._uniform()
         if not self._practises:
-            return self.model.predict(observation, deterministic=False)[0]
+            burst = self._kept_for_a_while()
+            return burst if burst is not None else self.model.predict(observation, deterministic=False)[0]
         with torch.no_grad():
             return self.actor()._predict(self.model.policy.obs_to_tensor(observation)[0], deterministic=True)[0].numpy()
+
+    def _kept_for_a_while(self) -> np.ndarray | None:
+        """Now and then one uniform action for several decisions; None in between.
+
+        The temporally extended exploration of Dabney, Ostrovski and Barreto (2021): it leaves where a policy has
+        settled, such as above all contact, and it says what going on in one direction is worth.
+        """
+        if self._burst == 0:
+            if not self.preset.bursts or self.random.random() >= self.preset.bursts:
+                return None
+            self._burst = int(self.random.integers(1, self.preset.longest_burst + 1))
+            self._burst_action = self._uniform()
+        self._burst -= 1
+        return self._burst_action
 
     def _uniform(self) -> np.ndarray:
         space = self.model.action_space

@@ -31,6 +31,8 @@ class Preset:
     entropy: str = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     units: tuple[int, ...] = (256, 256)  # of the hidden layers
     steady_episodes: int = 0  # the first ones, in which one action drawn uniformly is kept all the time
+    bursts: float = 0.0  # how likely, at an exploring decision, one action drawn uniformly is kept for a while
+    longest_burst: int = 8  # decisions
     practise: float = 0.0  # part of the episodes, evenly spread, that are acted without exploring
     layer_norm: bool = (
         False  # of the hidden layers, before their activation: critics that stay bounded where nobody was
@@ -136,7 +138,15 @@ def _as_setting(key: str, value: Any, example: Any) -> Any:
 
 def _check(preset: Preset) -> None:
     """Refuses settings that no learner can use."""
-    for key in ("train_every", "gradient_steps", "batch_size", "buffer_size", "learning_starts", "n_steps"):
+    for key in (
+        "train_every",
+        "gradient_steps",
+        "batch_size",
+        "buffer_size",
+        "learning_starts",
+        "n_steps",
+        "longest_burst",
+    ):
         if getattr(preset, key) < 1:
             raise InputError(f"the learner's {key} must be at least 1, not {getattr(preset, key)}")
     if preset.discount_of not in ("control_step", "decision"):
@@ -145,8 +155,9 @@ def _check(preset: Preset) -> None:
         raise InputError(f"the learner's steady_episodes must not be negative, not {preset.steady_episodes}")
     if preset.proven_by < 0:
         raise InputError(f"the learner's proven_by must not be negative, not {preset.proven_by}")
-    if not 0 <= preset.practise <= 1:
-        raise InputError(f"the learner's practise must be between 0 and 1, not {preset.practise}")
+    for key in ("practise", "bursts"):
+        if not 0 <= getattr(preset, key) <= 1:
+            raise InputError(f"the learner's {key} must be between 0 and 1, not {getattr(preset, key)}")
     if not (np.isfinite(preset.learning_rate) and preset.learning_rate > 0):
         raise InputError(f"the learner's learning_rate must be positive, not {preset.learning_rate}")
     for key, low in (("discount", 0.0), ("soft_update", 0.0), ("averaging", -1e-300)):
