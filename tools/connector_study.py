@@ -22,6 +22,7 @@ from guiderail.tools.train import train
 from guiderail.tools.training import configure
 
 TASK = "BncConnector"
+ENVIRONMENT: dict[str, Any] = {"reward": "shaped"}
 LEARNED = ("kgrl", "skgrl", "skgrl_adaptive", "residual", "safe_residual")
 UNLEARNED = ("demonstration", "rule")
 
@@ -40,7 +41,7 @@ class Cell:
     def config(self, episodes: int, station: str = "rails") -> RunConfig:
         """The run of so many episodes."""
         guidance = {"demonstration": "kmp", "rule": "kgrl", "skgrl_adaptive": "skgrl"}.get(self.method, self.method)
-        environment: dict[str, Any] = {"guidance": guidance, "uncertainty": self.uncertainty, "station": station}
+        environment = {**ENVIRONMENT, "guidance": guidance, "uncertainty": self.uncertainty, "station": station}
         if self.method == "skgrl_adaptive":
             environment["adaptive_history"] = True
         return configure(TASK, environment, episodes=episodes, seed=self.seed)

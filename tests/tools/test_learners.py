@@ -190,6 +190,21 @@ def test_so_many_episodes_practise_as_asked_for(preset):
         assert sum(practised) == 8 * share
 
 
+def test_exploring_keeps_one_action_for_a_while_now_and_then(preset):
+    settled = replace(preset, steady_episodes=0, learning_starts=1, bursts=0.2, longest_burst=5)
+    learner = make(settled)
+    live(learner, 20)
+    exploring = acted(learner, 1, decisions=400)[0]
+    kept = (np.diff(exploring, axis=0) == 0.0).all(axis=1)
+    runs = [len(run) for run in "".join("k" if k else " " for k in kept).split()]
+    assert max(runs) == settled.longest_burst - 1  # an action that is kept for n decisions comes again n − 1 times
+    assert 0.2 < kept.mean() < 0.5  # 0.2 begin, and last 3 decisions on average: two of eight and a bit are the same
+    practises = make(replace(settled, practise=1.0))
+    live(practises, 20)
+    practising = acted(practises, 1, decisions=50)[0]
+    assert (practising == practising[0]).all()
+
+
 def test_a_restored_learner_is_in_the_same_episode(preset):
     first = make(replace(preset, steady_episodes=2, practise=0.5))
     live(first, 20)
@@ -218,7 +233,9 @@ def test_the_result_is_the_actor_that_proved_itself_also_after_a_restart(preset)
     assert not torch.equal(practised[2], first.actor().state_dict()["mu.weight"])
 
 
-@pytest.mark.parametrize("settings", [{"steady_episodes": -1}, {"practise": -1}, {"practise": 1.5}, {"proven_by": -1}])
+@pytest.mark.parametrize(
+    "settings", [{"steady_episodes": -1}, {"practise": 1.5}, {"proven_by": -1}, {"bursts": 1.5}, {"longest_burst": 0}]
+)
 def test_episodes_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError):
         resolve_preset("robust", "tqc", settings)

@@ -15,10 +15,10 @@ from guiderail.tools.study import write_table
 TASK = "BncConnector"
 METHODS = ("kgrl", "skgrl")
 EPISODES, PRESET, EVALUATIONS = 45, "robust", 25
-ENVIRONMENT = {"uncertainty": "calibration"}
+ENVIRONMENT = {"uncertainty": "calibration", "reward": "shaped"}
 CONDITION = (
     "in simulation, on rails; a hidden offset of 1.0 to 1.5 mm per run and a few tenths per episode; the robust "
-    "preset, actions in x and y held ten control steps"
+    "preset, actions in x and y held ten control steps; the thesis's reward and 5 per millimetre of depth"
 )
 
 

@@ -8,6 +8,7 @@ import guiderail.diagrams  # noqa: F401 (registers)
 from guiderail.diagrams.tasks.bnc_connector import (
     ALIGNMENT,
     COLLISION_FORCE,
+    DEPTH_REWARD,
     MM,
     NUM_STEPS,
     make_env,
@@ -149,7 +150,7 @@ def test_shaped_reward_adds_the_depth_gained():
     depth = 0.0
     for _ in range(12):
         depth += env.step(np.zeros(2))[4]["depth"]
-    assert depth == pytest.approx((start - env.trace.measured[-1, 2]) / MM, abs=0.1)
+    assert depth == pytest.approx(DEPTH_REWARD * (start - env.trace.measured[-1, 2]) / MM, abs=0.5)
 
 
 def test_the_same_policy_drives_rails_and_arm():
