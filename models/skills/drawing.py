@@ -48,7 +48,7 @@ def draw(skill: Skill, path: str | Path) -> None:
         raise InputError(f"A state machine can't be drawn as {path.suffix or 'that'}; use .png, .svg, .pdf or .dot.")
     from matplotlib.figure import Figure
 
-    width, gap = 2.0, 1.5
+    width, gap = 1.8, 1.7
     tallest = max(len(state_lines(state)) for state in skill.states)
     size = (len(skill.states) * (width + gap) + 0.4, 0.2 * tallest + 1.0)
     figure = Figure(figsize=size, layout="constrained")
@@ -76,8 +76,17 @@ def draw(skill: Skill, path: str | Path) -> None:
             "",
             xy=(span[1] if forward else span[0], y),
             xytext=(span[0] if forward else span[1], y),
-            arrowprops={"arrowstyle": "-|>", "color": "#33506b", "connectionstyle": "arc3,rad=-0.25"},
+            arrowprops={"arrowstyle": "-|>", "color": "#33506b"},
         )
-        axes.text(sum(span) / 2, y + 0.28 * side, condition, ha="center", va="center", fontsize=8, color="#33506b")
+        axes.annotate(
+            condition,
+            xy=(sum(span) / 2, y),
+            xytext=(0, 4 * side),
+            textcoords="offset points",
+            ha="center",
+            va="bottom" if forward else "top",
+            fontsize=8,
+            color="#33506b",
+        )
     axes.set_title(f"{skill.name}: {skill.inputs} inputs", fontsize=10)
     figure.savefig(path, dpi=120)
