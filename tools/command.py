@@ -26,11 +26,11 @@ def _guiderail() -> None:
 def train(
     task: Annotated[str | None, typer.Argument(help="What is learned, such as NarrowPassage.")] = None,
     out: Annotated[Path | None, typer.Option(help="The run's folder; it must not exist, unless with --resume.")] = None,
-    guidance: Annotated[str | None, typer.Option(help="What guides the policy.  [default: skgrl]")] = None,
-    algorithm: Annotated[str | None, typer.Option(help="tqc or sac.  [default: tqc]")] = None,
+    guidance: Annotated[str | None, typer.Option(help="What guides the policy.  [default: skgrl or sct]")] = None,
+    algorithm: Annotated[str | None, typer.Option(help="tqc or sac.  [default: the task's]")] = None,
     episodes: Annotated[int | None, typer.Option(help="How many in all.  [default: 60]")] = None,
     seed: Annotated[int | None, typer.Option(help="Of everything random.  [default: 0]")] = None,
-    preset: Annotated[str | None, typer.Option(help="The learner's settings.  [default: robust]")] = None,
+    preset: Annotated[str | None, typer.Option(help="The learner's settings.  [default: the task's]")] = None,
     setting: Annotated[list[str] | None, typer.Option("--set", help="One setting, such as batch_size=128.")] = None,
     hold: Annotated[int | None, typer.Option(help="Control steps that an action lasts.")] = None,
     reward: Annotated[

@@ -14,6 +14,12 @@ from guiderail.tools.train import train
 
 DEFAULTS: dict[str, Any] = {"guidance": "skgrl", "algorithm": "tqc", "preset": "robust", "episodes": 60, "seed": 0}
 
+# Tasks that were measured with a learner and settings of their own; taken where neither is asked for.
+OWN_DEFAULTS: dict[str, dict[str, Any]] = {
+    "GridClamp": {"guidance": "sct", "algorithm": "sac", "preset": "clamp"},
+    "Pouring": {"guidance": "sct", "algorithm": "sac", "preset": "pouring"},
+}
+
 
 def configure(
     task: str,
@@ -70,10 +76,27 @@ def run(
         raise InputError("what should be learned? name a task, such as guiderail train NarrowPassage --out RUN")
     else:
         folder.refuse_existing()
+        environment, given = with_defaults(task, environment, given)
         config = configure(task, environment, settings=settings, **given)
     with TrainingProgress(config.episodes, name=config.task) as progress:
         rows = train(folder, config, resume=resume, report=report or progress.update)
     return summarise(out, rows) | finish(out)
+
+
+def with_defaults(
+    task: str, environment: Mapping[str, Any], given: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What was asked for, and for the rest what this task was measured with.
+
+    Args:
+        task: its name.
+        environment: arguments of the environment.
+        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them.
+    """
+    own = dict(OWN_DEFAULTS.get(task, {}))
+    guidance = own.pop("guidance", DEFAULTS["guidance"])
+    learner = {} if given.keys() & {"algorithm", "preset"} else own
+    return {"guidance": guidance, **environment}, {**learner, **given}
 
 
 def finish(out: Path) -> dict[str, str]:

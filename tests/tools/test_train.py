@@ -15,7 +15,7 @@ from guiderail.tools.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.episodes import make_environment
 from guiderail.tools.run_folder import RunFolder
 from guiderail.tools.train import train
-from guiderail.tools.training import run
+from guiderail.tools.training import configure, run, with_defaults
 
 # Trains like the fixture's run, and says after each episode that it is over; then the parent pulls the plug.
 CHILD = """
@@ -149,3 +149,19 @@ def test_one_thread_does_the_sums():
     threadpoolctl.threadpool_limits(2)
     make_environment("Bead", {})
     assert {pool["num_threads"] for pool in threadpoolctl.threadpool_info()} == {1}
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "algorithm"),
+    [("GridClamp", "clamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "robust", "tqc")],
+)
+def test_a_task_is_learned_as_it_was_measured_unless_told_otherwise(task, preset, algorithm):
+    environment, given = with_defaults(task, {}, {"seed": 3})
+    config = configure(task, environment, **given)
+    assert (config.preset, config.learner.algorithm, config.seed) == (preset, algorithm, 3)
+
+
+def test_a_learner_that_was_asked_for_is_taken_whole():
+    environment, given = with_defaults("GridClamp", {"guidance": "none"}, {"algorithm": "tqc"})
+    assert (environment, given) == ({"guidance": "none"}, {"algorithm": "tqc"})
+    assert configure("GridClamp", environment, **given).preset == "robust"
