@@ -115,24 +115,30 @@ class Learner:
         self.random = np.random.default_rng(seed)
         self.averaged = copy.deepcopy(self.model.actor) if preset.averaging else None
         self.proving = Proving(preset.proven_by) if preset.proven_by else None
-        self.episodes = 0
+        self.episodes = self.successes = 0
         self._practises = False
         self._steady: np.ndarray | None = None
         self._burst = 0  # decisions for which it still goes on
         self._burst_action: np.ndarray | None = None
 
+    def has_begun(self) -> bool:
+        """Whether enough is known to learn from; until then actions are drawn uniformly."""
+        return self.decisions >= self.preset.learning_starts and self.successes >= self.preset.successes_first
+
     def begin(self) -> None:
         """Begins an episode, and decides how it explores."""
         self.episodes += 1
         share = self.preset.practise
-        self._practises = int(self.episodes * share) > int((self.episodes - 1) * share)
         self._steady = self._uniform() if self.episodes <= self.preset.steady_episodes else None
+        due = int(self.episodes * share) > int((self.episodes - 1) * share)
+        self._practises = due and self._steady is None and self.has_begun()
         self._burst = 0
         if self.proving is not None and self._practises:
             self.proving.begin(self.actor())
 
     def finish(self, success: bool) -> None:
         """Ends an episode."""
+        self.successes += success
         if self.proving is not None and self._practises:
             self.proving.finish(success)
 
@@ -144,7 +150,7 @@ class Learner:
         """
         if self._steady is not None:
             return self._steady
-        if self.decisions < self.preset.learning_starts:
+        if not self.has_begun():
             return self._uniform()
         if not self._practises:
             burst = self._kept_for_a_while()
@@ -195,7 +201,7 @@ class Learner:
 
     def learn(self) -> None:
         """Trains if it is time to: every `train_every` decisions of the whole run, whatever the episodes' lengths."""
-        if self.decisions < self.preset.learning_starts or self.decisions % self.preset.train_every:
+        if not self.has_begun() or self.decisions % self.preset.train_every:
             return
         self.model.train(self.preset.gradient_steps, self.preset.batch_size)
         if self.averaged is not None:
@@ -252,6 +258,7 @@ class Learner:
         return arrays, {
             "decisions": self.decisions,
             "episodes": self.episodes,
+            "successes": self.successes,
             "proving": proving,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
@@ -281,7 +288,7 @@ class Learner:
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
-        self.episodes = values["episodes"]
+        self.episodes, self.successes = values["episodes"], values["successes"]
         if self.proving is not None:
             actors = {key.removeprefix("proving/"): v for key, v in tensors.items() if key.startswith("proving/")}
             self.proving.restore(actors, values["proving"])

@@ -28,6 +28,7 @@ class Preset:
     n_steps: int = 1  # decisions after which a return is guessed, and until which it is known
     buffer_size: int = 1_000_000
     learning_starts: int = 100  # decisions drawn uniformly before the first training
+    successes_first: int = 0  # episodes that must have succeeded before the first training, too
     entropy: str = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     units: tuple[int, ...] = (256, 256)  # of the hidden layers
     steady_episodes: int = 0  # the first ones, in which one action drawn uniformly is kept all the time
@@ -157,10 +158,9 @@ def _check(preset: Preset) -> None:
             raise InputError(f"the learner's {key} must be at least 1, not {getattr(preset, key)}")
     if preset.discount_of not in ("control_step", "decision"):
         raise InputError(f"the learner's discount_of must be control_step or decision, not {preset.discount_of!r}")
-    if preset.steady_episodes < 0:
-        raise InputError(f"the learner's steady_episodes must not be negative, not {preset.steady_episodes}")
-    if preset.proven_by < 0:
-        raise InputError(f"the learner's proven_by must not be negative, not {preset.proven_by}")
+    for key in ("steady_episodes", "proven_by", "successes_first"):
+        if getattr(preset, key) < 0:
+            raise InputError(f"the learner's {key} must not be negative, not {getattr(preset, key)}")
     for key in ("practise", "bursts"):
         if not 0 <= getattr(preset, key) <= 1:
             raise InputError(f"the learner's {key} must be between 0 and 1, not {getattr(preset, key)}")

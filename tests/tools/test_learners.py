@@ -190,6 +190,19 @@ def test_so_many_episodes_practise_as_asked_for(preset):
         assert sum(practised) == 8 * share
 
 
+def test_learning_waits_for_so_many_successes(preset):
+    learner = make(replace(preset, steady_episodes=0, learning_starts=4, successes_first=2, practise=1.0, proven_by=1))
+    untouched = weights(learner)
+    for success in (True, False, True):
+        np.testing.assert_array_equal(weights(learner), untouched)
+        learner.begin()
+        live(learner, 8)
+        learner.finish(success)
+    assert learner.proving.result() is None  # nobody has practised yet
+    live(learner, 8)
+    assert not np.array_equal(weights(learner), untouched)
+
+
 def test_exploring_keeps_one_action_for_a_while_now_and_then(preset):
     settled = replace(preset, steady_episodes=0, learning_starts=1, bursts=0.2, longest_burst=5)
     learner = make(settled)
@@ -234,7 +247,15 @@ def test_the_result_is_the_actor_that_proved_itself_also_after_a_restart(preset)
 
 
 @pytest.mark.parametrize(
-    "settings", [{"steady_episodes": -1}, {"practise": 1.5}, {"proven_by": -1}, {"bursts": 1.5}, {"longest_burst": 0}]
+    "settings",
+    [
+        {"steady_episodes": -1},
+        {"practise": 1.5},
+        {"proven_by": -1},
+        {"successes_first": -1},
+        {"bursts": 1.5},
+        {"longest_burst": 0},
+    ],
 )
 def test_episodes_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError):
