@@ -72,10 +72,10 @@ PRESETS = {
     # Measured on the grid clamp with SAC; TQC, which is the more cautious, learned later or not. A cost of force is
     # known long before a success is, and what is learned first is to stay away from all contact: an entropy that is
     # worth 2 at first and actions that are kept for a while lead back to it. Without the cost they lead away from where
-    # a policy only presses. A smaller discount makes it hurry, and hurrying pushes. Learning begins as soon as it knows two
-    # successes: sooner, one seed stayed away for 25 episodes, and later, more of them push at random. Three of four
-    # episodes do not explore: otherwise noise is what snaps the clamp in, and the mean stops short. Without normalized
-    # layers one seed of two forgot what it had learned.
+    # a policy only presses. A smaller discount makes it hurry, and hurrying pushes. Learning begins as soon as two
+    # episodes have succeeded: sooner, one seed stayed away for 25 episodes, and later, more of them push at random.
+    # Three of four episodes do not explore: otherwise noise is what snaps the clamp in, and the mean stops short.
+    # Without normalized layers one seed of two forgot what it had learned.
     "clamp": Preset(
         algorithm="sac",
         learning_rate=7e-4,
