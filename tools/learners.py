@@ -115,7 +115,7 @@ class Learner:
         self.random = np.random.default_rng(seed)
         self.averaged = copy.deepcopy(self.model.actor) if preset.averaging else None
         self.proving = Proving(preset.proven_by) if preset.proven_by else None
-        self.episodes = self.successes = 0
+        self.episodes = 0
         self._practises = False
         self._steady: np.ndarray | None = None
         self._burst = 0  # decisions for which it still goes on
@@ -123,7 +123,7 @@ class Learner:
 
     def has_begun(self) -> bool:
         """Whether enough is known to learn from; until then actions are drawn uniformly."""
-        return self.decisions >= self.preset.learning_starts and self.successes >= self.preset.successes_first
+        return self.decisions >= self.preset.learning_starts
 
     def begin(self) -> None:
         """Begins an episode, and decides how it explores."""
@@ -138,7 +138,6 @@ class Learner:
 
     def finish(self, success: bool) -> None:
         """Ends an episode."""
-        self.successes += success
         if self.proving is not None and self._practises:
             self.proving.finish(success)
 
@@ -258,7 +257,6 @@ class Learner:
         return arrays, {
             "decisions": self.decisions,
             "episodes": self.episodes,
-            "successes": self.successes,
             "proving": proving,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
@@ -288,7 +286,7 @@ class Learner:
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
-        self.episodes, self.successes = values["episodes"], values["successes"]
+        self.episodes = values["episodes"]
         if self.proving is not None:
             actors = {key.removeprefix("proving/"): v for key, v in tensors.items() if key.startswith("proving/")}
             self.proving.restore(actors, values["proving"])

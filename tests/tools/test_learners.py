@@ -190,17 +190,14 @@ def test_so_many_episodes_practise_as_asked_for(preset):
         assert sum(practised) == 8 * share
 
 
-def test_learning_waits_for_so_many_successes(preset):
-    learner = make(replace(preset, steady_episodes=0, learning_starts=4, successes_first=2, practise=1.0, proven_by=1))
-    untouched = weights(learner)
-    for success in (True, False, True):
-        np.testing.assert_array_equal(weights(learner), untouched)
+def test_nobody_practises_before_learning_has_begun(preset):
+    learner = make(replace(preset, steady_episodes=0, learning_starts=12, practise=1.0, proven_by=3))
+    for begun in (False, False, True, True):  # an episode has eight decisions: the second is still an exploring one
         learner.begin()
+        assert learner.has_begun() is begun
         live(learner, 8)
-        learner.finish(success)
-    assert learner.proving.result() is None  # nobody has practised yet
-    live(learner, 8)
-    assert not np.array_equal(weights(learner), untouched)
+        learner.finish(True)
+    assert learner.proving.state()[1]["row"] == 2
 
 
 def test_exploring_keeps_one_action_for_a_while_now_and_then(preset):
@@ -252,7 +249,6 @@ def test_the_result_is_the_actor_that_proved_itself_also_after_a_restart(preset)
         {"steady_episodes": -1},
         {"practise": 1.5},
         {"proven_by": -1},
-        {"successes_first": -1},
         {"bursts": 1.5},
         {"longest_burst": 0},
     ],
