@@ -164,7 +164,8 @@ class Demonstrations:
         except InputError as error:
             raise InputError(f"'{path}': {error}") from error
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"'{path}' is damaged or no demonstration file: {error}") from error
+            reason = str(error).split(". ")[0].rstrip(".")  # NumPy also advises to load what is pickled, unsafely
+            raise InputError(f"'{path}' is damaged or no demonstration file: {reason}") from error
         raise InputError(f"cannot read demonstrations from '{path.name}': the ending must be .npz or .csv")
 
     @classmethod
