@@ -23,6 +23,9 @@ from guiderail.tools.training import configure
 
 TASK = "BncConnector"
 ENVIRONMENT: dict[str, Any] = {"reward": "shaped"}
+# A jack that is elsewhere in every episode is met only now and then where the disc ends: what one learns from each must
+# be more. An action that is kept for a while says which way to go; seed 31 missed 7 of 100 jacks without, none with.
+SETTINGS: dict[str, dict[str, Any]] = {"disc": {"bursts": 0.15}}
 LEARNED = ("kgrl", "skgrl", "skgrl_adaptive", "residual", "safe_residual")
 UNLEARNED = ("demonstration", "rule")
 
@@ -44,7 +47,8 @@ class Cell:
         environment = {**ENVIRONMENT, "guidance": guidance, "uncertainty": self.uncertainty, "station": station}
         if self.method == "skgrl_adaptive":
             environment["adaptive_history"] = True
-        return configure(TASK, environment, episodes=episodes, seed=self.seed)
+        settings = SETTINGS.get(self.uncertainty)
+        return configure(TASK, environment, settings=settings, episodes=episodes, seed=self.seed)
 
 
 def connector_study(
