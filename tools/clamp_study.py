@@ -14,7 +14,7 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.tools.clamp_rule import searching_rule, straight_descent
-from guiderail.tools.judging import held_out, kept, mean, refuse_another, total, worst
+from guiderail.tools.judging import held_out, kept, mean, total, worst
 from guiderail.tools.policy import Policy
 from guiderail.tools.run_folder import RunConfig, RunFolder, converged_after
 from guiderail.tools.study import write_table
@@ -106,7 +106,7 @@ def judge(cell: Cell, out: Path) -> dict[str, Any]:
     if cell.method in LEARNED:
         begun = (folder.path / "config.yaml").exists()
         if begun:
-            refuse_another(folder, cell.config(), also=["episodes"])
+            folder.refuse_another(cell.config(), also=["episodes"])
         finished = begun and (folder.path / "policy.json").exists()
         trained = folder.episodes() if finished else train(folder, cell.config(), resume=begun)
     return _row(cell, trained, _held_out(cell, folder))

@@ -13,7 +13,7 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.tools.bnc_rule import reactive_rule
-from guiderail.tools.judging import Act, held_out, kept, mean, refuse_another, total, worst
+from guiderail.tools.judging import Act, held_out, kept, mean, total, worst
 from guiderail.tools.policy import Policy
 from guiderail.tools.run_folder import RunConfig, RunFolder
 from guiderail.tools.study import write_table
@@ -110,7 +110,7 @@ def judge(cell: Cell, out: Path) -> list[dict[str, Any]]:
     for mark in cell.marks:
         trained = _trained(folder)
         if trained:
-            refuse_another(folder, cell.config(mark))
+            folder.refuse_another(cell.config(mark))
         if len(trained) < mark:
             trained = train(folder, cell.config(mark), resume=bool(trained))
         elif len(trained) > mark and not _file(folder, cell, mark).exists():

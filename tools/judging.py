@@ -12,7 +12,7 @@ from rich.progress import track
 from guiderail.models.errors import InputError
 from guiderail.tools.episodes import make_environment, run_episode, standing_still
 from guiderail.tools.files import write_atomically
-from guiderail.tools.run_folder import RunConfig, RunFolder, read_table, table_text
+from guiderail.tools.run_folder import RunConfig, read_table, table_text
 
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
 
@@ -61,18 +61,6 @@ def kept(file: Path, judge: Callable[[], list[dict[str, Any]]]) -> list[dict[str
     if rows:
         write_atomically(file, table_text(rows).encode())
     return rows
-
-
-def refuse_another(folder: RunFolder, wanted: RunConfig, also: Sequence[str] = ()) -> None:
-    """A run with other settings is neither trained further nor judged as if it were this one.
-
-    Raises:
-        InputError: if task, environment, learner, seed or one of `also` differs.
-    """
-    found = folder.config()
-    for key in ("task", "environment", "learner", "seed", *also):
-        if getattr(found, key) != getattr(wanted, key):
-            raise InputError(f"{folder.path} holds a run with another {key}: name another folder with --out")
 
 
 def mean(rows: Rows, key: str) -> float | None:

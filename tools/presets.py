@@ -73,9 +73,9 @@ PRESETS = {
     # worth 2 at first and actions that are kept for a while lead back to it. Without the cost they lead away from where
     # a policy only presses. A smaller discount makes it hurry, and hurrying pushes. Learning sooner saves pushing at
     # random, but then it stays away for longer: one seed for 25 episodes. Half of the episodes do not explore:
-    # otherwise noise is what snaps the clamp in, and the mean stops short; where three of four did not, one policy of
-    # four missed one time in ten. Without normalized layers one seed of two forgot what it had learned. The last
-    # actor is taken: it still gets better, and one that proved itself for long is from the run's first half.
+    # otherwise noise is what snaps the clamp in, and the mean stops short. Without normalized layers one seed of two
+    # forgot what it had learned. The last actor is taken: it still gets better, and one that proved itself for long is
+    # from the run's first half.
     "clamp": Preset(
         algorithm="sac",
         learning_rate=7e-4,

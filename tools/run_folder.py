@@ -74,6 +74,17 @@ class RunFolder:
         if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
             raise InputError(f"{self.path} already exists: name another folder, or go on with that run by --resume")
 
+    def refuse_another(self, wanted: RunConfig, also: Sequence[str] = ()) -> None:
+        """A run with other settings is neither trained further nor judged as if it were this one.
+
+        Raises:
+            InputError: if task, environment, learner, seed or one of `also` differs.
+        """
+        found = self.config()
+        for key in ("task", "environment", "learner", "seed", *also):
+            if getattr(found, key) != getattr(wanted, key):
+                raise InputError(f"{self.path} holds a run with another {key}: name another folder with --out")
+
     def write_config(self, config: RunConfig) -> None:
         """Replaces `config.yaml`."""
         values = asdict(config) | {"learner": asdict(config.learner) | {"units": list(config.learner.units)}}

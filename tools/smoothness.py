@@ -2,7 +2,7 @@
 
 Each method explores the connector's skill with random actions, in free space (the jack is somewhere else) and on the
 connector: KGRL and sKGRL through their null space, everything else as a residual on the demonstrations. One table, one
-picture. A command's jerk has two parts: the demonstrations' own, which no method is below, and what exploring adds.
+picture. A command's jerk has two parts: the demonstrations' own, and what exploring adds.
 """
 
 from collections.abc import Callable

@@ -168,10 +168,7 @@ def _refuse_another(job: Job) -> None:
     """A folder that holds another run is never trained further as if it were this one."""
     if not _begun(job):
         return RunFolder(job.folder).refuse_existing()
-    found = RunFolder(job.folder).config()
-    for key in ("task", "environment", "learner", "seed", "episodes"):
-        if getattr(found, key) != getattr(job.config, key):
-            raise InputError(f"{job.folder} holds a run with another {key}: name another folder with --out")
+    return RunFolder(job.folder).refuse_another(job.config, also=["episodes"])
 
 
 def _cell(value: Any) -> str:
