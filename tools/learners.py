@@ -117,6 +117,7 @@ class Learner:
         self.proving = Proving(preset.proven_by) if preset.proven_by else None
         self.episodes = 0
         self._practises = False
+        self._row = 0  # practising episodes in a row that succeeded
         self._steady: np.ndarray | None = None
         self._burst = 0  # decisions for which it still goes on
         self._burst_action: np.ndarray | None = None
@@ -138,8 +139,10 @@ class Learner:
 
     def finish(self, success: bool) -> None:
         """Ends an episode."""
-        if self.proving is not None and self._practises:
-            self.proving.finish(success)
+        if self._practises:
+            self._row = self._row + 1 if success else 0
+            if self.proving is not None:
+                self.proving.finish(success)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """An exploring action: uniform until learning starts, then drawn from the policy.
@@ -164,7 +167,8 @@ class Learner:
         settled, such as above all contact, and it says what going on in one direction is worth.
         """
         if self._burst == 0:
-            if not self.preset.bursts or self.random.random() >= self.preset.bursts:
+            known = 0 < self.preset.bursts_until <= self._row
+            if known or not self.preset.bursts or self.random.random() >= self.preset.bursts:
                 return None
             self._burst = int(self.random.integers(1, self.preset.longest_burst + 1))
             self._burst_action = self._uniform()
@@ -257,6 +261,7 @@ class Learner:
         return arrays, {
             "decisions": self.decisions,
             "episodes": self.episodes,
+            "row": self._row,
             "proving": proving,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
@@ -286,7 +291,7 @@ class Learner:
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
-        self.episodes = values["episodes"]
+        self.episodes, self._row = values["episodes"], values["row"]
         if self.proving is not None:
             actors = {key.removeprefix("proving/"): v for key, v in tensors.items() if key.startswith("proving/")}
             self.proving.restore(actors, values["proving"])

@@ -33,6 +33,7 @@ class Preset:
     steady_episodes: int = 0  # the first ones, in which one action drawn uniformly is kept all the time
     bursts: float = 0.0  # how likely, at an exploring decision, one action drawn uniformly is kept for a while
     longest_burst: int = 8  # decisions
+    bursts_until: int = 0  # successes in a row while practising, after which there are no more bursts; 0 for never
     practise: float = 0.0  # part of the episodes, evenly spread, that are acted without exploring
     layer_norm: bool = (
         False  # of the hidden layers, before their activation: critics that stay bounded where nobody was
@@ -158,7 +159,7 @@ def _check(preset: Preset) -> None:
             raise InputError(f"the learner's {key} must be at least 1, not {getattr(preset, key)}")
     if preset.discount_of not in ("control_step", "decision"):
         raise InputError(f"the learner's discount_of must be control_step or decision, not {preset.discount_of!r}")
-    for key in ("steady_episodes", "proven_by"):
+    for key in ("steady_episodes", "proven_by", "bursts_until"):
         if getattr(preset, key) < 0:
             raise InputError(f"the learner's {key} must not be negative, not {getattr(preset, key)}")
     for key in ("practise", "bursts"):

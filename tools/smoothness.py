@@ -25,6 +25,7 @@ from guiderail.tools.study import write_table
 
 TASK = "BncConnector"
 HOLD = 10  # control steps that an action lasts where the connector is learned
+SLOW = 25  # half a second: actions that are as slow as what a low-pass at 1 Hz lets through
 PLACES = ("free", "connector")
 ELSEWHERE = (0.3, 0.3)  # m: where the jack is while the robot moves in free space
 ALONE = "demonstration alone"
@@ -58,7 +59,7 @@ def methods() -> list[Method]:
     usual = {"history": 10, "history_variance": HISTORY_VARIANCE}
     listed.append(Method("sKGRL adaptive", "skgrl", _white(), 1, usual | {"adaptive_history": True}))
     listed.append(Method(f"KGRL repeat {HOLD}", "kgrl", _white(HOLD), HOLD))
-    listed.append(Method(f"sKGRL repeat {HOLD}", "skgrl", _white(HOLD), HOLD, usual))
+    listed += [Method(f"sKGRL repeat {n}", "skgrl", _white(n), n, usual) for n in (HOLD, SLOW)]
     listed.append(Method("residual white", "residual", _white()))
     listed += [Method(f"residual repeat {n}", "residual", _white(n)) for n in (HOLD,)]
     listed += [Method(f"residual gSDE {n}", "residual", _state_dependent(n)) for n in (1, 8, 64)]

@@ -215,6 +215,22 @@ def test_exploring_keeps_one_action_for_a_while_now_and_then(preset):
     assert (practising == practising[0]).all()
 
 
+def test_bursts_end_once_practice_succeeds_and_come_back_when_it_fails(preset):
+    settled = replace(preset, steady_episodes=0, learning_starts=1, practise=0.5, bursts=1.0, bursts_until=2)
+    learner = make(settled)
+    live(learner, 20)
+    for success, bursts in ((None, True), (True, True), (True, False), (True, False), (False, True)):
+        if success is not None:
+            learner.finish(success)  # the practising episode
+        again = make(settled, seed=9)
+        again.restore(*learner.state())
+        for one in (again, learner):
+            exploring = acted(one, 1, decisions=30)[0]
+            assert bool((np.diff(exploring, axis=0) == 0.0).all(axis=1).any()) is bursts
+        learner.finish(False)  # an exploring episode proves nothing
+        learner.begin()
+
+
 def test_a_restored_learner_is_in_the_same_episode(preset):
     first = make(replace(preset, steady_episodes=2, practise=0.5))
     live(first, 20)
@@ -251,6 +267,7 @@ def test_the_result_is_the_actor_that_proved_itself_also_after_a_restart(preset)
         {"proven_by": -1},
         {"bursts": 1.5},
         {"longest_burst": 0},
+        {"bursts_until": -1},
     ],
 )
 def test_episodes_that_cannot_be_are_refused(settings):
