@@ -92,10 +92,12 @@ def clamp_study(
             f"{row['held_out_success']:.0%}" for row in of_seeds
         )
     if {"sct", "sct_no_force"} <= set(methods):
-        pairs = zip(by_method["sct"], by_method["sct_no_force"], strict=True)
-        result["squared force in training, with its cost as a part of without, each seed"] = ", ".join(
-            f"{a['training_squared_force'] / b['training_squared_force']:.2f}" for a, b in pairs
+        force, rough = (
+            [row["training_squared_force"] for row in by_method[method]] for method in ("sct", "sct_no_force")
         )
+        words = "squared force in training, with its cost as a part of without"
+        result[f"{words}, each seed"] = ", ".join(f"{a / b:.2f}" for a, b in zip(force, rough, strict=True))
+        result[f"{words}, all seeds together"] = f"{sum(force) / sum(rough):.2f}"
     return result
 
 

@@ -51,6 +51,7 @@ FLOOR = np.array([0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0
 # ρ [m², rad²]. The thesis's 1e-8 is (0.1 mm)², much for demonstrations that vary by a millimetre: jerk at the same
 # exploration RMS is then 52 times below KGRL's, at 1e-10 26 times (white actions in x and y, held ten control steps).
 HISTORY_VARIANCE = 1e-11
+ISOTROPIC_GROUPS = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
 COLLISION_FORCE = 35.0  # [N], of the impedance
 LOCKED_BESIDE = 1.0 * MM  # a plug that is as low and as turned beside the jack is not locked
@@ -139,7 +140,7 @@ def make_env(
         history_source=history_source,
         adaptive_history=adaptive_history,
         gains=None if gains is None else tuple(gains),
-        isotropic_groups=((0, 1, 2), (3, 4, 5)),
+        isotropic_groups=ISOTROPIC_GROUPS,
         # No walls are known here: what safe residual learning is projected to is the alignment alone.
         keep_out=KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), alignment_constraints(), margin=0.0),
     )

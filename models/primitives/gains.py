@@ -13,6 +13,7 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
+from guiderail.models.primitives.reference import ReferenceTrajectory
 
 
 def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.ndarray:
@@ -45,7 +46,7 @@ def authority_gains(primitive: LcNsKmp, kappa: float = 1.0, outputs: np.ndarray 
     explored = _explored(primitive, outputs)
     authority = unit_authority(primitive, outputs)
     _refuse_deaf(primitive, authority[explored])
-    target = np.sqrt(3) * kappa * _deviation(primitive)
+    target = np.sqrt(3) * kappa * deviation(primitive.reference)
     return np.divide(target, authority, out=np.zeros_like(target), where=explored)
 
 
@@ -68,7 +69,7 @@ def rms_gains(primitive: LcNsKmp, kappa: float = 1.0, hold: int = 1, outputs: np
     explored = np.flatnonzero(_explored(primitive, outputs))
     power = _white_power(primitive, hold)[np.ix_(explored, explored)]
     _refuse_deaf(primitive, np.sqrt(power.diagonal()))
-    squared = np.linalg.solve(power, (kappa * _deviation(primitive)[explored]) ** 2)
+    squared = np.linalg.solve(power, (kappa * deviation(primitive.reference)[explored]) ** 2)
     if (squared <= 0).any():
         raise InputError("the outputs are too correlated to explore all of them alike: name fewer in outputs=")
     gains = np.zeros(primitive.num_outputs)
@@ -78,12 +79,17 @@ def rms_gains(primitive: LcNsKmp, kappa: float = 1.0, hold: int = 1, outputs: np
 
 def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, hold: int = 1) -> np.ndarray:
     """RMS over the motion, in demonstration standard deviations, of uniform white actions in ±1 times `gains`, (O,)."""
-    return np.sqrt(_white_power(primitive, hold) @ np.asarray(gains, dtype=float) ** 2) / _deviation(primitive)
+    return np.sqrt(_white_power(primitive, hold) @ np.asarray(gains, dtype=float) ** 2) / deviation(primitive.reference)
 
 
 def authority(primitive: LcNsKmp, gains: np.ndarray) -> np.ndarray:
     """Where a constant ±1 action times `gains` ends up, in demonstration standard deviations, (O,)."""
-    return unit_authority(primitive) * np.asarray(gains, dtype=float) / _deviation(primitive)
+    return unit_authority(primitive) * np.asarray(gains, dtype=float) / deviation(primitive.reference)
+
+
+def deviation(reference: ReferenceTrajectory) -> np.ndarray:
+    """RMS over the motion of the demonstrations' standard deviations, (O,)."""
+    return np.sqrt(np.mean(reference.standard_deviations**2, axis=0))
 
 
 def _check_kappa(kappa: float) -> None:
@@ -103,10 +109,6 @@ def _explored(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray:
         raise InputError(f"explored outputs must be among 0 … {primitive.num_outputs - 1}: {indices.tolist()}")
     mask[indices] = True
     return mask
-
-
-def _deviation(primitive: LcNsKmp) -> np.ndarray:
-    return np.sqrt(np.mean(primitive.reference.standard_deviations**2, axis=0))
 
 
 def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:

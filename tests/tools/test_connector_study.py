@@ -4,7 +4,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.connector_study import Cell, connector_study
 from guiderail.tools.files import write_atomically
 from guiderail.tools.run_folder import read_table, table_text
-from guiderail.tools.smoothness import methods, smoothness
+from guiderail.tools.smoothness import measure, methods, quiet_commands, smoothness
 
 
 def judged(success):
@@ -57,3 +57,11 @@ def test_every_way_to_explore_has_a_name_of_its_own():
     assert len(set(names)) == len(names)
     for kind in ("KGRL", "adaptive", "white", "gSDE", "pink", "OU", "low-pass", "repeat"):
         assert any(kind in name for name in names), kind
+
+
+@pytest.mark.parametrize("name", ["KGRL", "residual white"])
+def test_every_way_to_explore_has_the_same_rms(name):
+    (method,) = [method for method in methods() if method.name == name]
+    free, contact = measure(method, (0, 1, 2, 3, 4, 5), quiet_commands(), episodes=1, kappa=0.5, seed=0)
+    assert (free["place"], contact["place"]) == ("free", "connector")
+    assert free["rms_in_deviations"] == pytest.approx(0.5, rel=0.05)
