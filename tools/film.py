@@ -9,11 +9,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from guiderail.tools.episodes import EpisodeRecord, make_environment, most_decisions, reset_held_out
+from guiderail.tools.episodes import EpisodeRecord, make_environment, reset_held_out
 from guiderail.tools.pictures import new_figure, save_figure
 
 ROWS, COLUMNS = 2, 3
-FRAMES = 24  # looked at in an episode that takes all its time: how it ends isn't known before
+FRAMES = 24  # kept at most: how long an episode takes isn't known before
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,14 @@ def write_film(picture: Path, episode: Shown) -> dict[str, Any]:
     env.reset(seed=episode.run_seed)
     observation, over = reset_held_out(env, episode.seed), False
     record = EpisodeRecord(env)
-    seen, decisions, stride = [(0.0, 0.0, env.render())], 0, -(-most_decisions(env) // FRAMES)
+    seen, decisions, stride = [(0.0, 0.0, env.render())], 0, 1
     while not over:
         observation, reward, terminated, truncated, info = env.step(episode.act(observation))
         record.add(float(reward), info)
         over, decisions = terminated or truncated, decisions + 1
         if over or decisions % stride == 0:
+            if len(seen) == FRAMES:
+                seen, stride = seen[::2], 2 * stride
             seen.append((len(base.trace) * base.task.control_period, info["contact_force"], env.render()))
     env.close()
     row = record.row(0)
