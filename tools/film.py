@@ -13,7 +13,29 @@ from guiderail.tools.episodes import EpisodeRecord, make_environment, reset_held
 from guiderail.tools.pictures import new_figure, save_figure
 
 ROWS, COLUMNS = 2, 3
-FRAMES = 24  # kept at most: how long an episode takes isn't known before
+FRAMES = 24  # kept at most
+
+
+@dataclass
+class Frames:
+    """What is seen of an episode, evenly spread over it and never much: how long it takes isn't known before."""
+
+    seen: list[Any]
+    stride: int = 1  # decisions from one to the next
+
+    def due(self, decision: int) -> bool:
+        """Whether this decision is one to look at."""
+        return decision % self.stride == 0
+
+    def keep(self, frame: Any) -> None:
+        """Takes one more; where there are `FRAMES`, every second one goes."""
+        if len(self.seen) == FRAMES:
+            self.seen, self.stride = self.seen[::2], 2 * self.stride
+        self.seen.append(frame)
+
+    def spread(self, number: int) -> list[Any]:
+        """So many of them, from the first to the last."""
+        return [self.seen[i] for i in np.linspace(0, len(self.seen) - 1, number).round().astype(int)]
 
 
 @dataclass(frozen=True)
@@ -61,22 +83,18 @@ def write_film(picture: Path, episode: Shown) -> dict[str, Any]:
     env.reset(seed=episode.run_seed)
     observation, over = reset_held_out(env, episode.seed), False
     record = EpisodeRecord(env)
-    seen, decisions, stride = [(0.0, 0.0, env.render())], 0, 1
+    frames, decisions = Frames([(0.0, 0.0, env.render())]), 0
     while not over:
         observation, reward, terminated, truncated, info = env.step(episode.act(observation))
         record.add(float(reward), info)
         over, decisions = terminated or truncated, decisions + 1
-        if over or decisions % stride == 0:
-            if len(seen) == FRAMES:
-                seen, stride = seen[::2], 2 * stride
-            seen.append((len(base.trace) * base.task.control_period, info["contact_force"], env.render()))
+        if over or frames.due(decisions):
+            frames.keep((len(base.trace) * base.task.control_period, info["contact_force"], env.render()))
     env.close()
     row = record.row(0)
     figure, axes = new_figure(ROWS, COLUMNS, (3.6 * COLUMNS, 2.95 * ROWS))
     figure.suptitle(f"{episode.heading}: {outcome(row)}", fontsize=10)
-    moments = np.linspace(0, len(seen) - 1, ROWS * COLUMNS).round().astype(int)
-    for axis, moment in zip(axes.flat, moments, strict=True):
-        time, force, image = seen[moment]
+    for axis, (time, force, image) in zip(axes.flat, frames.spread(ROWS * COLUMNS), strict=True):
         axis.imshow(cast(np.ndarray, image))
         axis.set_title(f"{time:.1f} s, {force:.0f} N", fontsize=9)
         axis.set_axis_off()
