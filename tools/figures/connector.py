@@ -92,7 +92,7 @@ def figure_5_9(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str,
 
 def figure_5_10(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str, Any]:
     """Mean jerk of the first ten training episodes, linear and angular, commanded and measured."""
-    results = _train(out, METHODS, seeds, episodes)
+    results = _train(out, METHODS, seeds, episodes, evaluations=0)
     figure, (axes,) = new_figure(1, 2, (10, 4.4))
     rows: list[dict[str, Any]] = []
     for axis, part, unit in zip(axes, ("linear", "angular"), ("m/s³", "rad/s³"), strict=True):
@@ -129,7 +129,9 @@ def figure_5_10(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str
     }
 
 
-def _train(out: Path, guidance: tuple[str, ...], seeds: int, episodes: int) -> list[dict[str, Any]]:
+def _train(
+    out: Path, guidance: tuple[str, ...], seeds: int, episodes: int, evaluations: int = EVALUATIONS
+) -> list[dict[str, Any]]:
     return runs.train_all(
         out,
         TASK,
@@ -138,7 +140,7 @@ def _train(out: Path, guidance: tuple[str, ...], seeds: int, episodes: int) -> l
         episodes=episodes,
         preset=PRESET,
         environment=ENVIRONMENT,
-        evaluations=EVALUATIONS,
+        evaluations=evaluations,
     )
 
 
