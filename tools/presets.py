@@ -74,10 +74,10 @@ PRESETS = {
     # worth 2 at first and actions that are kept for a while lead back to it. They are what pushes hardest: once three
     # practising episodes in a row succeeded, they end. A smaller discount makes it hurry, and hurrying pushes. Learning
     # sooner saves pushing at random, but then it stays away for longer: one seed for 25 episodes. Twelve gradient steps
-    # a decision instead of six halved the force from the fifteenth episode on. Three of four episodes do not explore:
-    # otherwise noise is what snaps the clamp in, and the mean stops short of it, where nothing moves any more; with
-    # half of them one seed of three missed 21 of 100. The averaged actor follows over four episodes or so, and is the
-    # result: quicker ones missed 6 to 8 of 100 on the seed where it missed none, one proven by practice 2. Without
+    # a decision instead of six take a third off the force from the fifteenth episode on. Three of four episodes do not
+    # explore: otherwise noise is what snaps the clamp in, and the mean stops short of it, where nothing moves any more;
+    # with half of them one seed of three missed 21 of 100. The averaged actor follows over four episodes or so, and is
+    # the result: quicker ones missed 6 to 8 of 100 on the seed where it missed none, one proven by practice 2. Without
     # normalized layers one seed of two forgot what it had learned.
     "clamp": Preset(
         algorithm="sac",

@@ -50,7 +50,7 @@ def figure_3_10(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str
 
 def figure_3_11(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str, Any]:
     """The rewards gained: each by its own reward, so that one is not above the other for being better."""
-    results = _train(out, seeds, episodes)
+    results = _train(out, seeds, episodes, evaluations=0)
     figure, ((axis,),) = new_figure(1, 1, (7, 4.2))
     _draw(axis, results, "return", "return of an episode")
     legend(figure, axis)
@@ -68,13 +68,13 @@ def figure_3_11(out: Path, seeds: int = 3, episodes: int = EPISODES) -> dict[str
     }
 
 
-def _train(out: Path, seeds: int, episodes: int) -> list[dict[str, Any]]:
+def _train(out: Path, seeds: int, episodes: int, evaluations: int = EVALUATIONS) -> list[dict[str, Any]]:
     """A row for each method and seed, with the run's episodes as `rows`; finished runs are used again."""
     jobs = []
     for kind in METHODS:
         for seed in range(seeds):
             config = configure(TASK, LEARNED[kind], algorithm=ALGORITHM, preset=PRESET, episodes=episodes, seed=seed)
-            jobs.append(Job(kind, config, out / "runs" / TASK / f"{kind}-{PRESET}-{episodes}-{seed}", EVALUATIONS))
+            jobs.append(Job(kind, config, out / "runs" / TASK / f"{kind}-{PRESET}-{episodes}-{seed}", evaluations))
     return [result | {"rows": RunFolder(result["folder"]).episodes()} for result in run_jobs(jobs)]
 
 
