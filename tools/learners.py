@@ -291,7 +291,7 @@ class Learner:
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
-        self.episodes, self._row = values["episodes"], values["row"]
+        self.episodes, self._row = values["episodes"], values.get("row", 0)  # older ones had no use for it
         if self.proving is not None:
             actors = {key.removeprefix("proving/"): v for key, v in tensors.items() if key.startswith("proving/")}
             self.proving.restore(actors, values["proving"])

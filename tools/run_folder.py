@@ -104,7 +104,8 @@ class RunFolder:
         try:
             values = yaml.safe_load(file.read_text(encoding="utf-8"))
             learner = dict(values["learner"])
-            settings = {key: value for key, value in learner.items() if key != "algorithm"}
+            # A setting that did not exist yet was off, as its default is, whatever the preset has become since.
+            settings = {key: value for key, value in (asdict(Preset()) | learner).items() if key != "algorithm"}
             config = RunConfig(
                 task=str(values["task"]),
                 environment=as_arguments(values["environment"]),

@@ -4,6 +4,7 @@ from dataclasses import replace
 import pytest
 
 from guiderail.models.errors import InputError
+from guiderail.tools.presets import PRESETS
 from guiderail.tools.run_folder import RunFolder, converged_after, read_table, table_text
 
 
@@ -19,6 +20,15 @@ def test_everything_that_decides_a_run_is_in_its_configuration(bead_config, tmp_
     text = (tmp_path / "run" / "config.yaml").read_text()
     for word in ("guidance: skgrl", "hold: 1", "learning_rate:", "seed: 5", "torch:", "drake:"):
         assert word in text
+
+
+def test_a_setting_that_a_run_is_older_than_is_off_whatever_its_preset_says_now(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(replace(bead_config, preset="clamp", learner=PRESETS["clamp"]))
+    file = tmp_path / "run" / "config.yaml"
+    lines = [line for line in file.read_text().splitlines() if "bursts_until" not in line]
+    file.write_text("\n".join(lines))
+    assert folder.config().learner == replace(PRESETS["clamp"], bursts_until=0)
 
 
 def test_numbers_come_back_exactly(tmp_path):
