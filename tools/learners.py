@@ -135,7 +135,7 @@ class Learner:
         self._practises = due and self._steady is None and self.has_begun()
         self._burst = 0
         if self.proving is not None and self._practises:
-            self.proving.begin(self.actor())
+            self.proving.begin(self.actor(), self._row)
 
     def finish(self, success: bool) -> None:
         """Ends an episode."""
@@ -291,7 +291,8 @@ class Learner:
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
-        self.episodes, self._row = values["episodes"], values.get("row", 0)  # older ones had no use for it
+        self.episodes = values["episodes"]
+        self._row = values.get("row", values["proving"].get("row", 0))  # where older checkpoints have it, if at all
         if self.proving is not None:
             actors = {key.removeprefix("proving/"): v for key, v in tensors.items() if key.startswith("proving/")}
             self.proving.restore(actors, values["proving"])

@@ -36,21 +36,19 @@ class Proving:
             episodes: successes before and after an actor, beyond which more prove nothing and the later one is taken.
         """
         self.episodes = episodes
-        self._row = 0
         self._proven: Candidate | None = None
         self._open: list[Candidate] = []  # whose row goes on
 
-    def begin(self, actor: torch.nn.Module) -> None:
-        """A practising episode begins, acted by this actor."""
+    def begin(self, actor: torch.nn.Module, before: int) -> None:
+        """A practising episode begins, acted by this actor; so many in a row succeeded before it."""
         copy = {key: value.detach().clone() for key, value in actor.state_dict().items()}
-        self._open.append(Candidate(copy, min(self._row, self.episodes)))
+        self._open.append(Candidate(copy, min(before, self.episodes)))
 
     def finish(self, success: bool) -> None:
         """It is over."""
         if not success:
-            self._proven, self._row, self._open = self._best(), 0, []
+            self._proven, self._open = self._best(), []
             return
-        self._row += 1
         for candidate in self._open:
             candidate.since += 1
         while self._open and self._open[0].since >= self.episodes:
@@ -78,7 +76,7 @@ class Proving:
         if self._proven is not None:
             kept["proven"] = self._proven
         tensors = {f"{name}/{key}": value for name, one in kept.items() for key, value in one.actor.items()}
-        return tensors, {"row": self._row, "rows": {name: [one.before, one.since] for name, one in kept.items()}}
+        return tensors, {"rows": {name: [one.before, one.since] for name, one in kept.items()}}
 
     def restore(self, tensors: Mapping[str, torch.Tensor], values: Mapping[str, Any]) -> None:
         """Becomes what it was when `state` was called."""
@@ -87,6 +85,5 @@ class Proving:
             actor, key = name.split("/", 1)
             actors[actor][key] = value
         kept = {name: Candidate(actors[name], *rows) for name, rows in values["rows"].items()}
-        self._row = values["row"]
         self._proven = kept.pop("proven", None)
         self._open = [kept[name] for name in sorted(kept, key=int)]

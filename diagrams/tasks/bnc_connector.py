@@ -48,8 +48,9 @@ COMPONENTS = 16
 # How well a hand repeats itself: added to the demonstrations' covariance as a standard deviation.
 FLOOR = np.array([0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE])
 
-# ρ [m², rad²]. The thesis's 1e-8 is (0.1 mm)², much for demonstrations that vary by a millimetre: jerk at the same
-# exploration RMS is then 52 times below KGRL's, at 1e-10 26 times (white actions in x and y, held ten control steps).
+# ρ [m², rad²]. The thesis's 1e-8 is (0.1 mm)², much for demonstrations that vary by a millimetre: linear jerk at
+# the same exploration RMS is then 2.6 times below KGRL's, at 1e-10 19 and at 1e-11 47 times (`guiderail study
+# smoothness`, an action at every control step).
 HISTORY_VARIANCE = 1e-11
 ISOTROPIC_GROUPS = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26

@@ -197,7 +197,7 @@ def test_nobody_practises_before_learning_has_begun(preset):
         assert learner.has_begun() is begun
         live(learner, 8)
         learner.finish(True)
-    assert learner.proving.state()[1]["row"] == 2
+    assert learner.state()[1]["row"] == 2
 
 
 def test_exploring_keeps_one_action_for_a_while_now_and_then(preset):

@@ -5,13 +5,14 @@ import torch
 from guiderail.tools.proving import Proving
 
 
-def lived(proving, outcomes, first=0):
+def lived(proving, outcomes, first=0, row=0):
     """Practising episodes with these outcomes, acted by actors whose one weight is the episode's number."""
     for number, success in enumerate(outcomes, first):
         actor = torch.nn.Linear(1, 1)
         torch.nn.init.constant_(actor.weight, number)
-        proving.begin(actor)
+        proving.begin(actor, row)
         proving.finish(success)
+        row = row + 1 if success else 0
     return proving
 
 
@@ -47,6 +48,6 @@ def test_goes_on_as_it_would_have():
     second = Proving(3)
     second.restore(*first.state())
     for one in (first, second):
-        lived(one, [1, 1, 1, 1, 1], first=5)
+        lived(one, [1, 1, 1, 1, 1], first=5, row=1)
     assert proven(first) == proven(second) == 7
     assert first.state()[1] == second.state()[1]
