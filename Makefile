@@ -17,18 +17,15 @@ test: $(VENV)/.ready lint
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	MYPYPATH=$(VENV)/types $(BIN)/mypy -p guiderail.models -p guiderail.systems -p guiderail.diagrams -p guiderail.tools
+	$(BIN)/mypy -p guiderail
 
 bench: $(VENV)/.ready
 	$(BIN)/guiderail bench primitive
 	$(BIN)/guiderail bench simulation
 
-# An editable install maps the folders to guiderail.*; a type checker can't follow that, so it gets the same map as links.
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[dev]"
-	mkdir -p $(VENV)/types/guiderail
-	for folder in models systems diagrams tools; do ln -sfn ../../../$$folder $(VENV)/types/guiderail/$$folder; done
 	touch $@
 
 clean:

@@ -1,5 +1,6 @@
 """The package as it is installed elsewhere: nothing forgotten."""
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -17,13 +18,13 @@ def packages(tmp_path_factory):
     build = tmp_path_factory.mktemp("wheel")
     source = tmp_path_factory.mktemp("source")
     tracked = subprocess.run(
-        ["git", "ls-files", "-z", "--", *FOLDERS, "pyproject.toml", "README.md", "LICENSE"],
+        ["git", "ls-files", "-z", "--", *FOLDERS, "src", "pyproject.toml", "README.md", "LICENSE"],
         cwd=ROOT, capture_output=True, text=True, check=True,
     ).stdout.split("\0")  # fmt: skip
     for name in filter(None, tracked):
         target = source / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes((ROOT / name).read_bytes())
+        shutil.copy2(ROOT / name, target, follow_symlinks=False)
     command = [
         sys.executable,
         "-m",
