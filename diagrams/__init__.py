@@ -1,25 +1,11 @@
 """Wiring: stations, guidance, tasks, and the Gymnasium environments made of them.
 
-Importing this package registers the environments; so does Gymnasium itself, through its plugin entry point. Neither
-imports Drake before an environment is made.
+Importing this package registers the environments of all tasks that are known: this package's own, and those of
+installed packages. Gymnasium does it in one go: `gymnasium.make("guiderail.diagrams:guiderail/NarrowPassage-v0")`.
 """
 
-import gymnasium
+from guiderail.diagrams.register import register_envs
 
-TASKS = {
-    "BncConnector": "guiderail.diagrams.tasks.bnc_connector:make_env",
-    "GridClamp": "guiderail.diagrams.tasks.grid_clamp:make_env",
-    "NarrowPassage": "guiderail.diagrams.tasks.narrow_passage:make_env",
-    "Pouring": "guiderail.diagrams.tasks.pouring:make_env",
-}
-
-
-def register_envs() -> None:
-    """Registers `guiderail/<Task>-v0` for every task; calling it again changes nothing."""
-    for task, entry_point in TASKS.items():
-        name = f"guiderail/{task}-v0"
-        if name not in gymnasium.registry:
-            gymnasium.register(id=name, entry_point=entry_point)
-
+__all__ = ["register_envs"]
 
 register_envs()

@@ -1,7 +1,9 @@
 """Cameras for image observations and for people, and the browser view."""
 
 import ctypes
+from dataclasses import dataclass
 
+import numpy as np
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -17,7 +19,7 @@ from pydrake.geometry import (
     Role,
     SceneGraph,
 )
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
@@ -26,17 +28,38 @@ from guiderail.models.errors import InputError
 _RENDERER = "vtk"
 
 
+@dataclass(frozen=True)
+class Camera:
+    """A fixed camera.
+
+    Attributes:
+        size: width and height of its image, in pixels.
+        vertical_fov: its vertical field of view [rad].
+        X_WC: where it is; C has x to the right, y down and z into the picture.
+    """
+
+    size: tuple[int, int]
+    vertical_fov: float
+    X_WC: RigidTransform
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
+    """The pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), the horizon level."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return RigidTransform(RotationMatrix(np.stack([right, np.cross(forward, right), forward], axis=1)), eye)
+
+
+def look_from_front(target: np.ndarray, distance: float, height: float) -> RigidTransform:
+    """A camera X_WC that looks slightly down at `target` from the side that faces away from the arm."""
+    return look_at(target + np.array([0.8 * distance, -0.6 * distance, height]), target)
+
+
 def add_camera(
-    builder: DiagramBuilder,
-    scene_graph: SceneGraph,
-    query: OutputPort,
-    name: str,
-    *,
-    size: tuple[int, int],
-    vertical_fov: float,
-    X_WC: RigidTransform,  # C: x to the right, y down, z into the picture
+    builder: DiagramBuilder, scene_graph: SceneGraph, query: OutputPort, name: str, camera: Camera
 ) -> OutputPort:
-    """Adds a fixed camera and returns its colour image, an `ImageRgba8U` of `size` = (width, height).
+    """Adds a camera and returns its colour image, an `ImageRgba8U`.
 
     Raises:
         InputError: if this machine lacks the library that renders without a display.
@@ -45,16 +68,17 @@ def add_camera(
     if not scene_graph.HasRenderer(_RENDERER):
         scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     clipping = ClippingRange(0.01, 10.0)
-    core = RenderCameraCore(_RENDERER, CameraInfo(*size, vertical_fov), clipping, RigidTransform())
-    camera = RgbdSensor(
+    info = CameraInfo(*camera.size, camera.vertical_fov)
+    core = RenderCameraCore(_RENDERER, info, clipping, RigidTransform())
+    sensor = RgbdSensor(
         parent_id=scene_graph.world_frame_id(),
-        X_PB=X_WC,
+        X_PB=camera.X_WC,
         color_camera=ColorRenderCamera(core, show_window=False),
         depth_camera=DepthRenderCamera(core, DepthRange(0.02, 9.0)),
     )
-    builder.AddNamedSystem(name, camera)
-    builder.Connect(query, camera.query_object_input_port())
-    return camera.color_image_output_port()
+    builder.AddNamedSystem(name, sensor)
+    builder.Connect(query, sensor.query_object_input_port())
+    return sensor.color_image_output_port()
 
 
 def check_rendering() -> None:

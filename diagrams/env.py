@@ -30,9 +30,9 @@ class GuidedEnv(DrakeGymEnv):
 
     `info` has at every step, and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
     `constraint_violation` and `measured_violation` (the worst of the step; negative is slack), `contact_force` (the
-    largest of the step, N), every reward term by name (summed over the step), and `control_steps` since the reset. At
-    the end of an episode it also has `ledger`, the safety ledger's row as a dict. A reset's `info` also has what the
-    task drew.
+    largest of the step, N), `fallback` (whether guidance fell back to something safe in it), every reward term by name
+    (summed over the step), and `control_steps` since the reset. At the end of an episode it also has `ledger`, the
+    safety ledger's row as a dict. A reset's `info` also has what the task drew.
 
     An episode that lasts as long as the task allows is truncated with `termination` "time_limit". Where the simulation
     itself fails (a solver that doesn't converge, NaN), the episode is truncated with the last sound observation, and
@@ -59,7 +59,7 @@ class GuidedEnv(DrakeGymEnv):
         if isinstance(hold, bool) or not isinstance(hold, int | np.integer) or hold < 1:
             raise InputError(f"hold is the number of control steps an action lasts: give an integer from 1, not {hold}")
         diagram = task.diagram
-        _check_render_mode(task, render_mode)
+        _check_view(task, render_mode)
         self.task = task
         self.hold = int(hold)
         # The parent class writes into whatever `metadata` it finds; this one is our own, not every environment's.
@@ -90,6 +90,7 @@ class GuidedEnv(DrakeGymEnv):
         self._commanded_violation_port = diagram.GetOutputPort("commanded_violation")
         self._measured_violation_port = diagram.GetOutputPort("measured_violation")
         self._force_port = diagram.GetOutputPort("contact_force")
+        self._fallback_port = diagram.GetOutputPort("fallback")
         self._ledger_port = diagram.GetOutputPort("ledger")
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
         self._pose_port = diagram.GetOutputPort("pose")
@@ -100,7 +101,7 @@ class GuidedEnv(DrakeGymEnv):
         self._violations = (-np.inf, -np.inf)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Starts an episode; `options` are the task's own (see its `make_env`)."""
+        """Starts an episode; `options` are the task's own (its `Reset`)."""
         # Not the parent's reset: it initializes before the state is set, and refuses options.
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
@@ -117,7 +118,7 @@ class GuidedEnv(DrakeGymEnv):
             float(self._commanded_violation_port.Eval(context)[0]),
             float(self._measured_violation_port.Eval(context)[0]),
         )
-        info = self._info(0, *self._violations, 0.0, dict.fromkeys(self.task.reward_terms, 0.0))
+        info = self._info(0, *self._violations, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
         info.update(drawn)
         return self._observation, info
 
@@ -138,7 +139,7 @@ class GuidedEnv(DrakeGymEnv):
         commanded_violation = measured_violation = -np.inf
         terms = dict.fromkeys(self.task.reward_terms, 0.0)
         termination = 0
-        failure = None
+        fallback, failure = False, None
         first_step = self._control_steps
         for _ in range(self.hold):
             try:
@@ -160,6 +161,7 @@ class GuidedEnv(DrakeGymEnv):
             peak_force = max(peak_force, force)
             commanded_violation = max(commanded_violation, float(self._commanded_violation_port.Eval(context)[0]))
             measured_violation = max(measured_violation, float(self._measured_violation_port.Eval(context)[0]))
+            fallback = fallback or bool(self._fallback_port.Eval(context)[0])
             for name, port in self._term_ports:
                 terms[name] += float(port.Eval(context)[0])
             self.trace.append(self._desired_pose_port.Eval(context), pose, force, reward)
@@ -175,7 +177,7 @@ class GuidedEnv(DrakeGymEnv):
             # It failed before there was anything new to read.
             commanded_violation, measured_violation = self._violations
         self._violations = commanded_violation, measured_violation
-        info = self._info(termination, commanded_violation, measured_violation, peak_force, terms)
+        info = self._info(termination, commanded_violation, measured_violation, peak_force, fallback, terms)
         if failure is not None:
             info["simulation_failure"] = failure
         else:
@@ -222,21 +224,31 @@ class GuidedEnv(DrakeGymEnv):
             return self.observation_port.Eval(context).data[:, :, :3].copy()
         return self.observation_port.Eval(context).astype(self.observation_space.dtype)
 
-    def _info(self, termination, commanded_violation, measured_violation, force, terms) -> dict[str, Any]:
+    def _info(self, termination, commanded_violation, measured_violation, force, fallback, terms) -> dict[str, Any]:
         return {
             "is_success": TERMINATIONS[termination] == "success",
             "termination": TERMINATIONS[termination],
             "constraint_violation": commanded_violation,
             "measured_violation": measured_violation,
             "contact_force": force,
+            "fallback": fallback,
             "control_steps": self._control_steps,
             **terms,
         }
 
 
-def _check_render_mode(task: TaskDiagram, render_mode: str | None) -> None:
+def check_render_mode(render_mode: str | None) -> None:
+    """Refuses a word that is no render mode, before anything is built.
+
+    Raises:
+        InputError: naming those that there are.
+    """
     if render_mode not in (None, "human", "rgb_array"):
         raise InputError(f"there is no render mode '{render_mode}': use None, 'human' or 'rgb_array'")
+
+
+def _check_view(task: TaskDiagram, render_mode: str | None) -> None:
+    check_render_mode(render_mode)
     if render_mode == "human" and task.meshcat is None:
         raise InputError("this environment has no Meshcat: make it with render_mode='human'")
     if render_mode == "rgb_array" and not task.diagram.HasOutputPort("rgb_image"):

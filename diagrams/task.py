@@ -21,6 +21,7 @@ PORTS = (
     "ledger",
     "desired_pose",
     "pose",
+    "fallback",
 )
 """The output ports that every task's diagram exports, beside one per reward term."""
 
@@ -76,6 +77,7 @@ class TaskDiagram:
     ``ledger``              the `SafetyLedger`'s row, named as in `ledger_fields`
     ``desired_pose``        (O,) what is commanded
     ``pose``                (O,) what is measured
+    ``fallback``            (1,) 1 where guidance commanded something safe instead of what was asked for
     ``rgb_image``           an abstract `ImageRgba8U`; only where the task was built with a camera
     ======================= ================================================================================
 
@@ -98,6 +100,7 @@ class TaskDiagram:
             pushes the robot. None where a task has no such thing.
         meshcat: where the diagram publishes to, for `render_mode="human"`.
         symmetry: of the task, where it has one; a learner may learn from what it saw, seen from the other side.
+        declaration: the `Task` that this was assembled of, where it was.
     """
 
     diagram: Diagram
@@ -110,6 +113,7 @@ class TaskDiagram:
     push: Callable[[Context, np.ndarray], None] | None = None
     meshcat: Meshcat | None = None
     symmetry: Symmetry | None = None
+    declaration: Any = None
 
     def __post_init__(self):
         missing = [name for name in (*PORTS, *self.reward_terms) if not self.diagram.HasOutputPort(name)]

@@ -5,6 +5,12 @@ from __future__ import annotations
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+POSE_SIZE = 6
+"""Numbers in a pose."""
+
+WRENCH_SIZE = 6
+"""Numbers in a wrench: [fx fy fz tx ty tz], N and Nm."""
+
 
 def pose_to_transform(pose: np.ndarray) -> RigidTransform:
     """X = (Rz(a) Ry(b) Rx(c), [x y z]) of pose = [x y z a b c], metres and radians."""

@@ -17,9 +17,12 @@ import numpy as np
 from guiderail.diagrams.recording import DrivenStation, along
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import Workcell
-from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, make_env, make_station
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS
+from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.objects.bnc_motion import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.command_watch import CommandWatch
@@ -87,7 +90,7 @@ def _one_run(name: str, task: str) -> dict[str, float]:
     """Simulated seconds per second of CPU time while the plug is seated, turned and locked, or the clamp snaps in."""
     workcell, times, poses, contact = _motion(task)
     with timed_callbacks() as spent:
-        station = make_station(name, workcell)
+        station = STATIONS.get(name).build(workcell)
         driven = DrivenStation(station, along(times, poses), num_samples=NUM_STEPS)
         driven.start(poses[0])
         first, last = (round(t / CONTROL_PERIOD) for t in contact)
@@ -111,7 +114,7 @@ def _motion(task: str) -> tuple[Workcell, np.ndarray, np.ndarray, tuple[float, f
 
 def env_seconds(guidance: str = "kgrl") -> float:
     """CPU seconds of 400 control steps of the environment on rails with random actions; the best of some episodes."""
-    env = make_env(guidance=guidance, uncertainty="disc", hold=5)
+    env = make_env("BncConnector", guidance=guidance, uncertainty="disc", hold=5)
     rng = np.random.default_rng(0)
     best = np.inf
     for episode in range(1 + REPEATS):

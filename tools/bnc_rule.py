@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, POSE_CENTRE, POSE_SCALE, make_env
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, POSE_CENTRE, POSE_SCALE
 from guiderail.models.objects.bnc_motion import MM, RIM
 from guiderail.tools.episodes import standing_still
 from guiderail.tools.film import Shown, outcome, write_film
@@ -71,7 +72,7 @@ def main(arguments: list[str] | None = None) -> None:
         show(options)
         return
     for uncertainty in ("known", "calibration", "disc"):
-        env = make_env(guidance=options.guidance, uncertainty=uncertainty, station=options.station)
+        env = make_env("BncConnector", guidance=options.guidance, uncertainty=uncertainty, station=options.station)
         rates = {
             name: mean(trials(env, act, options.trials), "success")
             for name, act in (("demonstration", standing_still(env)), ("rule", reactive_rule))

@@ -13,8 +13,10 @@ import json
 import numpy as np
 
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.grid_clamp import CENTRE, MM, SCALE, make_env, make_skill
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.grid_clamp import CENTRE, SCALE, make_skill
 from guiderail.models.objects.grid_clamp import GridClampDimensions
+from guiderail.models.units import MM
 from guiderail.tools.judging import total, trials, worst
 
 _D = GridClampDimensions()
@@ -74,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--station", default="rails")
     options = parser.parse_args(arguments)
     for uncertainty in ("known", "calibration"):
-        env = make_env(uncertainty=uncertainty, station=options.station)
+        env = make_env("GridClamp", uncertainty=uncertainty, station=options.station)
         for policy in (straight_descent, searching_rule):
             rows = trials(env, policy, options.trials)
             what = {"uncertainty": uncertainty, "policy": policy.__name__, "trials": options.trials}

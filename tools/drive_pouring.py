@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from guiderail.diagrams.tasks.pouring import make_env
+from guiderail.diagrams.make import make_env
 from guiderail.systems.meshcat_device import MeshcatDevice
 
 AXES = ((0, 1.0), (1, -1.0), (3, -1.0))
@@ -33,7 +33,7 @@ def drive(env, driver: Callable[[np.ndarray], np.ndarray], episodes: int) -> lis
 
 def main() -> None:
     """Until somebody has had enough."""
-    env = make_env(render_mode="human")
+    env = make_env("Pouring", render_mode="human")
     meshcat = env.task.meshcat
     assert meshcat is not None
     device = MeshcatDevice(meshcat, AXES, KEYS, env.task.control_period)

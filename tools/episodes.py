@@ -10,19 +10,22 @@ from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
+from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.make import resolve
+from guiderail.diagrams.tasks.task import TASKS, environment_id
 from guiderail.diagrams.trace import mean_jerk
 from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
 
 # Guidance in which an action of zero is the demonstration, so that step-0 success can be stated.
-DEMONSTRATED = ("kmp", "residual", "safe_residual", "kgrl", "skgrl")
-START_DEVIATION = 0.01  # m, of a held-out start from the usual one
+DEMONSTRATED = tuple(name for name in GUIDANCE.names() if GUIDANCE.get(name).demonstrates)
 # What the safety ledger counts.
 COUNTS = ("collisions", "collision_steps", "saturations", "fallbacks")
 
 
 def known_tasks() -> list[str]:
-    """The tasks that there are."""
-    return sorted(spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")
+    """The tasks that there are: those that are declared, and environments that somebody registered as guiderail's."""
+    return sorted({*TASKS.names(), *(spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")})
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -31,9 +34,11 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     Raises:
         InputError: for an unknown task, or an argument that it does not take.
     """
+    if task in TASKS.names():
+        return resolve(task, arguments).values
     if task not in known_tasks():
-        raise InputError(f"there is no task {task!r}: choose one of {', '.join(known_tasks())}")
-    entry = gymnasium.spec(f"guiderail/{task}-v0").entry_point
+        raise InputError(f"there is no task {task!r}: {did_you_mean(task, known_tasks())}")
+    entry = gymnasium.spec(environment_id(task)).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
     taken = {k: v for k, v in inspect.signature(creator).parameters.items() if k not in ("self", "render_mode")}
     unknown = sorted(set(arguments) - set(taken))
@@ -54,7 +59,7 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
     """
     threadpool_limits(1)
     arguments = check_environment(task, arguments)
-    return gymnasium.make(f"guiderail/{task}-v0", disable_env_checker=True, render_mode=render_mode, **arguments)
+    return gymnasium.make(environment_id(task), disable_env_checker=True, render_mode=render_mode, **arguments)
 
 
 def most_decisions(env: gymnasium.Env) -> int:
@@ -124,22 +129,8 @@ def split_jerk(poses: np.ndarray, period: float) -> dict[str, float]:
 
 
 def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
-    """Starts an episode with conditions that training never drew; `options` are further ones of the reset.
-
-    A task draws them by its reset option `held_out`, or at least by the seed, which is none of training's. One in which
-    every episode starts from the same place is started a little beside it instead.
-    """
-    try:
-        return env.reset(seed=seed, options={"held_out": True} | options)[0]
-    except InputError as error:
-        if "held_out" not in str(error):
-            raise
-    usual = env.reset(seed=seed + 1)[1].get("start")
-    observation, drawn = env.reset(seed=seed)
-    if usual is None or not np.array_equal(usual, drawn["start"]):
-        return observation
-    beside = START_DEVIATION * np.random.default_rng(seed).standard_normal(len(drawn["start"]))
-    return env.reset(seed=seed, options={"start": np.asarray(drawn["start"]) + beside})[0]
+    """Starts an episode with conditions that training never drew; `options` are further ones of the reset."""
+    return env.reset(seed=seed, options={"held_out": True} | options)[0]
 
 
 def run_episode(

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from guiderail.diagrams.scene import Scene, Viewpoint, in_plane
 from guiderail.models.errors import InputError
 from guiderail.tools.episodes import DEMONSTRATED, make_environment, run_episode, standing_still
 from guiderail.tools.files import write_atomically
@@ -17,7 +18,6 @@ from guiderail.tools.film import Shown, outcome, write_film
 from guiderail.tools.policy import Policy
 from guiderail.tools.progress import TOLERANCE
 from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.scenes import Camera, scene
 
 FRAMES_PER_SECOND = 32.0
 SEEN_THROUGH = 0.35  # opacity of everything but paths, for who asks for it
@@ -97,7 +97,8 @@ def write_page(html: Path, episode: Shown) -> dict[str, Any]:
     base.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=episode.run_seed)
 
-    shown = scene(episode.task)
+    declared = base.task.declaration
+    shown = Scene(to_world=in_plane) if declared is None else declared.scene()
     lines: dict[str, list[np.ndarray]] = {"demonstrations": [shown.to_world(d) for d in shown.demonstrations]}
     lines["constraint"] = list(shown.constraint)
 
@@ -122,7 +123,7 @@ def write_page(html: Path, episode: Shown) -> dict[str, Any]:
     for ornament in ("/Grid", "/Axes"):
         meshcat.SetProperty(ornament, "visible", False)
     views = dict(shown.arm_views) if episode.environment.get("station") == "arm" else {}
-    camera = next(iter(views.values()), shown.camera)
+    camera = next(iter(views.values()), shown.viewpoint)
     if camera is not None:
         meshcat.SetCameraPose(*(np.array(point) for point in camera))
     page = meshcat.StaticHtml()
@@ -155,7 +156,7 @@ def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray,
     return (points[:, None] + radius * ring).reshape(-1, 3), faces
 
 
-def _with_caption(page: str, episode: Shown, row: dict[str, Any], drawn: set[str], views: Mapping[str, Camera]) -> str:
+def _with_caption(page: str, episode: Shown, row: dict[str, Any], drawn: set[str], views: Mapping[str, Viewpoint]) -> str:
     """The page with a legend over it: what it shows, the numbers of the episode shown, and where to look from."""
     entries = "".join(
         f'<div><span style="color:rgb({",".join(str(round(255 * c)) for c in colour[:3])})">&#9644;</span> '
@@ -177,7 +178,7 @@ def _with_caption(page: str, episode: Shown, row: dict[str, Any], drawn: set[str
     return f"{head}{caption}{body}{tail}" if body else page + caption
 
 
-def _buttons(views: Mapping[str, Camera]) -> str:
+def _buttons(views: Mapping[str, Viewpoint]) -> str:
     """A button that lets one see the paths within things, and one for each view."""
     # Meshcat's own camera lives in a frame whose y is up. What is opaque is asked of whatever is on the page by then.
     script = (

@@ -12,14 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
-from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector import (
-    HISTORY_VARIANCE,
-    ISOTROPIC_GROUPS,
-    alignment_constraints,
-    reference_trajectory,
-)
+from guiderail.diagrams.make import known
+from guiderail.diagrams.tasks.bnc_connector import HISTORY_VARIANCE, reference_trajectory
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.models.smoothness import log_dimensionless_jerk, spectral_arc_length
@@ -177,10 +171,9 @@ def _strength(method: Method, explored: tuple[int, ...], kappa: float) -> dict[s
     if method.guidance == "kmp":
         return {}
     # Built once more, only for its primitive: what the environment would explore with at κ = 1.
-    known = {key: method.environment[key] for key in ("history", "history_variance") if key in method.environment}
-    skill = PrimitiveSkill(
-        reference_trajectory(), alignment_constraints(), CONTROL_PERIOD, isotropic_groups=ISOTROPIC_GROUPS, **known
-    )
+    explored_with = {key: method.environment[key] for key in ("history", "history_variance") if key in method.environment}
+    skill = known(TASK, guidance=method.guidance, explored=None, **explored_with).demonstrations
+    assert skill is not None
     indices = np.array(explored)
     if method.guidance == "residual":  # the same for all outputs of a unit, whose deviations differ
         reached = RMS * (skill.residual_gains() / deviation(skill.reference))[indices]

@@ -19,8 +19,9 @@ import numpy as np
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.bnc_connector import MM, make_env
+from guiderail.diagrams.make import make_env
 from guiderail.models.objects.bnc_interference import interference
+from guiderail.models.units import MM
 from guiderail.tools.stress import Case, Witness, run
 
 EXPLORED = {"x, y": (0, 1), "all six": (0, 1, 2, 3, 4, 5)}
@@ -74,6 +75,7 @@ def cases(station: str = "rails") -> list[Case]:
             name=f"{guidance}, {uncertainty}, {outputs}",
             make=partial(
                 make_env,
+                "BncConnector",
                 guidance=guidance,
                 uncertainty=uncertainty,
                 explored=EXPLORED[outputs],

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.env import GuidedEnv
-from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET, make_env
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.tools.progress import TOLERANCE
@@ -31,7 +32,7 @@ def stress(steps: int, seed: int = 0, progress: bool = False, input_speed: float
         What was found: control steps, episodes by how they ended, collisions, the worst commanded and measured
         violation, and the greatest tilt [rad] that was commanded in the upright state.
     """
-    env = make_env(mug_offset=MAX_MUG_OFFSET, input_speed=input_speed)
+    env = make_env("Pouring", mug_offset=MAX_MUG_OFFSET, input_speed=input_speed)
     rng = np.random.default_rng(seed)
     found: dict[str, Any] = {"steps": 0, "collisions": 0, "commanded": 0.0, "measured": 0.0, "early_tilt": 0.0}
     endings: Counter[str] = Counter()

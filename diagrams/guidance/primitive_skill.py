@@ -34,6 +34,7 @@ class PrimitiveSkill:
         gains: (O,) raw null-space units per action, instead of those computed from κ.
         isotropic_groups: outputs of one unit each; a residual moves all outputs of a group alike. One group unless
             given.
+        solver: of the constrained primitive's QP: "daqp", "osqp" or "piqp".
         keep_out: what safe residual learning stops before; None where nobody has written that down.
         wrench_size: numbers in a measured wrench.
     """
@@ -53,6 +54,7 @@ class PrimitiveSkill:
     explored: tuple[int, ...] | None = None
     gains: tuple[float, ...] | None = None
     isotropic_groups: tuple[tuple[int, ...], ...] | None = None
+    solver: str = "daqp"
     keep_out: KeepOut | None = None
     wrench_size: int = 6
 
@@ -112,6 +114,7 @@ class PrimitiveSkill:
             history=self.history if history else 0,
             history_variance=self.history_variance,
             constraints=self.constraints if constrained else LinearConstraints.none(self.num_outputs),
+            solver=self.solver,
         )
 
     def null_space_gains(self, primitive: LcNsKmp) -> np.ndarray:

@@ -1,97 +1,29 @@
 """Guidance by a shared control template: a person's or a policy's few inputs in, a safe pose out."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOrderHold
 
-from guiderail.models.skills import Skill
-from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
+from guiderail.diagrams.guidance.active_constraint_filter import ActiveConstraintFilter
+from guiderail.diagrams.guidance.guidance import Guidance
+from guiderail.diagrams.guidance.known import Known
+from guiderail.diagrams.guidance.registry import register_guidance
+from guiderail.models.pose_coordinates import WRENCH_SIZE
+from guiderail.models.skills import Skill, load_skill
 from guiderail.systems.sct_input_mapping import SctInputMapping
-from guiderail.systems.sct_state_machine import SctStateMachine
-
-WRENCH_SIZE = 6
 
 
-class ActiveConstraintFilter(Diagram):
-    """The active constraints and the state machine of a skill, behind anything that requests a pose.
-
-    .. pydrake_system::
-
-        name: ActiveConstraintFilter
-        input_ports:
-        - requested_pose
-        - pose
-        output_ports:
-        - desired_pose
-        - fallback
-        - last_desired_pose
-        - state
-        - transition_distance
-        - progress
-        - commanded_violation
-        - measured_violation
-    """
-
-    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float, leash: float = np.inf):
-        """
-        Args:
-            skill: the template.
-            frames: the poses X_WF of its objects by name; W is the frame that all poses are given in.
-            period: seconds between control steps.
-            leash: [m] how far the robot may be from its command before that waits.
-        """
-        super().__init__()
-        builder = DiagramBuilder()
-        self._projector = ActiveConstraintProjector(skill, frames, period, leash)
-        builder.AddNamedSystem("projector", self._projector)
-        self._machine = SctStateMachine(skill, frames, period)
-        builder.AddNamedSystem("state_machine", self._machine)
-        # The state follows the command, not the measured pose: so the command is always inside the constraints of the
-        # state that it is made for, and a transition doesn't depend on how well the robot tracks.
-        builder.Connect(self._projector.get_desired_pose_output_port(), self._machine.get_pose_input_port())
-        builder.Connect(self._machine.get_state_output_port(), self._projector.get_state_input_port())
-        builder.ExportInput(self._projector.get_requested_pose_input_port(), "requested_pose")
-        builder.ExportInput(self._projector.get_pose_input_port(), "pose")
-        builder.ConnectInput("pose", self._machine.get_initial_pose_input_port())
-        for system, names in (
-            (self._projector, ("desired_pose", "fallback", "last_desired_pose")),
-            (self._machine, ("state", "transition_distance", "progress")),
-            (self._projector, ("commanded_violation", "measured_violation")),
-        ):
-            for name in names:
-                builder.ExportOutput(system.GetOutputPort(name), name)
-        builder.BuildInto(self)
-
-    def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Moves objects; those that aren't named stay. The context is the root diagram's."""
-        for system in (self._projector, self._machine):
-            system.frames.set(system.GetMyMutableContextFromRoot(root_context), frames)
-
-
-class SctGuidance(Diagram):
+class SctGuidance(Guidance):
     """Shared control: input mapping, then active constraints, in the state that the state machine is in.
 
-    .. pydrake_system::
-
-        name: SctGuidance
-        input_ports:
-        - action
-        - pose
-        - wrench
-        output_ports:
-        - desired_pose
-        - fallback
-        - state
-        - transition_distance
-        - progress
-        - commanded_violation
-        - measured_violation
-        - held_action
-
-    ``action`` is (n,) in [−1, 1], whoever gives it: a policy, or a person's device. It is held for a control period.
+    ``action`` is (n,), whoever gives it: a policy, or a person's device. ``constraint_violation`` is the larger of
+    metres and radians from the projection, 0 inside. Beside the ports of all guidance it exports ``state``,
+    ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
     """
 
     def __init__(
@@ -138,16 +70,7 @@ class SctGuidance(Diagram):
         # No template of ours listens to forces yet; the port is there because all guidance has the same ports.
         wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
         builder.ExportInput(wrench.get_input_port(), "wrench")
-        for name in (
-            "desired_pose",
-            "fallback",
-            "state",
-            "transition_distance",
-            "progress",
-            "commanded_violation",
-            "measured_violation",
-        ):
-            builder.ExportOutput(self._filter.GetOutputPort(name), name)
+        self._filter.export_outputs(builder)
         builder.ExportOutput(hold.get_output_port(), "held_action")
         builder.BuildInto(self)
 
@@ -156,3 +79,30 @@ class SctGuidance(Diagram):
         self._filter.set_frames(root_context, frames)
         known = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
         self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), known)
+
+
+def _through_template(known: Known, input_mapping: Skill | None, constrained: bool) -> SctGuidance:
+    assert known.template is not None
+    template = known.template
+    return SctGuidance(
+        template.skill,
+        template.frames,
+        known.period,
+        input_mapping=input_mapping,
+        active_constraints=constrained,
+        leash=template.leash if constrained else np.inf,
+    )
+
+
+@register_guidance("sct", needs=(("template",),), label="RL-SCT", colour="#9467bd")
+def sct(known: Known) -> SctGuidance:
+    """A few inputs through the template, its active constraints behind them."""
+    assert known.template is not None
+    return _through_template(known, None, known.template.constrained(True))
+
+
+@register_guidance("none", needs=(("template",),), label="RL", colour="#7f7f7f")
+def unguided(known: Known) -> SctGuidance:
+    """Six inputs as the end effector's velocity; the template says only how far it is, unless it is to constrain."""
+    assert known.template is not None
+    return _through_template(known, load_skill("end_effector_velocity"), known.template.constrained(False))

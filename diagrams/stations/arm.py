@@ -10,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
+from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     PLANT_PERIOD,
     Impedance,
@@ -153,6 +154,7 @@ def add_impedance_control(
     return controller.get_torque_output_port()
 
 
+@register_station("arm", world="workcell")
 class ArmStation(Station):
     """The arm, its controller and the workcell.
 

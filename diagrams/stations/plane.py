@@ -7,17 +7,19 @@ from pydrake.geometry import (
     Box,
     Cylinder,
     ProximityProperties,
-    SceneGraph,
     Sphere,
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import ModelInstanceIndex, PrismaticJoint, SpatialInertia
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
 
+from guiderail.diagrams.stations.registry import register_station
+from guiderail.diagrams.stations.station import Station, export_station_ports
 from guiderail.diagrams.task import exact_period
 from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
 
 
@@ -69,27 +71,16 @@ class PlaneConfig:
         return (1 - np.sqrt(self.mass / inertia)) ** 2 * inertia / self.plant_period**2
 
 
-class PlaneStation(Diagram):
-    """The plane, its walls, and the robot.
+@register_station("plane", world="plane")
+class PlaneStation(Station):
+    """A plane with walls and a robot that is commanded by position.
 
-    .. pydrake_system::
-
-        name: PlaneStation
-        input_ports:
-        - desired_pose
-        output_ports:
-        - pose
-        - contact_force
-        - contact_force_magnitude
-        - saturation
-        - query
-
-    ``desired_pose`` and ``pose`` are (x, y) of the robot's centre, m. ``contact_force`` (2,) is what the walls did to
-    the robot, averaged over the control step, N, and ``contact_force_magnitude`` (1,) its norm. ``saturation`` (2,) is
-    the force, N, that was asked of each rail beyond its limit. ``query`` is the scene graph's, for cameras.
+    ``desired_pose`` and ``pose`` are (x, y) of the robot's centre [m]. ``wrench`` (2,) is what the walls did to the
+    robot, averaged over the control step [N], and ``contact_force`` (1,) its norm. ``saturation`` (2,) is the force
+    that was asked of each rail beyond its limit [N]. ``query`` is the scene graph's, for cameras.
     """
 
-    def __init__(self, world: NarrowPassage, config: PlaneConfig, builder: DiagramBuilder | None = None):
+    def __init__(self, world: NarrowPassage, config: PlaneConfig = PlaneConfig()):
         """
         Args:
             world: what is where.
@@ -98,6 +89,7 @@ class PlaneStation(Diagram):
         super().__init__()
         builder = DiagramBuilder()
         self.world, self.config = world, config
+        self.control_period = config.control_period
         # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
         # updates of the same instant, and a system that samples the pose there would see it one plant step late.
         plant_config = MultibodyPlantConfig(
@@ -106,8 +98,6 @@ class PlaneStation(Diagram):
             contact_model="point",
             use_sampled_output_ports=False,
         )
-        self.plant: MultibodyPlant
-        self.scene_graph: SceneGraph
         self.plant, self.scene_graph = AddMultibodyPlant(plant_config, builder)
         self.plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
         self._robot = _add_robot(self.plant, world, config)
@@ -118,11 +108,14 @@ class PlaneStation(Diagram):
         # F = clip(k (x_d - x), ±F_max), against the rails' viscous friction.
         one = np.eye(2)
         pose = builder.AddNamedSystem("pose", MatrixGain(D=np.eye(2, 4)))
+        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(config.control_period, pose_size=2))
         poses = builder.AddNamedSystem("desired_and_measured_pose", Multiplexer([2, 2]))
         gain = builder.AddNamedSystem("position_gain", MatrixGain(D=config.position_gain * np.hstack([one, -one])))
         limit = np.full(2, config.max_force)
         saturation = builder.AddNamedSystem("force_limit", Saturation(-limit, limit))
         builder.Connect(self.plant.get_state_output_port(self._robot), pose.get_input_port())
+        builder.Connect(pose.get_output_port(), watchdog.get_pose_input_port())
+        builder.Connect(watchdog.get_safe_pose_output_port(), poses.get_input_port(0))
         builder.Connect(pose.get_output_port(), poses.get_input_port(1))
         builder.Connect(poses.get_output_port(), gain.get_input_port())
         builder.Connect(gain.get_output_port(), saturation.get_input_port())
@@ -139,22 +132,23 @@ class PlaneStation(Diagram):
         builder.Connect(self.plant.get_generalized_contact_forces_output_port(self._robot), force_sum.get_input_port())
         builder.Connect(force_sum.get_output_port(), mean_force.get_force_sum_input_port())
 
-        builder.ExportInput(poses.get_input_port(0), "desired_pose")
-        builder.ExportOutput(pose.get_output_port(), "pose")
-        builder.ExportOutput(mean_force.get_force_output_port(), "contact_force")
-        builder.ExportOutput(mean_force.get_magnitude_output_port(), "contact_force_magnitude")
-        builder.ExportOutput(excess.get_output_port(), "saturation")
+        export_station_ports(
+            builder,
+            watchdog.get_desired_pose_input_port(),
+            watchdog.get_command_time_input_port(),
+            pose=pose.get_output_port(),
+            wrench=mean_force.get_force_output_port(),
+            contact_force=mean_force.get_magnitude_output_port(),
+            saturation=excess.get_output_port(),
+            holding=watchdog.get_holding_output_port(),
+        )
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)
 
-    def set_pose(self, root_context: Context, pose: np.ndarray) -> None:
-        """Puts the robot's centre at (x, y), at rest."""
-        context = self.plant.GetMyMutableContextFromRoot(root_context)
-        self.plant.SetPositionsAndVelocities(context, self._robot, np.concatenate([pose, np.zeros(2)]))
-
-    def get_pose(self, root_context: Context) -> np.ndarray:
-        """Where the robot's centre is, (x, y)."""
-        return self.plant.GetPositions(self.plant.GetMyContextFromRoot(root_context), self._robot)
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Puts the robot's centre at (x, y), at rest; `context` is the root context."""
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        self.plant.SetPositionsAndVelocities(plant_context, self._robot, np.concatenate([pose, np.zeros(2)]))
 
 
 def _add_robot(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig) -> ModelInstanceIndex:

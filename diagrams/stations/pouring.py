@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from pydrake.geometry import Box, Cylinder, SceneGraph
+from pydrake.geometry import Box, Cylinder
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import (
@@ -14,10 +14,13 @@ from pydrake.multibody.tree import (
     ModelInstanceIndex,
     PdControllerGains,
     RigidBody,
+    WeldJoint,
 )
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
+from guiderail.diagrams.stations.registry import register_station
+from guiderail.diagrams.stations.station import Station, export_station_ports
 from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
@@ -29,6 +32,7 @@ from guiderail.systems.cartesian_position_controller import CartesianPositionCon
 from guiderail.systems.contact_watch import ContactWatch
 from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.relative_poses import RelativePoses
+from guiderail.systems.wrench_sensor import WrenchSensor
 
 NUM_BALLS = 2
 # Half way between the pourings that the workspace allows, so that a search ends on the same branch for all of them;
@@ -37,6 +41,8 @@ POSTURE = np.array([-0.3, 0.6, 0.2, -1.6, -0.2, -0.7, -0.7])  # [rad]
 
 # More than any guidance asks for, so that it is the guidance that says how fast.
 SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
+
+WRENCH_TIME_CONSTANT = 0.02  # [s] of the wrench sensor's low-pass filter
 
 METAL = (0.55, 0.58, 0.62, 1.0)
 WOOD = (0.80, 0.68, 0.50, 1.0)
@@ -95,37 +101,45 @@ class PouringConfig:
 TYPICAL_INERTIA = (7.4, 7.4, 5.4, 5.4, 1.9, 1.5, 1.2)
 
 
-class PouringStation(Diagram):
-    """The arm, its position controller, and what it pours.
+@register_station("pouring", world="pouring")
+class PouringStation(Station):
+    """An arm under Cartesian position control that holds a thermos with two balls, and a mug on a table.
 
     .. pydrake_system::
 
         name: PouringStation
         input_ports:
         - desired_pose
+        - command_time (optional)
         output_ports:
         - pose
+        - wrench
+        - contact_force
+        - saturation
+        - holding
         - tip_in_mug
         - balls_in_mug
         - balls_in_thermos
         - collision
         - touched
-        - contact_force
-        - saturation
         - query
 
     ``desired_pose`` and ``pose`` are X_TP of the thermos's tip P as (6,) [x y z Rz Ry Rx], metres and radians; T is the
-    tip of the mug where it nominally stands. ``tip_in_mug`` is the tip's pose in the actual mug's, (6,) [x y z] and a
-    rotation vector; ``balls_in_mug`` and ``balls_in_thermos`` are the balls' poses in the vessels' tip frames in the
-    same form, one after the other. ``collision`` is 1 while the arm or the thermos touches table or mug, ``touched``
-    from the first such plant step on, ``contact_force`` [N] how hard; ``saturation`` is 1 while the controller can't
-    follow; all (1,).
+    tip of the mug where it nominally stands. ``wrench`` (6,) is what the balls and the surroundings do to the thermos,
+    at P in the axes of T, without its own weight and inertia; ``contact_force`` (1,) is how hard the arm or the thermos
+    touches table or mug [N]; ``saturation`` (1,) is 1 while the controller can't follow.
+
+    Beside the ports of every station: ``tip_in_mug`` is the tip's pose in the actual mug's, (6,) [x y z] and a rotation
+    vector; ``balls_in_mug`` and ``balls_in_thermos`` are the balls' poses in the vessels' tip frames in the same form,
+    one after the other. ``collision`` is 1 while the arm or the thermos touches table or mug, ``touched`` from the
+    first such plant step on; both (1,).
     """
 
     def __init__(self, config: PouringConfig):
         super().__init__()
         builder = DiagramBuilder()
         self.config = config
+        self.control_period = config.control_period
         # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
         # updates of the same instant, and whatever samples a pose there would see it one plant step late.
         plant_config = MultibodyPlantConfig(
@@ -135,10 +149,8 @@ class PouringStation(Diagram):
             penetration_allowance=1e-3,
             use_sampled_output_ports=False,
         )
-        self.plant: MultibodyPlant
-        self.scene_graph: SceneGraph
         self.plant, self.scene_graph = plant, _ = AddMultibodyPlant(plant_config, builder)
-        self.arm, self._tip = add_arm_with_thermos(plant, config)
+        self.arm, self._tip, wrist = add_arm_with_thermos(plant, config)
         self._mount = plant.AddFrame(FixedOffsetFrame("mug_mount", plant.world_frame(), config.X_WT))
         self._mug = add_vessel(plant, "mug", config.mug, CHINA)
         _add_stand(plant, self._mug, config)
@@ -149,7 +161,7 @@ class PouringStation(Diagram):
         thermos = plant.GetBodyByName("thermos")
 
         self._controller_plant = MultibodyPlant(0.0)
-        _, tip = add_arm_with_thermos(self._controller_plant, config)
+        _, tip, _ = add_arm_with_thermos(self._controller_plant, config)
         self._target = self._controller_plant.AddFrame(
             FixedOffsetFrame("target", self._controller_plant.world_frame(), config.X_WT)
         )
@@ -178,6 +190,10 @@ class PouringStation(Diagram):
         period = config.plant_period
         watch = ContactWatch(plant, [*links, thermos], [plant.world_body(), self._mug], period)
         builder.AddNamedSystem("contact_watch", watch)
+        axes = config.X_WT.rotation()
+        sensor = WrenchSensor(plant, wrist, [thermos], self._tip, axes, config.control_period, WRENCH_TIME_CONSTANT)
+        builder.AddNamedSystem("wrench_sensor", sensor)
+        sensor.connect(builder, plant)
         seen = [
             ("tip_in_mug", RelativePoses(plant, [thermos], self._mug)),
             ("balls_in_mug", RelativePoses(plant, self._balls, self._mug)),
@@ -190,16 +206,22 @@ class PouringStation(Diagram):
         builder.Connect(drives.get_output_port(), plant.get_desired_state_input_port(self.arm))
         builder.Connect(plant.get_body_poses_output_port(), measured.get_body_poses_input_port())
         builder.Connect(plant.get_contact_results_output_port(), watch.get_contact_results_input_port())
-        builder.ExportInput(controller.get_desired_pose_input_port(), "desired_pose")
-        builder.ExportOutput(measured.get_pose_output_port(), "pose")
+        export_station_ports(
+            builder,
+            controller.get_desired_pose_input_port(),
+            controller.get_command_time_input_port(),
+            pose=measured.get_pose_output_port(),
+            wrench=sensor.get_wrench_output_port(),
+            contact_force=watch.get_contact_force_output_port(),
+            saturation=controller.get_stuck_output_port(),
+            holding=controller.get_holding_output_port(),
+        )
         for name, system in seen:
             builder.AddNamedSystem(name, system)
             builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
             builder.ExportOutput(system.get_relative_poses_output_port(), name)
         builder.ExportOutput(watch.get_collision_output_port(), "collision")
         builder.ExportOutput(watch.get_touched_output_port(), "touched")
-        builder.ExportOutput(watch.get_contact_force_output_port(), "contact_force")
-        builder.ExportOutput(controller.get_stuck_output_port(), "saturation")
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)
 
@@ -213,27 +235,27 @@ class PouringStation(Diagram):
         context = self.plant.GetMyMutableContextFromRoot(root_context)
         self._mount.SetPoseInParentFrame(context, self.config.X_WT @ X_TMug)
 
-    def set_pose(self, root_context: Context, pose: np.ndarray) -> None:
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
-        context = self.plant.GetMyMutableContextFromRoot(root_context)
-        self.plant.SetPositions(context, self.arm, self.solve(pose, self.posture))
-        self.plant.SetVelocities(context, self.arm, np.zeros(NUM_JOINTS))
-        X_WP = self._tip.CalcPoseInWorld(context)
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        self.plant.SetPositions(plant_context, self.arm, self.solve(pose, self.posture))
+        self.plant.SetVelocities(plant_context, self.arm, np.zeros(NUM_JOINTS))
+        X_WP = self._tip.CalcPoseInWorld(plant_context)
         radius = self.config.ball.diameter / 2
         # Side by side as far as the thermos is wider than a ball, and then as low as they touch.
         aside = self.config.thermos.inner_diameter / 2 - radius
         step = np.sqrt(self.config.ball.diameter**2 - (2 * aside) ** 2)
         for i, ball in enumerate(self._balls):
             p_PB = np.array([aside * (-1) ** i, 0.0, -self.config.thermos.depth + radius + i * step])
-            self.plant.SetFloatingBaseBodyPoseInWorldFrame(context, ball, RigidTransform(X_WP @ p_PB))
+            self.plant.SetFloatingBaseBodyPoseInWorldFrame(plant_context, ball, RigidTransform(X_WP @ p_PB))
 
 
-def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[ModelInstanceIndex, Frame]:
-    """Adds the arm at the world's origin, a hand, and the thermos in it; returns the arm and the tip's frame."""
+def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[ModelInstanceIndex, Frame, WeldJoint]:
+    """Adds the arm at the world's origin, a hand, and the thermos in it; returns the arm, the tip and the wrist."""
     arm = add_model(plant, IIWA_URDF)
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("iiwa_link_0", arm))
     thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
-    plant.WeldFrames(plant.GetFrameByName("iiwa_flange", arm), thermos.body_frame(), config.X_FlangeP)
+    wrist = plant.WeldFrames(plant.GetFrameByName("iiwa_flange", arm), thermos.body_frame(), config.X_FlangeP)
     _add_hand(plant, thermos, config)
     for model in (arm, thermos.model_instance()):
         # Weight is compensated by leaving it out, as a position-controlled arm does by its integrators.
@@ -241,7 +263,7 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     for i, (stiffness, inertia) in enumerate(zip(config.gains, TYPICAL_INERTIA, strict=True)):
         actuator: JointActuator = plant.GetJointActuatorByName(f"iiwa_motor_{i + 1}", arm)
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=2.0 * np.sqrt(stiffness * inertia)))
-    return arm, thermos.body_frame()
+    return arm, thermos.body_frame(), wrist
 
 
 def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) -> None:

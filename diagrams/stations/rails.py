@@ -22,6 +22,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain
 
+from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     PLANT_PERIOD,
     POSE_SIZE,
@@ -52,6 +53,7 @@ CARRIAGE_INERTIA = 2e-3  # [kg m²]
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 
 
+@register_station("rails", world="workcell")
 class RailsStation(Station):
     """Joints x, y, z, Rz, Ry, Rx from the target frame to the tool centre, each with a spring, a damper and a limit.
 

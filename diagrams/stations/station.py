@@ -74,6 +74,18 @@ class Station(Diagram):
 
     plant: MultibodyPlant
     scene_graph: SceneGraph
+    control_period: float = CONTROL_PERIOD
+    """Seconds between commands."""
+
+    @property
+    def pose_size(self) -> int:
+        """O, numbers in a pose."""
+        return self.get_pose_output_port().size()
+
+    @property
+    def wrench_size(self) -> int:
+        """W, numbers in a wrench."""
+        return self.get_wrench_output_port().size()
 
     def get_desired_pose_input_port(self):
         """Where the tool centre shall be, (6,)."""

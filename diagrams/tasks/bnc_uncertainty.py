@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from guiderail.diagrams.tasks.offsets import MM, HiddenOffsets, in_ring
-from guiderail.models.errors import InputError
+from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
+from guiderail.models.units import DEGREE, MM
 
 RUN_OFFSET = (1.0 * MM, 1.5 * MM)  # least and largest distance of the jack from where a calibration thinks it is
 GRASP_RADIUS = 0.3 * MM  # how exactly a plug is picked up again
@@ -26,24 +26,15 @@ class BncUncertainty(HiddenOffsets):
     after x and y. The option `offset` puts the jack there and the plug straight in its place.
     """
 
-    task = "BncConnector"
-    kinds = ("calibration", "disc", "known")
-
     def __init__(self, kind: str, grasp_angle: float = 0.0):
         """
         Args:
-            kind: one of `kinds`.
-            grasp_angle: the largest tilt of the plug in the tool [degrees], at most `LARGEST_GRASP_ANGLE`.
-
-        Raises:
-            InputError: for an unknown kind or an angle out of range.
+            kind: "calibration", "disc" or "known".
+            grasp_angle: the largest tilt of the plug in the tool [degrees].
         """
-        super().__init__(kind)
-        if not 0.0 <= grasp_angle <= LARGEST_GRASP_ANGLE:
-            raise InputError(
-                f"grasp_angle is a plug's tilt in the tool, 0 to {LARGEST_GRASP_ANGLE:g} degrees, not {grasp_angle}"
-            )
-        self.grasp_angle = np.deg2rad(grasp_angle)
+        super().__init__()
+        self.kind = kind
+        self.grasp_angle = grasp_angle * DEGREE
 
     def _draw_run(self, rng: np.random.Generator) -> np.ndarray:
         return in_ring(rng, *RUN_OFFSET)

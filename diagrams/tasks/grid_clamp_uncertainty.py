@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from guiderail.diagrams.tasks.offsets import MM, HiddenOffsets, in_ring
+from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
+from guiderail.models.units import MM
 
 NUM_PLACES = 6  # where clamps are picked up
 # Parallel jaws centre what they close on; along the jaws, which is x, a clamp stays where it happened to be.
@@ -27,8 +28,13 @@ class GridClampUncertainty(HiddenOffsets):
     The option `offset` puts the clamp there in the tool and the table in its place.
     """
 
-    task = "GridClamp"
-    kinds = ("calibration", "disc", "known")
+    def __init__(self, kind: str):
+        """
+        Args:
+            kind: "calibration", "disc" or "known".
+        """
+        super().__init__()
+        self.kind = kind
 
     def _draw_run(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """The table's offset (2,) and the grasp offsets (6, 2) of the places."""

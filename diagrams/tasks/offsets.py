@@ -3,16 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-
-from guiderail.diagrams.tasks.held_out import episode_stream
-from guiderail.models.errors import InputError
-
-MM = 1e-3
-OPTIONS = ("held_out", "offset", "new_run")
 
 
 class HiddenOffsets(ABC):
@@ -22,35 +15,18 @@ class HiddenOffsets(ABC):
     from a stream that training never draws from, with what the run has hidden; `offset` (x, y) [m] says where instead.
     """
 
-    task: str
-    kinds: tuple[str, ...]
-
-    def __init__(self, kind: str):
-        """
-        Args:
-            kind: one of `kinds`.
-
-        Raises:
-            InputError: if there is no such kind.
-        """
-        if kind not in self.kinds:
-            names = ", ".join(f"'{known}'" for known in self.kinds[:-1])
-            raise InputError(f"there is no uncertainty '{kind}': use {names} or '{self.kinds[-1]}'")
-        self.kind = kind
+    def __init__(self) -> None:
         self._run: Any = None
 
-    def draw(self, rng: np.random.Generator, options: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets (2,) [m] of the fixture and of the workpiece in the tool."""
-        unknown = set(options) - set(OPTIONS)
-        if unknown:
-            raise InputError(f"{self.task} knows no reset option {sorted(unknown)}: it knows {', '.join(OPTIONS)}")
+    def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets (2,) [m] of the fixture and of the workpiece in the tool; `options` are an `InsertionReset`."""
         # Every reset draws the same numbers, used or not, so that a seed means the same at the first reset and later.
         hidden = self._draw_run(rng)
-        episode = episode_stream(rng, bool(options.get("held_out")))
-        if self._run is None or options.get("new_run"):
+        episode = episode_stream(rng, options.held_out)
+        if self._run is None or options.new_run:
             self._run = hidden
-        if "offset" in options:
-            return self._given(checked_offset(options["offset"]))
+        if options.offset is not None:
+            return self._given(np.array(options.offset))
         return self._draw_episode(episode, self._run)
 
     @abstractmethod
@@ -66,23 +42,20 @@ class HiddenOffsets(ABC):
         """The offsets that the option `offset` stands for."""
 
 
+# No seed of a training run leads to this stream.
+_HELD_OUT_STREAM = 0x8E1D
+
+
+def episode_stream(rng: np.random.Generator, held_out: bool) -> np.random.Generator:
+    """The generator that an episode's conditions are drawn from: training's, or one that only evaluation has.
+
+    It takes one number from `rng` whichever it is, so that a seed means the same at the first reset and later.
+    """
+    return np.random.default_rng([int(rng.integers(2**62)), _HELD_OUT_STREAM if held_out else 0])
+
+
 def in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray:
     """A point (2,) whose density is the same everywhere between two circles."""
     radius = np.sqrt(rng.uniform(inner**2, outer**2))
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return radius * np.array([np.cos(angle), np.sin(angle)])
-
-
-def checked_offset(offset: Any) -> np.ndarray:
-    """The option `offset` as (2,).
-
-    Raises:
-        InputError: if it is anything else than two finite numbers.
-    """
-    try:
-        offset = np.array(offset, dtype=float)
-    except (TypeError, ValueError):
-        offset = np.empty(0)
-    if offset.shape != (2,) or not np.isfinite(offset).all():
-        raise InputError(f"the reset option 'offset' is (x, y) in metres, not {offset}")
-    return offset

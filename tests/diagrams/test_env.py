@@ -50,6 +50,7 @@ class Toy(LeafSystem):
         port("ledger", 2, lambda x: [x[0], x[2]])
         port("desired_pose", 1, lambda x: x[0] + x[3])
         port("pose", 1, lambda x: x[0])
+        port("fallback", 1, lambda x: float(abs(x[0] - 0.3) < 1e-9))
 
     def x(self, context):
         return context.get_discrete_state(self.state).value()
@@ -107,6 +108,7 @@ def test_info_says_everything_at_reset_and_at_every_step():
         "constraint_violation",
         "measured_violation",
         "contact_force",
+        "fallback",
         "control_steps",
         "double",
         "one",

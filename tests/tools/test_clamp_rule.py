@@ -1,6 +1,7 @@
 import numpy as np
 
-from guiderail.diagrams.tasks.grid_clamp import CENTRE, MM, SCALE
+from guiderail.diagrams.tasks.grid_clamp import CENTRE, SCALE
+from guiderail.models.units import MM
 from guiderail.tools.clamp_rule import LANE_ENDS, LANES, searching_rule
 
 

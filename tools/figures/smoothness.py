@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from guiderail.diagrams.stations.plane import PlaneConfig
-from guiderail.diagrams.tasks.narrow_passage import make_skill
-from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.diagrams.make import known
 from guiderail.models.primitives import LcNsKmp
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.tools.episodes import make_environment, run_episode
@@ -24,7 +22,8 @@ HOLDS = (1, 5)  # control steps of an action: the thesis's, and what is learned 
 
 def primitive_of(kind: str, variance: float = SHOWN) -> LcNsKmp:
     """The narrow passage's primitive, with a history for sKGRL."""
-    skill = make_skill(NarrowPassage(), PlaneConfig(), history_variance=variance)
+    skill = known("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
+    assert skill is not None
     return skill.primitive(history=kind == "skgrl")
 
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.guidance import build_guidance
+from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 
 PERIOD, STEPS, TOUCH = 0.02, 60, slice(20, 40)
@@ -24,7 +25,7 @@ def skill():
 
 def rollout(skill, actions, forces, kind="skgrl"):
     """Commands and history lengths of every control step; the robot is where it was commanded."""
-    guidance = build_guidance(kind, skill)
+    guidance = build_guidance(kind, Known(PERIOD, demonstrations=skill))
     simulator = Simulator(guidance)
     context = simulator.get_mutable_context()
     action = guidance.GetInputPort("action").FixValue(context, [0.0, 0.0])

@@ -7,7 +7,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
 
-from guiderail.diagrams.guidance.sct import ActiveConstraintFilter, SctGuidance
+from guiderail.diagrams.guidance.active_constraint_filter import ActiveConstraintFilter
+from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
+from guiderail.diagrams.guidance.sct import SctGuidance
 from guiderail.diagrams.task import exact_period
 from guiderail.models.skills import load_skill
 
@@ -61,8 +63,8 @@ def test_has_the_ports_of_all_guidance(skill):
     inputs = [guidance.get_input_port(i).get_name() for i in range(guidance.num_input_ports())]
     outputs = [guidance.get_output_port(i).get_name() for i in range(guidance.num_output_ports())]
     assert inputs == ["action", "pose", "wrench"]
-    assert outputs[:2] == ["desired_pose", "fallback"]
-    assert {"state", "transition_distance", "progress"} <= set(outputs)
+    assert set(outputs) == {*OUTPUTS, "state", "transition_distance", "progress", "measured_violation"}
+    check_guidance_ports(guidance, pose_size=6, wrench_size=6)
 
 
 def test_starts_where_the_robot_is_and_stays_there_without_an_input(skill):
@@ -87,7 +89,7 @@ def test_goes_through_all_states_and_says_how_far_it_is(skill):
         rig.step(np.array([0.0, 0.9, -0.3]))
         states.append(int(rig.value("state")[0]))
         progress.append(rig.value("progress")[0])
-        worst = max(worst, rig.value("commanded_violation")[0])
+        worst = max(worst, rig.value("constraint_violation")[0])
     assert sorted(set(states)) == [0, 1, 2]
     assert worst <= 1e-9
     assert rig.value("transition_distance")[0] == pytest.approx(0.0, abs=0.02)
@@ -131,7 +133,7 @@ def test_a_velocity_is_filtered_like_anything_else(skill):
     rng = np.random.default_rng(0)
     for _ in range(200):
         rig.step(rng.choice([-1.0, 1.0], 6))
-        assert rig.value("commanded_violation")[0] <= 1e-9
+        assert rig.value("constraint_violation")[0] <= 1e-9
 
 
 def test_the_filter_takes_requests_from_anyone(skill):

@@ -63,7 +63,7 @@ def test_arrives_within_a_control_step_and_never_overshoots():
         assert (path > low).all()
         assert (path < high).all()
         pose = path[-1]
-    assert run.read("contact_force_magnitude") == 0
+    assert run.read("contact_force") == 0
 
 
 def test_stands_still_where_it_was_put():
@@ -77,7 +77,7 @@ def test_a_wall_stops_the_robots_centre_where_the_world_says():
     path = run.go([0.2, 0.9], 10)
     assert path[-1] == pytest.approx([0.2, WORLD.wall_y[0]], abs=2e-4)
     # At full force it presses with what the drive has, and the wall presses back.
-    np.testing.assert_allclose(run.read("contact_force"), [0, -CONFIG.max_force], atol=0.5)
+    np.testing.assert_allclose(run.read("wrench"), [0, -CONFIG.max_force], atol=0.5)
     assert run.read("saturation")[1] > 0
     run = Run([0.35, 0.55])
     path = run.go([0.2, 0.55], 5)
@@ -96,7 +96,7 @@ def test_a_robot_pressed_against_a_wall_does_not_slide():
 def test_the_gap_is_open():
     run = Run([0.35, 0.4])
     assert run.go([0.35, 0.8], 5)[-1] == pytest.approx([0.35, 0.8], abs=1e-4)
-    assert run.read("contact_force_magnitude") == 0
+    assert run.read("contact_force") == 0
 
 
 def test_a_touch_within_a_control_step_is_not_missed():
@@ -108,7 +108,7 @@ def test_a_touch_within_a_control_step_is_not_missed():
     run.command.GetMutableData().set_value([0.2, 0.4])
     run.simulator.AdvanceTo(10 * CONFIG.plant_period)
     assert run.read("pose")[1] < 0.41
-    assert run.read("contact_force_magnitude") > 0
+    assert run.read("contact_force") > 0
 
 
 @pytest.mark.parametrize("seed", range(3))

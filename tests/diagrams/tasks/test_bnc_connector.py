@@ -5,17 +5,13 @@ import numpy as np
 import pytest
 
 import guiderail.diagrams  # noqa: F401 (registers)
-from guiderail.diagrams.tasks.bnc_connector import (
-    ALIGNMENT,
-    COLLISION_FORCE,
-    DEPTH_REWARD,
-    MM,
-    NUM_STEPS,
-    make_env,
-    reference_trajectory,
-)
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT, COLLISION_FORCE, NUM_STEPS, reference_trajectory
+from guiderail.diagrams.tasks.bnc_rewards import DEPTH_REWARD
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
+from guiderail.models.units import MM
 from guiderail.tools.bnc_rule import reactive_rule
 from guiderail.tools.episodes import standing_still
 from guiderail.tools.judging import total, trials, worst
@@ -35,17 +31,17 @@ def play(env, policy, *, seed=None, options=None):
 
 @pytest.fixture(scope="module")
 def kmp():
-    return make_env(guidance="kmp", uncertainty="known")
+    return make_env("BncConnector", guidance="kmp", uncertainty="known")
 
 
 @pytest.fixture(scope="module")
 def kgrl():
-    return make_env(guidance="kgrl", uncertainty="disc")
+    return make_env("BncConnector", guidance="kgrl", uncertainty="disc")
 
 
 @pytest.fixture(scope="module")
 def skgrl():
-    return make_env(guidance="skgrl", uncertainty="calibration")
+    return make_env("BncConnector", guidance="skgrl", uncertainty="calibration")
 
 
 def test_is_registered():
@@ -88,7 +84,7 @@ def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
 def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
     """Corner actions that change at every decision, into every corner of the square."""
-    safe_residual = make_env(guidance="safe_residual", kappa=3.0)
+    safe_residual = make_env("BncConnector", guidance="safe_residual", kappa=3.0)
     env = {"kgrl": kgrl, "skgrl": skgrl, "safe_residual": safe_residual}[guidance]
     rng = np.random.default_rng(3)
     _, info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
@@ -127,7 +123,7 @@ def test_the_same_seed_is_the_same_episode(kgrl):
 
 def test_a_hard_push_is_a_collision():
     """A residual that commands 25 mm sideways against the jack's side, which no constraint keeps from it."""
-    env = make_env(guidance="residual", uncertainty="disc", explored=(0, 1, 2), kappa=20.0)
+    env = make_env("BncConnector", guidance="residual", uncertainty="disc", explored=(0, 1, 2), kappa=20.0)
     _, info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
     assert info["termination"] == "collision"
     assert info["contact_force"] > COLLISION_FORCE
@@ -144,7 +140,7 @@ def test_reward_is_the_sum_of_its_terms(kgrl):
 
 
 def test_shaped_reward_adds_the_depth_gained():
-    env = make_env(guidance="kmp", reward="shaped", uncertainty="known", hold=10)
+    env = make_env("BncConnector", guidance="kmp", reward="shaped", uncertainty="known", hold=10)
     env.reset(seed=0)
     start = reference_trajectory().means[0, 2]
     depth = 0.0
@@ -156,7 +152,7 @@ def test_shaped_reward_adds_the_depth_gained():
 def test_the_same_policy_drives_rails_and_arm():
     """One rule object, both stations; the arm is slower to follow, and locks too."""
     for station in ("rails", "arm"):
-        env = make_env(guidance="kgrl", uncertainty="disc", station=station)
+        env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", station=station)
         _, info, _, _ = play(env, reactive_rule, seed=4, options={"offset": (0.0009, -0.0008)})
         assert info["is_success"], station
 
@@ -173,7 +169,7 @@ def test_a_push_moves_the_robot(kgrl):
 class TestUncertainty:
     def test_calibration_keeps_its_hidden_offset_for_a_run(self):
         uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(0)
-        draws = [uncertainty.draw(rng, {}) for _ in range(20)]
+        draws = [uncertainty.draw(rng, InsertionReset()) for _ in range(20)]
         jacks, grasps = (np.array(column) for column in zip(*draws, strict=True))
         assert (jacks == jacks[0]).all()
         assert 1.0 * MM <= np.linalg.norm(jacks[0]) <= 1.5 * MM
@@ -182,20 +178,20 @@ class TestUncertainty:
 
     def test_a_new_run_has_another_one(self):
         uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(0)
-        first, _ = uncertainty.draw(rng, {})
-        second, _ = uncertainty.draw(rng, {"new_run": True})
+        first, _ = uncertainty.draw(rng, InsertionReset())
+        second, _ = uncertainty.draw(rng, InsertionReset(new_run=True))
         assert (first != second).any()
 
     def test_held_out_keeps_the_run_and_draws_apart(self):
         uncertainty = BncUncertainty("calibration")
-        jack, grasp = uncertainty.draw(np.random.default_rng(7), {})
-        jack_held_out, grasp_held_out = uncertainty.draw(np.random.default_rng(7), {"held_out": True})
+        jack, grasp = uncertainty.draw(np.random.default_rng(7), InsertionReset())
+        jack_held_out, grasp_held_out = uncertainty.draw(np.random.default_rng(7), InsertionReset(held_out=True))
         np.testing.assert_array_equal(jack, jack_held_out)
         assert (grasp != grasp_held_out).any()
 
     def test_disc_fills_the_disc(self):
         uncertainty, rng = BncUncertainty("disc"), np.random.default_rng(1)
-        radii = np.array([np.linalg.norm(uncertainty.draw(rng, {})[0]) for _ in range(2000)])
+        radii = np.array([np.linalg.norm(uncertainty.draw(rng, InsertionReset())[0]) for _ in range(2000)])
         assert radii.max() <= 1.5 * MM
         # The density is the same everywhere: half the area lies within 1/√2 of the radius.
         assert np.mean(radii < 1.5 * MM / np.sqrt(2)) == pytest.approx(0.5, abs=0.04)
@@ -203,9 +199,9 @@ class TestUncertainty:
     @pytest.mark.parametrize(
         "options", [{"ofset": 1}, {"offset": (1, 2, 3)}, {"offset": "far"}, {"offset": (0, np.nan)}]
     )
-    def test_refuses_options_that_make_no_sense(self, options):
+    def test_refuses_options_that_make_no_sense(self, kmp, options):
         with pytest.raises(InputError):
-            BncUncertainty("disc").draw(np.random.default_rng(0), options)
+            kmp.reset(options=options)
 
 
 @pytest.mark.parametrize(
@@ -221,4 +217,4 @@ class TestUncertainty:
 )
 def test_refuses_what_makes_no_sense(wrong):
     with pytest.raises(InputError):
-        make_env(**wrong)
+        make_env("BncConnector", **wrong)

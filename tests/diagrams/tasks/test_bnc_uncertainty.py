@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector import make_env
+from guiderail.diagrams.make import make_env
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
+from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
 from guiderail.tools.bnc_rule import reactive_rule
 from guiderail.tools.judging import total, trials
@@ -12,10 +13,10 @@ from guiderail.tools.judging import total, trials
 
 def drawn(uncertain, count, seed=0):
     rng = np.random.default_rng(seed)
-    return [np.concatenate(uncertain.draw(rng, {})) for _ in range(count)]
+    return [np.concatenate(uncertain.draw(rng, InsertionReset())) for _ in range(count)]
 
 
-@pytest.mark.parametrize("kind", BncUncertainty.kinds)
+@pytest.mark.parametrize("kind", ["calibration", "disc", "known"])
 def test_a_tilt_is_drawn_anew_within_its_bound_and_changes_nothing_else(kind):
     straight, tilted = drawn(BncUncertainty(kind), 50), drawn(BncUncertainty(kind, grasp_angle=1.0), 50)
     assert np.shape(straight) == (50, 4)
@@ -26,18 +27,19 @@ def test_a_tilt_is_drawn_anew_within_its_bound_and_changes_nothing_else(kind):
 
 
 def test_a_given_offset_is_without_a_tilt():
-    _, plug = BncUncertainty("disc", grasp_angle=1.0).draw(np.random.default_rng(0), {"offset": (0.0, 1e-3)})
+    given = InsertionReset(offset=(0.0, 1e-3))
+    _, plug = BncUncertainty("disc", grasp_angle=1.0).draw(np.random.default_rng(0), given)
     np.testing.assert_array_equal(plug, 0.0)
 
 
 @pytest.mark.parametrize("angle", [-0.1, LARGEST_GRASP_ANGLE + 0.1, np.nan])
 def test_refuses_an_angle_that_is_none(angle):
     with pytest.raises(InputError, match="grasp_angle"):
-        BncUncertainty("disc", grasp_angle=angle)
+        make_env("BncConnector", grasp_angle=angle)
 
 
 def test_the_plug_in_the_tool_is_tilted():
-    env = make_env(guidance="kmp", uncertainty="disc", grasp_angle=1.0)
+    env = make_env("BncConnector", guidance="kmp", uncertainty="disc", grasp_angle=1.0)
     _, info = env.reset(seed=0)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
@@ -47,5 +49,5 @@ def test_the_plug_in_the_tool_is_tilted():
 
 
 def test_a_rule_that_feels_the_torque_locks_a_tilted_plug_too():
-    env = make_env(guidance="kgrl", uncertainty="disc", grasp_angle=1.0)
+    env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", grasp_angle=1.0)
     assert total(trials(env, reactive_rule, 4), "success") == 4

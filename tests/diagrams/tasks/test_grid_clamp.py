@@ -7,21 +7,16 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import guiderail.diagrams  # noqa: F401 (registers)
-from guiderail.diagrams.tasks.grid_clamp import (
-    CENTRE,
-    COLLISION_FORCE,
-    GUIDANCE,
-    LEASH,
-    MM,
-    SCALE,
-    make_env,
-    make_skill,
-)
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.grid_clamp import CENTRE, COLLISION_FORCE, LEASH, SCALE, make_skill
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
+from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
+from guiderail.models.units import MM
 from guiderail.tools.clamp_rule import STIFFNESS, searching_rule, straight_descent
 from guiderail.tools.judging import total, trials, worst
 
+GUIDANCE = ("sct", "residual", "none")
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -41,12 +36,12 @@ def play(env, policy, *, seed=None, options=None):
 
 @pytest.fixture(scope="module")
 def env():
-    return make_env()
+    return make_env("GridClamp")
 
 
 @pytest.fixture(scope="module")
 def known():
-    return make_env(uncertainty="known")
+    return make_env("GridClamp", uncertainty="known")
 
 
 def test_is_registered():
@@ -55,7 +50,7 @@ def test_is_registered():
 
 @pytest.fixture(scope="module")
 def arm():
-    return make_env(station="arm", uncertainty="known")
+    return make_env("GridClamp", station="arm", uncertainty="known")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -85,7 +80,7 @@ def test_the_searching_rule_inserts_where_the_straight_descent_fails(env):
 @pytest.mark.parametrize("guidance", GUIDANCE)
 def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
     """Corner actions, kept for a while: they reach every corner of the cuboid and the surface of the table."""
-    env = make_env(guidance=guidance)
+    env = make_env("GridClamp", guidance=guidance)
     size = env.action_space.shape
     rng = np.random.default_rng(3)
     held = rng.choice([-1.0, 1.0], size)
@@ -110,7 +105,7 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
 
 
 def test_without_the_cuboid_a_push_is_a_collision():
-    env = make_env(guidance="none", active_constraints=False)
+    env = make_env("GridClamp", guidance="none", active_constraints=False)
     info, _, _ = play(env, lambda _: np.array([0, 0, -0.5, 0, 0, 0]), seed=0, options={"offset": (0.003, 0.0)})
     assert info["termination"] == "collision"
     assert info["contact_force"] > COLLISION_FORCE
@@ -118,7 +113,7 @@ def test_without_the_cuboid_a_push_is_a_collision():
 
 def test_force_costs_unless_it_is_left_out(known):
     """The same episode, with and without: the difference is the cost of force."""
-    without = make_env(uncertainty="known", reward="no_force")
+    without = make_env("GridClamp", uncertainty="known", reward="no_force")
     _, with_cost, terms = play(known, lambda _: DOWN, seed=1)
     _, without_cost, _ = play(without, lambda _: DOWN, seed=1)
     assert terms["force_cost"] < -0.5
@@ -148,8 +143,8 @@ def test_the_same_seed_is_the_same_episode_bit_for_bit(env):
 
 
 def test_checkers_are_content():
-    check_env(make_env(hold=25), skip_render_check=True)
-    check_env_of_sb3(make_env(hold=25), skip_render_check=True)
+    check_env(make_env("GridClamp", hold=25), skip_render_check=True)
+    check_env_of_sb3(make_env("GridClamp", hold=25), skip_render_check=True)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -165,7 +160,8 @@ class TestUncertainty:
     def test_a_run_has_six_grasps_and_one_error_of_the_table(self):
         uncertainty, rng = GridClampUncertainty("calibration"), np.random.default_rng(0)
         tables, grasps = (
-            np.array(column) for column in zip(*[uncertainty.draw(rng, {}) for _ in range(60)], strict=True)
+            np.array(column)
+            for column in zip(*[uncertainty.draw(rng, InsertionReset()) for _ in range(60)], strict=True)
         )
         assert (tables == tables[0]).all()
         assert 1.8 * MM <= np.linalg.norm(tables[0]) <= 2.2 * MM
@@ -177,14 +173,14 @@ class TestUncertainty:
     @pytest.mark.parametrize("kind", ["calibration", "disc", "known"])
     def test_the_cuboid_reaches_wherever_the_hole_is(self, kind):
         uncertainty, rng = GridClampUncertainty(kind), np.random.default_rng(1)
-        draws = [uncertainty.draw(rng, {"new_run": True}) for _ in range(500)]
+        draws = [uncertainty.draw(rng, InsertionReset(new_run=True)) for _ in range(500)]
         worst = max(np.abs(table - grasp).max() for table, grasp in draws)
         assert worst < make_skill().parameters["width_m"] / 2 - 0.2 * MM
 
     def test_held_out_keeps_the_run_and_draws_apart(self):
         uncertainty = GridClampUncertainty("calibration")
-        table, grasp = uncertainty.draw(np.random.default_rng(7), {})
-        table_held_out, grasp_held_out = uncertainty.draw(np.random.default_rng(7), {"held_out": True})
+        table, grasp = uncertainty.draw(np.random.default_rng(7), InsertionReset())
+        table_held_out, grasp_held_out = uncertainty.draw(np.random.default_rng(7), InsertionReset(held_out=True))
         np.testing.assert_array_equal(table, table_held_out)
         assert (grasp != grasp_held_out).any()
 
@@ -202,4 +198,4 @@ class TestUncertainty:
 )
 def test_refuses_what_makes_no_sense(wrong):
     with pytest.raises(InputError):
-        make_env(**wrong)
+        make_env("GridClamp", **wrong)

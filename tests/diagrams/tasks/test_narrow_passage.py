@@ -13,11 +13,13 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import guiderail.diagrams  # registers the environments
 from guiderail.diagrams import cameras
-from guiderail.diagrams.guidance import PRIMITIVE_GUIDANCE
+from guiderail.diagrams.guidance.registry import possible_guidance
+from guiderail.diagrams.tasks.narrow_passage import NarrowPassage as Task
 from guiderail.models.errors import InputError
 from guiderail.models.objects.narrow_passage import NarrowPassage
 
 WORLD = NarrowPassage()
+GUIDANCE = possible_guidance(Task.knows())
 NULL_SPACE = ("kgrl", "skgrl")
 
 
@@ -54,7 +56,7 @@ def adversaries():
         yield lambda k: rng.choice([-1.0, 1.0], 2).astype(np.float32)
 
 
-@pytest.mark.parametrize("guidance", PRIMITIVE_GUIDANCE)
+@pytest.mark.parametrize("guidance", GUIDANCE)
 def test_both_env_checkers_pass_without_a_warning(guidance):
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
@@ -74,7 +76,7 @@ def test_both_env_checkers_pass_with_images(monkeypatch):
     assert not [str(warning.message) for warning in warned]
 
 
-@pytest.mark.parametrize("guidance", PRIMITIVE_GUIDANCE)
+@pytest.mark.parametrize("guidance", GUIDANCE)
 def test_same_seed_same_episode_bit_for_bit_fresh_and_after_resets(guidance):
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
@@ -91,7 +93,7 @@ def test_same_seed_same_episode_bit_for_bit_fresh_and_after_resets(guidance):
         np.testing.assert_equal(first, second)
 
 
-@pytest.mark.parametrize("guidance", PRIMITIVE_GUIDANCE)
+@pytest.mark.parametrize("guidance", GUIDANCE)
 def test_the_demonstrations_alone_pass_and_run_into_the_obstacle(guidance):
     env = make(guidance)
     rewards, _, infos = play(env, still)
@@ -349,17 +351,20 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"guidance": "sct"}, "kmp, residual, safe_residual, kgrl, skgrl"),
-        ({"guidance": "none"}, "kmp, residual, safe_residual, kgrl, skgrl"),
+        ({"guidance": "sct"}, "a shared control template.*use kgrl, kmp, residual, safe_residual, skgrl"),
+        ({"guidance": "none"}, "use kgrl, kmp, residual, safe_residual, skgrl"),
         ({"guidance": "magic"}, "there is no guidance 'magic'"),
-        ({"reward": "dense"}, "'sparse' or 'shaped'"),
-        ({"observation": "smell"}, "'state' or 'image'"),
+        ({"reward": "dense"}, "no reward 'dense': choose one of shaped, sparse"),
+        ({"observation": "smell"}, "choose one of image, state"),
+        ({"stetion": "plane"}, "no option 'stetion': did you mean station"),
+        ({"station": "rails"}, "no station 'rails'.*plane"),
+        ({"difficulty": "hopeless"}, "no difficulty 'hopeless'"),
         ({"render_mode": "ascii"}, "render mode"),
         ({"hold": 0}, "hold"),
         ({"kappa": -1.0}, "kappa"),
         ({"history": 0}, "history"),
         ({"history_variance": 0.0}, "history_variance"),
-        ({"history_source": "dreamt"}, "commanded or measured"),
+        ({"history_source": "dreamt"}, "no history_source 'dreamt': choose one of commanded, measured"),
         ({"gains": (1.0,)}, "one per output"),
     ],
 )

@@ -5,19 +5,20 @@ import numpy as np
 import pytest
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
-from guiderail.diagrams.tasks.pouring import START_HEIGHT, START_RADIUS, make_env
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.pouring import START_HEIGHT, START_RADIUS
 from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES, person
 from guiderail.models.errors import InputError
 
 
 @pytest.fixture(scope="module")
 def env():
-    return make_env()
+    return make_env("Pouring")
 
 
 @pytest.fixture(scope="module")
 def unconstrained():
-    return make_env(active_constraints=False)
+    return make_env("Pouring", active_constraints=False)
 
 
 def run(env, inputs, seed=None, options=None, limit=150, watch=None):
@@ -84,14 +85,14 @@ def test_nobody_can_collide_or_leave_the_constraints(env, adversary):
 
 
 def test_a_velocity_without_a_template_can_do_anything():
-    env = make_env(guidance="none", reward="hand_shaped")
+    env = make_env("Pouring", guidance="none", reward="hand_shaped")
     info, total, _ = run(env, lambda observation: np.array([0.0, 1.0, -0.6, 0.0, 0.0, 0.0]), seed=0)
     assert info["termination"] in ("collision", "spill")
     assert total < 0.0
 
 
 def test_the_constraints_are_a_safety_filter_behind_a_velocity():
-    env = make_env(guidance="none", reward="sparse", active_constraints=True)
+    env = make_env("Pouring", guidance="none", reward="sparse", active_constraints=True)
     rng = np.random.default_rng(0)
     for seed in range(2):
         held = np.sign(rng.normal(size=6))
@@ -105,14 +106,14 @@ def test_the_constraints_are_a_safety_filter_behind_a_velocity():
     [({"mug_inner_diameter": 0.10, "mug_depth": 0.075}, (0.03, -0.03)), ({"mug_inner_diameter": 0.07}, (-0.03, 0.02))],
 )
 def test_the_template_is_the_objects_not_the_episodes(mug, position):
-    env = make_env(**mug)
+    env = make_env("Pouring", **mug)
     info, _, _ = run(env, person, seed=1, options={"mug_position": position})
     assert info["termination"] == "success"
     assert info["ledger"]["worst_commanded_violation"] <= 1e-9
 
 
 def test_faster_inputs_are_as_safe():
-    env = make_env(reward="sparse", hold=20)
+    env = make_env("Pouring", reward="sparse", hold=20)
     info, _, _ = run(env, person, seed=3)
     assert info["termination"] == "success"
     assert info["control_steps"] < 250
@@ -185,7 +186,7 @@ def test_shaping_is_the_progress_of_the_template(env):
 
 
 def test_hand_shaped_reward_is_the_thesiss():
-    env = make_env(guidance="none", reward="hand_shaped")
+    env = make_env("Pouring", guidance="none", reward="hand_shaped")
     observation, _ = env.reset(seed=0)
     j = np.linalg.norm(observation[:3] / 5.0)
     observation, reward, *_, info = env.step(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
@@ -198,17 +199,17 @@ def test_hand_shaped_reward_is_the_thesiss():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"guidance": "kgrl"}, "sct, none"),
+        ({"guidance": "kgrl"}, "needs demonstrations, which Pouring doesn't have: use none, sct"),
         ({"reward": "dense"}, "hand_shaped"),
         ({"observation": "image"}, "state"),
-        ({"mug_offset": 1.0}, "between 0 and"),
+        ({"mug_offset": 1.0}, "at most 0.04"),
         ({"mug_inner_diameter": 0.03}, "take the balls"),
-        ({"input_speed": 5.0}, "between 0.2 and 2"),
+        ({"input_speed": 5.0}, "at most 2"),
     ],
 )
 def test_refuses_what_makes_no_sense(arguments, said):
     with pytest.raises(InputError, match=said):
-        make_env(**arguments)
+        make_env("Pouring", **arguments)
 
 
 @pytest.mark.parametrize(

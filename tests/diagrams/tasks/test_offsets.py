@@ -1,6 +1,8 @@
+"""What training draws, and what it never draws."""
+
 import numpy as np
 
-from guiderail.diagrams.tasks.held_out import episode_stream
+from guiderail.diagrams.tasks.offsets import episode_stream
 
 
 def test_what_is_held_out_is_never_drawn_in_training_and_both_repeat_with_the_seed():

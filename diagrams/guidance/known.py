@@ -1,0 +1,81 @@
+"""What is known about a task, for guidance to be made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.models.skills import Skill
+
+INGREDIENTS = {
+    "demonstrations": "demonstrations",
+    "keep_out": "walls to keep out of",
+    "template": "a shared control template",
+    "approach": "a scripted approach",
+}
+"""What a kind of guidance can need, in words."""
+
+
+@dataclass(frozen=True)
+class Template:
+    """A shared control template in its surroundings.
+
+    Attributes:
+        skill: the template.
+        frames: the poses X_TF of its objects by name, in the frame that the station's poses are given in.
+        active_constraints: whether they hold; None leaves it to the kind of guidance.
+        leash: [m] how far the robot may be from its command before that waits.
+    """
+
+    skill: Skill
+    frames: Mapping[str, RigidTransform]
+    active_constraints: bool | None = None
+    leash: float = np.inf
+
+    def constrained(self, by_default: bool) -> bool:
+        """Whether the active constraints hold for a kind of guidance that says so `by_default`."""
+        return by_default if self.active_constraints is None else self.active_constraints
+
+
+@dataclass(frozen=True)
+class Approach:
+    """A straight line along z that needs no demonstrations, and how far a policy may lead away from it.
+
+    Attributes:
+        heights: where it begins and ends [m].
+        speed: [m/s].
+        reach: how far a full action moves the command along each axis [m].
+    """
+
+    heights: tuple[float, float]
+    speed: float
+    reach: float
+
+
+@dataclass(frozen=True)
+class Known:
+    """What a task knows; None where nobody wrote that down.
+
+    Attributes:
+        period: s, seconds between control steps.
+        demonstrations: with constraints, walls to keep out of, and how a policy may move between them.
+        template: in its surroundings.
+        approach: a scripted one.
+        options: of the kind of guidance itself, by name, where it declares some.
+    """
+
+    period: float
+    demonstrations: PrimitiveSkill | None = None
+    template: Template | None = None
+    approach: Approach | None = None
+    options: Mapping[str, object] = field(default_factory=dict)
+
+    def has(self, ingredient: str) -> bool:
+        """Whether that is known."""
+        if ingredient == "keep_out":
+            return self.demonstrations is not None and self.demonstrations.keep_out is not None
+        return getattr(self, ingredient) is not None

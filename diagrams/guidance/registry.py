@@ -1,0 +1,105 @@
+"""The kinds of guidance by name: how each is made, what it needs, and how it is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+from pydantic import BaseModel
+from pydrake.systems.framework import Diagram
+
+from guiderail.diagrams.guidance.known import INGREDIENTS, Known
+from guiderail.models.errors import InputError
+from guiderail.models.registry import Registry
+
+
+@dataclass(frozen=True)
+class GuidanceKind:
+    """A kind of guidance.
+
+    Attributes:
+        name: what `guidance=` calls it.
+        build: from what is known to a diagram with the ports of `Guidance`.
+        needs: alternatives, each some of `INGREDIENTS`: one of them must be known completely.
+        label: what a legend calls it.
+        colour: what it is drawn with, "#rrggbb".
+        demonstrates: whether an action of zero is the demonstrations or the script alone, so that success before
+            anything is learned can be stated.
+        options: a model of further options of the environment; none unless given.
+    """
+
+    name: str
+    build: Callable[[Known], Diagram]
+    needs: tuple[tuple[str, ...], ...]
+    label: str
+    colour: str
+    demonstrates: bool = False
+    options: type[BaseModel] | None = None
+
+    def lacks(self, known: Collection[str]) -> tuple[str, ...]:
+        """The ingredients that are missing; none of them where some alternative is complete."""
+        lacking = [tuple(one for one in needed if one not in known) for needed in self.needs]
+        return min(lacking, key=len, default=())
+
+
+GUIDANCE: Registry[GuidanceKind] = Registry(
+    "guidance", package="guiderail.diagrams.guidance", entry_points="guiderail.guidance"
+)
+
+
+def register_guidance(
+    name: str,
+    *,
+    needs: tuple[tuple[str, ...], ...] = (),
+    label: str | None = None,
+    colour: str = "#17becf",
+    demonstrates: bool = False,
+    options: type[BaseModel] | None = None,
+) -> Callable[[Callable[[Known], Diagram]], Callable[[Known], Diagram]]:
+    """A decorator that adds a kind of guidance; it decorates a function or a class that takes a `Known`.
+
+    Args:
+        name: what `guidance=` calls it.
+        needs, colour, demonstrates, options: see `GuidanceKind`.
+        label: what a legend calls it; its name unless given.
+    """
+
+    def add(build: Callable[[Known], Diagram]) -> Callable[[Known], Diagram]:
+        kind = GuidanceKind(name, build, needs, label or name, colour, demonstrates, options)
+        GUIDANCE.register(name, kind)
+        return build
+
+    return add
+
+
+def possible_guidance(known: Collection[str]) -> list[str]:
+    """The names of all kinds that can be made of these ingredients."""
+    return [name for name in GUIDANCE.names() if not GUIDANCE.get(name).lacks(known)]
+
+
+def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:
+    """The kind of that name, if it can be made of the ingredients that are known of a task.
+
+    Raises:
+        InputError: if there is no such kind, or something that it needs is missing: then it says what.
+    """
+    kind = GUIDANCE.get(name)
+    lacking = kind.lacks(known)
+    if lacking:
+        words = " and ".join(INGREDIENTS.get(one, one) for one in lacking)
+        raise InputError(
+            f"guidance '{name}' needs {words}, which {task} doesn't have: use {', '.join(possible_guidance(known))}"
+        )
+    return kind
+
+
+def build_guidance(name: str, known: Known, task: str = "this task") -> Diagram:
+    """The guidance of that name, made of what is known.
+
+    Raises:
+        InputError: if there is no such kind, or something that it needs is missing.
+    """
+    kind = check_guidance(name, [one for one in INGREDIENTS if known.has(one)], task)
+    guidance = kind.build(known)
+    guidance.set_name("guidance")
+    return guidance

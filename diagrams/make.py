@@ -1,0 +1,174 @@
+"""From names and options to an environment, or to a learned skill as a diagram."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, Field
+from pydrake.systems.framework import Diagram, System
+from threadpoolctl import threadpool_limits
+
+from guiderail.diagrams.env import GuidedEnv, check_render_mode
+from guiderail.diagrams.guidance.known import Known
+from guiderail.diagrams.guidance.registry import build_guidance, check_guidance, possible_guidance
+from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
+from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of
+from guiderail.diagrams.tasks.options import Integer, Options, PrimitiveOptions, TemplateOptions, choose, validated
+from guiderail.diagrams.tasks.task import STANDARD, TASKS, Choice, Task
+from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
+
+
+class CommonOptions(Options):
+    """Of every environment."""
+
+    guidance: str = Field("", description="what stands between the policy and the robot")
+    station: str = Field("", description="where it is done")
+    reward: str = Field("", description="what is rewarded")
+    observation: str = Field("", description="what the policy sees")
+    difficulty: str = Field(STANDARD, description="which of the task's declared settings")
+    hold: Integer = Field(1, ge=1, description="control steps per decision")
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """What an environment is made of, every option checked and every default filled in.
+
+    Attributes:
+        task: the declaration.
+        station: the kind of station.
+        models: the options by whom they concern: "common", "task", "station", "primitive", "template", "guidance".
+    """
+
+    task: Task
+    station: StationKind
+    models: Mapping[str, BaseModel]
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """All options by name, as `gymnasium.make` takes them."""
+        return dict(self.task.choice.values)
+
+
+def option_models(task: type[Task], guidance: str, station: str) -> dict[str, type[BaseModel]]:
+    """The models of all options that an environment has, by whom they concern."""
+    kind = check_guidance(guidance, task.knows(), task.name)
+    return {
+        "common": CommonOptions,
+        "task": task.Options,
+        "station": STATIONS.get(station).options or Options,
+        "primitive": PrimitiveOptions if "demonstrations" in task.knows() else Options,
+        "template": TemplateOptions if "template" in task.knows() else Options,
+        "guidance": kind.options or Options,
+    }
+
+
+def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
+    """The options of an environment of a task, checked, defaults filled in.
+
+    Raises:
+        InputError: for an unknown task, option or word, or a value out of range.
+    """
+    declared = TASKS.get(name)
+    places = stations_for(declared.world_kind)
+    difficulty = choose("difficulty", given.get("difficulty", STANDARD), list(declared.difficulties), name)
+    first = {"guidance": possible_guidance(declared.knows())[0], "station": places[0]}
+    first |= {"reward": declared.rewards[0], "observation": declared.observations[0]}
+    merged = first | dict(declared.defaults) | dict(declared.difficulties[difficulty]) | dict(given)
+    station = STATIONS.get(choose("station", merged["station"], places, name))
+    choose("reward", merged["reward"], list(declared.rewards), name)
+    choose("observation", merged["observation"], list(declared.observations), name)
+
+    models = option_models(declared, merged["guidance"], station.name)
+    known = [key for model in models.values() for key in model.model_fields]
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        raise InputError(f"{name} has no option {unknown[0]!r}: {did_you_mean(unknown[0], known)}")
+    checked = {
+        part: validated(model, {key: merged[key] for key in model.model_fields if key in merged}, name)
+        for part, model in models.items()
+    }
+    values = {key: value for model in checked.values() for key, value in _values(model).items()}
+    choice = Choice(**_values(checked["common"]), values=values)
+    task = declared(checked["task"], choice)  # type: ignore[arg-type]
+    return Resolved(task, station, checked)
+
+
+def make_station(resolved: Resolved) -> Station:
+    """The station of an environment, its world in it."""
+    return resolved.station.build(resolved.task.world(), **_values(resolved.models["station"]))
+
+
+def make_guidance(resolved: Resolved, station: Station) -> Diagram:
+    """The guidance of an environment, for its station."""
+    return build_guidance(resolved.task.choice.guidance, _known(resolved, station), resolved.task.name)
+
+
+def known(task: str, **options: Any) -> Known:
+    """What is known about a task, with the options of an environment: for whoever wants its primitive or template.
+
+    Raises:
+        InputError: as `make_env`.
+    """
+    resolved = resolve(task, options)
+    return _known(resolved, make_station(resolved))
+
+
+def _known(resolved: Resolved, station: Station) -> Known:
+    models = resolved.models
+    return known_of(resolved.task, station, _values(models["primitive"]), _values(models["guidance"]))
+
+
+def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> GuidedEnv:
+    """`gymnasium.make("guiderail/<Task>-v0", ...)`.
+
+    From here on this process calculates with one thread: matrices are small here, and where another process wants the
+    cores too, threads that wait for each other take eighty times as long.
+
+    Args:
+        task: its name.
+        render_mode: None, "human" (a browser view) or "rgb_array".
+        options: those of `guiderail list`: of every environment, of the task, its guidance and its station.
+
+    Raises:
+        InputError: for an unknown name, a value out of range, or a pairing that makes no sense.
+    """
+    check_render_mode(render_mode)
+    resolved = resolve(task, options)
+    threadpool_limits(1)
+    station = make_station(resolved)
+    diagram = assemble(resolved.task, station, make_guidance(resolved, station), render_mode=render_mode)
+    return GuidedEnv(diagram, hold=resolved.task.choice.hold, render_mode=render_mode)
+
+
+def make_skill(
+    task: str,
+    policy: System | Callable[[np.ndarray], np.ndarray],
+    *,
+    render_mode: str | None = None,
+    **options: Any,
+) -> SkillDiagram:
+    """A learned skill as a plain diagram that `Simulator` runs: observation → policy → guidance → station.
+
+    Args:
+        task: the name of the task that it was learned on.
+        policy: a saved `Policy`, any function from an observation to an action, or a system in its place.
+        render_mode: None, or "human" for a view in the browser.
+        options: those of the environment that it was learned in.
+
+    Raises:
+        InputError: as `make_env`, or if a system in the policy's place sees or gives another number of values.
+    """
+    resolved = resolve(task, options)
+    threadpool_limits(1)
+    station = make_station(resolved)
+    guidance = make_guidance(resolved, station)
+    return assemble_skill(resolved.task, station, guidance, policy, render_mode=render_mode)
+
+
+def _values(model: BaseModel) -> dict[str, Any]:
+    return {name: getattr(model, name) for name in type(model).model_fields}

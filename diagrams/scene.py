@@ -1,0 +1,61 @@
+"""How a task is drawn: what belongs into a picture besides the robot, and where to look from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+Viewpoint = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Where to look from, and where to look at, in the world [m]."""
+
+ARM_VIEW: Viewpoint = ((1.05, -0.75, 0.55), (0.42, 0.0, 0.32))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """How a task is drawn.
+
+    Attributes:
+        to_world: takes poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
+        demonstrations: poses (N, O) of each demonstration.
+        constraint: corner points (k, 3) of each line that bounds what is allowed.
+        viewpoint: where a page looks from.
+        arm_views: the same where a whole arm does it, by name; a page opens with the first and offers them all.
+        line_radius: how thick a path is drawn [m].
+    """
+
+    to_world: Callable[[np.ndarray], np.ndarray]
+    demonstrations: tuple[np.ndarray, ...] = ()
+    constraint: tuple[np.ndarray, ...] = ()
+    viewpoint: Viewpoint | None = None
+    arm_views: Mapping[str, Viewpoint] = field(default_factory=dict)
+    line_radius: float = 0.0015
+
+
+def in_plane(poses: np.ndarray) -> np.ndarray:
+    """Points (n, 3): (x, y) at height zero, or the position of a pose of six numbers."""
+    poses = np.asarray(poses)
+    if poses.shape[1] >= 3:
+        return poses[:, :3]
+    return np.column_stack([poses, np.zeros(len(poses))])
+
+
+def in_frame(X_WT: RigidTransform) -> Callable[[np.ndarray], np.ndarray]:
+    """Takes poses (n, 6) that are given in T to points (n, 3) in the world."""
+    return lambda poses: X_WT.multiply(np.asarray(poses)[:, :3].T).T
+
+
+def viewpoint(eye: np.ndarray, target: np.ndarray) -> Viewpoint:
+    """A viewpoint of two points (3,)."""
+    return (float(eye[0]), float(eye[1]), float(eye[2])), (float(target[0]), float(target[1]), float(target[2]))
+
+
+def box_edges(half_width: float, low: float, high: float) -> list[np.ndarray]:
+    """The twelve edges (2, 3) of an upright box around the z axis: a path that turns sharply is drawn side by side."""
+    square = half_width * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    rings = [np.column_stack([square, np.full(5, height)]) for height in (low, high)]
+    sides = [ring[i : i + 2] for ring in rings for i in range(4)]
+    return sides + [np.array([[x, y, low], [x, y, high]]) for x, y in square[:4]]

@@ -1,0 +1,59 @@
+"""Stations by name: what each works on, and how it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel
+
+from guiderail.diagrams.stations.station import Station
+from guiderail.models.registry import Registry
+
+
+@dataclass(frozen=True)
+class StationKind:
+    """A kind of station.
+
+    Attributes:
+        name: what `station=` calls it.
+        build: from a world, and its options by name, to a station.
+        world: the kind of world that it works on: "workcell" for whoever puts a workpiece into a fixture.
+        options: a model of further options of the environment; none unless given.
+        words: what it is, in a line.
+    """
+
+    name: str
+    build: Callable[..., Station]
+    world: str
+    options: type[BaseModel] | None
+    words: str
+
+
+STATIONS: Registry[StationKind] = Registry(
+    "station", package="guiderail.diagrams.stations", entry_points="guiderail.stations"
+)
+
+
+def register_station(
+    name: str, *, world: str, options: type[BaseModel] | None = None
+) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
+    """A decorator that adds a station; it decorates a class or a function that takes a world and its options.
+
+    Args:
+        name: what `station=` calls it.
+        world, options: see `StationKind`.
+    """
+
+    def add(build: Any) -> Any:
+        words = str(build.__doc__ or "").strip().splitlines()
+        STATIONS.register(name, StationKind(name, build, world, options, words[0] if words else ""))
+        return build
+
+    return add
+
+
+def stations_for(world: str) -> list[str]:
+    """The names of the stations that work on such a world."""
+    return [name for name in STATIONS.names() if STATIONS.get(name).world == world]

@@ -1,0 +1,338 @@
+"""From a declaration to a diagram: the loop of station, guidance and observation, and whoever judges it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
+from pydrake.systems.primitives import ZeroOrderHold
+
+from guiderail.diagrams.cameras import Camera, add_camera, add_meshcat
+from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
+from guiderail.diagrams.guidance.known import Known
+from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.diagrams.ledger import add_ledger
+from guiderail.diagrams.observation import Observation, affine
+from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.task import TaskDiagram
+from guiderail.diagrams.tasks.options import validated
+from guiderail.diagrams.tasks.task import Task
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import LinearConstraints
+from guiderail.models.registry import did_you_mean
+from guiderail.systems.constraint_violation import ConstraintViolation
+from guiderail.systems.episode_monitor import EpisodeMonitor
+from guiderail.systems.policy_system import PolicySystem
+from guiderail.systems.reward_system import RewardSystem
+from guiderail.systems.safety_ledger import SafetyLedger
+
+
+def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidance: Mapping[str, Any]) -> Known:
+    """What a task knows, for guidance on a station.
+
+    Args:
+        task: the declaration.
+        station: for its period and sizes.
+        primitive: options of `PrimitiveSkill` by name.
+        guidance: the kind of guidance's own options by name.
+    """
+    knows = task.knows()
+    skill = None
+    if "demonstrations" in knows:
+        skill = PrimitiveSkill(
+            reference=task.reference(),
+            constraints=task.constraints() or LinearConstraints.none(station.pose_size),
+            control_period=station.control_period,
+            isotropic_groups=task.isotropic_groups,
+            keep_out=task.keep_out() if "keep_out" in knows else None,
+            wrench_size=station.wrench_size,
+            **primitive,
+        )
+    return Known(
+        period=station.control_period,
+        demonstrations=skill,
+        template=task.template() if "template" in knows else None,
+        approach=task.approach() if "approach" in knows else None,
+        options=guidance,
+    )
+
+
+class Signals:
+    """Ports by name, while a diagram is built; "last_x" is x held from the control step before."""
+
+    def __init__(self, builder: DiagramBuilder, period: float, ports: Mapping[str, OutputPort]):
+        """
+        Args:
+            builder: what holds a signal is added to it.
+            period: s, seconds between control steps.
+            ports: the signals that there are.
+        """
+        self._builder, self._period, self._ports = builder, period, dict(ports)
+
+    def add(self, ports: Mapping[str, OutputPort]) -> None:
+        """Adds further signals; of two of the same name the later one counts."""
+        self._ports |= ports
+
+    def get(self, name: str, whose: str) -> OutputPort:
+        """The port of a signal.
+
+        Raises:
+            InputError: if there is none of that name.
+        """
+        held = name.removeprefix("last_")
+        if name not in self._ports and held != name and held in self._ports:
+            # A change over a control step is the difference of the two.
+            port = self._ports[held]
+            hold = self._builder.AddNamedSystem(name, ZeroOrderHold(self._period, port.size()))
+            self._builder.Connect(port, hold.get_input_port())
+            self._ports[name] = hold.get_output_port()
+        if name not in self._ports:
+            raise InputError(
+                f"{whose} needs the signal {name!r}, which nothing here has: {did_you_mean(name, self._ports)}"
+            )
+        return self._ports[name]
+
+    def connect(self, system: Any, names: Mapping[str, int], whose: str) -> None:
+        """Connects a system's inputs, each named and sized as its signal.
+
+        Raises:
+            InputError: if a signal is missing or of another size.
+        """
+        for name, size in names.items():
+            port = self.get(name, whose)
+            if port.size() != size:
+                raise InputError(f"{whose} takes the signal {name!r} as {size} numbers, and it has {port.size()}")
+            self._builder.Connect(port, system.get_signal_input_port(name))
+
+
+class Loop:
+    """Station, guidance and what a policy sees, closed but for the policy itself.
+
+    Attributes:
+        builder: of the root diagram.
+        station, guidance: its subsystems of these names.
+        signals: what can be named by whoever judges.
+        space: of observations.
+        observation: the port with what a policy sees.
+    """
+
+    def __init__(self, task: Task, station: Station, guidance: Diagram):
+        self.builder = builder = DiagramBuilder()
+        self.station = builder.AddNamedSystem("station", station)
+        self.guidance = builder.AddNamedSystem("guidance", guidance)
+        check_guidance_ports(guidance, station.pose_size, station.wrench_size)
+        builder.Connect(station.get_pose_output_port(), guidance.GetInputPort("pose"))
+        builder.Connect(station.get_wrench_output_port(), guidance.GetInputPort("wrench"))
+        builder.Connect(guidance.GetOutputPort("desired_pose"), station.get_desired_pose_input_port())
+        self.signals = Signals(builder, station.control_period, _vector_ports(station) | _vector_ports(guidance))
+        self.signals.add({"action": guidance.GetOutputPort("held_action")})
+        self.signals.add(task.signals(builder, station))
+        self.space, self.observation = self._add_observation(task)
+
+    def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
+        observed, station = task.observed(), self.station
+        if isinstance(observed, Camera):
+            query = station.GetOutputPort("query")
+            image = add_camera(self.builder, station.scene_graph, query, "observation_camera", observed)
+            width, height = observed.size
+            return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
+        whose = f"the observation of {task.name}"
+        names = [one.signal for one in observed if one.signal not in ("time", "phase")]
+        ports = {name: self.signals.get(name, whose) for name in names}
+        duration = task.num_steps * station.control_period
+        sizes = {name: port.size() for name, port in ports.items()}
+        diagram = self.builder.AddNamedSystem("observation", Observation(observed, sizes, duration, task.clip))
+        for name, port in ports.items():
+            self.builder.Connect(port, diagram.GetInputPort(name))
+        return diagram.space, diagram.get_observation_output_port()
+
+
+def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None) -> TaskDiagram:
+    """Wires a task: its loop, and reward, monitor and ledger beside it. The policy's `action` is an input.
+
+    Raises:
+        InputError: if a signal that the task names doesn't exist here, or a port has the wrong size.
+    """
+    loop = Loop(task, station, guidance)
+    builder, signals, period = loop.builder, loop.signals, station.control_period
+    builder.ExportInput(guidance.GetInputPort("action"), "action")
+
+    violations = _add_violations(builder, task, station, guidance)
+    conditions = task.conditions()
+    monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period))
+    watched = {name: size for condition in conditions for name, size in condition.inputs.items()}
+    signals.connect(monitor, watched, f"the end of an episode of {task.name}")
+    signals.add({"termination": monitor.get_termination_output_port()})
+
+    terms = task.reward_terms(guidance.GetInputPort("action").size())
+    reward = builder.AddNamedSystem("reward", RewardSystem(terms))
+    rewarded = {name: size for term in terms for name, size in term.inputs.items()}
+    signals.connect(reward, rewarded, f"reward {task.choice.reward!r} of {task.name}")
+
+    too_much = builder.AddNamedSystem("collision", affine(np.eye(1), [-task.collision.above]))
+    builder.Connect(signals.get(task.collision.signal, f"the ledger of {task.name}"), too_much.get_input_port())
+    force = station.get_contact_force_output_port()
+    ledger = add_ledger(
+        builder,
+        period,
+        **violations,
+        contact_force=force,
+        collision=too_much.get_output_port(),
+        saturation=station.get_saturation_output_port(),
+        fallback=guidance.GetOutputPort("fallback"),
+    )
+    exported = {
+        **violations,
+        "observation": loop.observation,
+        "reward": reward.get_reward_output_port(),
+        **{name: reward.get_term_output_port(name) for name in reward.term_names},
+        "termination": monitor.get_termination_output_port(),
+        "contact_force": force,
+        "ledger": ledger,
+        "desired_pose": guidance.GetOutputPort("desired_pose"),
+        "pose": station.get_pose_output_port(),
+        "wrench": station.get_wrench_output_port(),
+        "fallback": guidance.GetOutputPort("fallback"),
+    }
+    # What this guidance has beyond the contract, such as the state of a template.
+    exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
+    for name, port in exported.items():
+        builder.ExportOutput(port, name)
+    meshcat = _add_view(builder, task, station, render_mode)
+    diagram = builder.Build()
+    diagram.set_name(task.name.replace("/", "_"))
+    return TaskDiagram(
+        diagram=diagram,
+        control_period=period,
+        num_steps=task.num_steps,
+        observation_space=loop.space,
+        reward_terms=reward.term_names,
+        ledger_fields=SafetyLedger.FIELDS,
+        randomize=_randomize(task, station, guidance),
+        push=_push(station) if task.pushable else None,
+        meshcat=meshcat,
+        symmetry=task.symmetry(),
+        declaration=task,
+    )
+
+
+@dataclass(frozen=True)
+class SkillDiagram:
+    """A learned skill as a plain diagram, for a `Simulator`: observation → policy → guidance → station.
+
+    Attributes:
+        diagram: with subsystems of these names; exports pose, desired_pose, wrench, contact_force, held_action,
+            constraint_violation and fallback.
+        control_period: s, seconds between control steps.
+        num_steps: control steps of an episode.
+        randomize: as in `TaskDiagram`: call it with the root context before `Simulator.Initialize`.
+        meshcat: where the diagram publishes to, if anywhere.
+    """
+
+    diagram: Diagram
+    control_period: float
+    num_steps: int
+    randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]]
+    meshcat: Meshcat | None = None
+
+
+def assemble_skill(
+    task: Task,
+    station: Station,
+    guidance: Diagram,
+    policy: System | Callable[[np.ndarray], np.ndarray],
+    *,
+    render_mode: str | None = None,
+) -> SkillDiagram:
+    """Wires a learned skill, without whatever judges it.
+
+    Args:
+        task: what it is a skill of.
+        station, guidance: as for `assemble`.
+        policy: from an observation to an action, called at every `hold` control periods by a `PolicySystem`; or any
+            system with an input `observation` and an output `action`.
+        render_mode: None, or "human" for a view in the browser.
+
+    Raises:
+        InputError: as `assemble`, or if the policy's ports have other sizes.
+    """
+    loop = Loop(task, station, guidance)
+    builder, action = loop.builder, guidance.GetInputPort("action")
+    if not isinstance(policy, System):
+        port = loop.observation
+        seen_as = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
+        policy = PolicySystem(policy, seen_as, action.size(), task.choice.hold * station.control_period)
+    builder.AddNamedSystem("policy", policy)
+    seen, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
+    if seen.size() != loop.observation.size() or acts.size() != action.size():
+        raise InputError(
+            f"a policy of {task.name} sees {loop.observation.size()} numbers and gives {action.size()}, "
+            f"this one {seen.size()} and {acts.size()}: it was trained with other options"
+        )
+    builder.Connect(loop.observation, seen)
+    builder.Connect(acts, action)
+    for name in ("pose", "wrench", "contact_force"):
+        builder.ExportOutput(station.GetOutputPort(name), name)
+    for name in OUTPUTS:
+        builder.ExportOutput(guidance.GetOutputPort(name), name)
+    meshcat = _add_view(builder, task, station, render_mode)
+    diagram = builder.Build()
+    diagram.set_name(f"{task.name.replace('/', '_')}_skill")
+    return SkillDiagram(diagram, station.control_period, task.num_steps, _randomize(task, station, guidance), meshcat)
+
+
+def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
+    ports = (diagram.get_output_port(index) for index in range(diagram.num_output_ports()))
+    return {port.get_name(): port for port in ports if port.get_data_type() == PortDataType.kVectorValued}
+
+
+def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guidance: Diagram) -> dict[str, OutputPort]:
+    """Judges commanded and measured poses by the task's own constraints; where it has none, guidance judges."""
+    constraints = task.constraints()
+    poses = {"commanded_violation": guidance.GetOutputPort("desired_pose")}
+    poses["measured_violation"] = station.get_pose_output_port()
+    violations = {}
+    if constraints is None:
+        constraints = LinearConstraints.none(station.pose_size)
+        violations["commanded_violation"] = guidance.GetOutputPort("constraint_violation")
+        if guidance.HasOutputPort("measured_violation"):
+            violations["measured_violation"] = guidance.GetOutputPort("measured_violation")
+    for name, port in poses.items():
+        if name not in violations:
+            violation = builder.AddNamedSystem(name, ConstraintViolation(constraints, station.control_period))
+            builder.Connect(port, violation.get_pose_input_port())
+            violations[name] = violation.get_violation_output_port()
+    return violations
+
+
+def _randomize(task: Task, station: Station, guidance: Diagram) -> Any:
+    def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
+        return task.reset(station, guidance, context, rng, validated(task.Reset, options, f"a reset of {task.name}"))
+
+    return randomize
+
+
+def _push(station: Station) -> Any:
+    def push(context: Context, displacement: np.ndarray) -> None:
+        pose = station.get_pose_output_port().Eval(station.GetMyContextFromRoot(context))
+        station.set_pose(context, pose + displacement)
+
+    return push
+
+
+def _add_view(builder: DiagramBuilder, task: Task, station: Station, render_mode: str | None) -> Meshcat | None:
+    """Adds a browser view for "human", and for "rgb_array" the task's camera, whose image is exported."""
+    if render_mode == "human":
+        return add_meshcat(builder, station.GetOutputPort("query"))[0]
+    if render_mode == "rgb_array":
+        camera = task.camera()
+        if camera is None:
+            raise InputError(f"{task.name} has no camera: leave render_mode='rgb_array' out")
+        picture = add_camera(builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera)
+        builder.ExportOutput(picture, "rgb_image")
+    return None

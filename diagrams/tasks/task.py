@@ -1,0 +1,182 @@
+"""A task as a declaration: what `assemble` needs to know to make a diagram of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+
+from guiderail.diagrams.cameras import Camera
+from guiderail.diagrams.guidance.known import Approach, Template
+from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.scene import Scene, in_plane
+from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.task import Symmetry
+from guiderail.diagrams.tasks.options import Options, ResetOptions
+from guiderail.models.keep_out import KeepOut
+from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
+from guiderail.models.registry import Registry
+from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.reward_system import RewardTerm
+
+STANDARD = "standard"
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A signal that means a collision while it is above a limit."""
+
+    signal: str = "contact_force"
+    above: float = 0.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What every environment is made with.
+
+    Attributes:
+        guidance, station, reward, observation, difficulty: words.
+        hold: control steps per decision.
+        values: all options, those of the task too, by name.
+    """
+
+    guidance: str
+    station: str
+    reward: str
+    observation: str
+    difficulty: str
+    hold: int
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Task(ABC):
+    """What is done, in what world, for what reward, and how an episode begins and ends.
+
+    A task says what there is; `assemble` wires it. A reward term, a condition or an observation names signals: ports of
+    the station, of the guidance, of `signals`, and any of them with "last_" before it, held from the control step
+    before.
+
+    Attributes:
+        options: the task's own, checked.
+        choice: what every environment is made with.
+    """
+
+    name: ClassVar[str] = ""
+    world_kind: ClassVar[str] = "workcell"
+    Options: ClassVar[type[Options]] = Options
+    Reset: ClassVar[type[ResetOptions]] = ResetOptions
+    rewards: ClassVar[tuple[str, ...]] = ("sparse",)
+    observations: ClassVar[tuple[str, ...]] = ("state",)
+    defaults: ClassVar[Mapping[str, Any]] = {}
+    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}}
+    learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "robust"}
+    num_steps: ClassVar[int]
+    clip: ClassVar[float] = 3.0
+    collision: ClassVar[Threshold] = Threshold()
+    isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
+    pushable: ClassVar[bool] = True
+
+    def __init__(self, options: Options, choice: Choice):
+        self.options = options
+        self.choice = choice
+
+    # What there is.
+
+    @abstractmethod
+    def world(self) -> Any:
+        """What a station of `world_kind` works on."""
+
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Further signals by name; whatever makes them is added to the builder."""
+        return {}
+
+    # What is known of it. A hook that a task doesn't override is something that nobody wrote down.
+
+    def reference(self) -> ReferenceTrajectory:
+        """What demonstrations have in common; its clock is the control period."""
+        raise NotImplementedError
+
+    def keep_out(self) -> KeepOut:
+        """Walls that safe residual learning stops before."""
+        raise NotImplementedError
+
+    def template(self) -> Template:
+        """A shared control template."""
+        raise NotImplementedError
+
+    def approach(self) -> Approach:
+        """A scripted approach."""
+        raise NotImplementedError
+
+    def constraints(self) -> LinearConstraints | None:
+        """G y ≥ c on every commanded pose; None where only guidance knows (a template's active constraints)."""
+        return None
+
+    # What a policy sees, and what it is told.
+
+    @abstractmethod
+    def observed(self) -> Sequence[Observed] | Camera:
+        """What a policy sees, for `choice.observation`."""
+
+    @abstractmethod
+    def reward_terms(self, num_actions: int) -> Sequence[RewardTerm]:
+        """The terms of a control step's reward, for `choice.reward`."""
+
+    @abstractmethod
+    def conditions(self) -> Sequence[Condition]:
+        """What ends an episode; the first that holds counts."""
+
+    def symmetry(self) -> Symmetry | None:
+        """A half turn or a mirror under which the task stays what it is."""
+        return None
+
+    # How an episode begins.
+
+    @abstractmethod
+    def reset(
+        self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
+    ) -> dict[str, Any]:
+        """Draws an episode's conditions and writes them into the root context; returns what `info` says of them."""
+
+    # How it is drawn.
+
+    def camera(self) -> Camera | None:
+        """What `render_mode="rgb_array"` sees; None where a task has no picture."""
+        return None
+
+    def scene(self) -> Scene:
+        """What is drawn beside the robot, and where to look from."""
+        return Scene(to_world=in_plane)
+
+    @classmethod
+    def knows(cls) -> tuple[str, ...]:
+        """The ingredients of guidance that somebody wrote down for this task."""
+        hooks = {
+            "demonstrations": "reference",
+            "keep_out": "keep_out",
+            "template": "template",
+            "approach": "approach",
+        }
+        return tuple(name for name, hook in hooks.items() if getattr(cls, hook) is not getattr(Task, hook))
+
+
+TASKS: Registry[type[Task]] = Registry("task", package="guiderail.diagrams.tasks", entry_points="guiderail.tasks")
+
+
+def register_task(name: str) -> Callable[[type[Task]], type[Task]]:
+    """A decorator that adds a task; `name` may have a namespace of its own, as in "lab/Peg"."""
+
+    def add(task: type[Task]) -> type[Task]:
+        task.name = name
+        return TASKS.register(name, task)
+
+    return add
+
+
+def environment_id(name: str) -> str:
+    """What `gymnasium.make` calls a task."""
+    return f"{name if '/' in name else f'guiderail/{name}'}-v0"
