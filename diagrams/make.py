@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
+from pydantic import Field
 from pydrake.systems.framework import Diagram, System
 from threadpoolctl import threadpool_limits
 
 from guiderail.diagrams.env import GuidedEnv, check_render_mode
 from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.registry import build_guidance, check_guidance, possible_guidance
+from guiderail.diagrams.options import Integer, Options, PrimitiveOptions, TemplateOptions, choose, validated
 from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of
-from guiderail.diagrams.tasks.options import Integer, Options, PrimitiveOptions, TemplateOptions, choose, validated
 from guiderail.diagrams.tasks.task import STANDARD, TASKS, Choice, Task
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
@@ -46,7 +46,7 @@ class Resolved:
 
     task: Task
     station: StationKind
-    models: Mapping[str, BaseModel]
+    models: Mapping[str, Options]
 
     @property
     def values(self) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class Resolved:
         return dict(self.task.choice.values)
 
 
-def option_models(task: type[Task], guidance: str, station: str) -> dict[str, type[BaseModel]]:
+def option_models(task: type[Task], guidance: str, station: str) -> dict[str, type[Options]]:
     """The models of all options that an environment has, by whom they concern."""
     kind = check_guidance(guidance, task.knows(), task.name)
     return {
@@ -94,7 +94,7 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
     }
     values = {key: value for model in checked.values() for key, value in _values(model).items()}
     choice = Choice(**_values(checked["common"]), values=values)
-    task = declared(checked["task"], choice)  # type: ignore[arg-type]
+    task = declared(checked["task"], choice)
     return Resolved(task, station, checked)
 
 
@@ -170,5 +170,5 @@ def make_skill(
     return assemble_skill(resolved.task, station, guidance, policy, render_mode=render_mode)
 
 
-def _values(model: BaseModel) -> dict[str, Any]:
+def _values(model: Options) -> dict[str, Any]:
     return {name: getattr(model, name) for name in type(model).model_fields}

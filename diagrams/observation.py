@@ -26,8 +26,8 @@ class Observed:
     """
 
     signal: str
-    centre: Sequence[float] | float = 0.0
-    scale: Sequence[float] | float = 1.0
+    centre: Sequence[float] | np.ndarray | float = 0.0
+    scale: Sequence[float] | np.ndarray | float = 1.0
     entries: tuple[int, ...] | None = None
 
 

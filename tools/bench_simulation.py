@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.diagrams.make import make_env
 from guiderail.diagrams.recording import DrivenStation, along
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import Workcell
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS
-from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.objects.bnc_motion import insert_and_lock
+from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor

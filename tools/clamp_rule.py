@@ -12,8 +12,8 @@ import json
 
 import numpy as np
 
-from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.make import make_env
+from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.grid_clamp import CENTRE, SCALE, make_skill
 from guiderail.models.objects.grid_clamp import GridClampDimensions
 from guiderail.models.units import MM

@@ -25,7 +25,9 @@ COUNTS = ("collisions", "collision_steps", "saturations", "fallbacks")
 
 def known_tasks() -> list[str]:
     """The tasks that there are: those that are declared, and environments that somebody registered as guiderail's."""
-    return sorted({*TASKS.names(), *(spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")})
+    return sorted(
+        {*TASKS.names(), *(spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")}
+    )
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:

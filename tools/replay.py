@@ -156,7 +156,9 @@ def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray,
     return (points[:, None] + radius * ring).reshape(-1, 3), faces
 
 
-def _with_caption(page: str, episode: Shown, row: dict[str, Any], drawn: set[str], views: Mapping[str, Viewpoint]) -> str:
+def _with_caption(
+    page: str, episode: Shown, row: dict[str, Any], drawn: set[str], views: Mapping[str, Viewpoint]
+) -> str:
     """The page with a legend over it: what it shows, the numbers of the episode shown, and where to look from."""
     entries = "".join(
         f'<div><span style="color:rgb({",".join(str(round(255 * c)) for c in colour[:3])})">&#9644;</span> '

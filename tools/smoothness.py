@@ -171,7 +171,9 @@ def _strength(method: Method, explored: tuple[int, ...], kappa: float) -> dict[s
     if method.guidance == "kmp":
         return {}
     # Built once more, only for its primitive: what the environment would explore with at κ = 1.
-    explored_with = {key: method.environment[key] for key in ("history", "history_variance") if key in method.environment}
+    explored_with = {
+        key: method.environment[key] for key in ("history", "history_variance") if key in method.environment
+    }
     skill = known(TASK, guidance=method.guidance, explored=None, **explored_with).demonstrations
     assert skill is not None
     indices = np.array(explored)

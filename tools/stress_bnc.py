@@ -17,9 +17,9 @@ from functools import partial
 import numpy as np
 
 from guiderail.diagrams.env import GuidedEnv
+from guiderail.diagrams.make import make_env
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.make import make_env
 from guiderail.models.objects.bnc_interference import interference
 from guiderail.models.units import MM
 from guiderail.tools.stress import Case, Witness, run

@@ -20,7 +20,11 @@ from guiderail.tools.stress import Case, run
 def cases() -> list[Case]:
     """KGRL and sKGRL, whose commands must keep the constraint, at two lengths of a decision."""
     return [
-        Case(f"{guidance}, hold {hold}", partial(make_env, "NarrowPassage", guidance=guidance, hold=hold), constrained=True)
+        Case(
+            f"{guidance}, hold {hold}",
+            partial(make_env, "NarrowPassage", guidance=guidance, hold=hold),
+            constrained=True,
+        )
         for guidance, hold in itertools.product(("kgrl", "skgrl"), (1, 5))
     ]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from pydantic import BaseModel
 from pydrake.systems.framework import Diagram
 
 from guiderail.diagrams.guidance.known import INGREDIENTS, Known
+from guiderail.diagrams.options import Options
 from guiderail.models.errors import InputError
 from guiderail.models.registry import Registry
 
@@ -34,7 +34,7 @@ class GuidanceKind:
     label: str
     colour: str
     demonstrates: bool = False
-    options: type[BaseModel] | None = None
+    options: type[Options] | None = None
 
     def lacks(self, known: Collection[str]) -> tuple[str, ...]:
         """The ingredients that are missing; none of them where some alternative is complete."""
@@ -54,7 +54,7 @@ def register_guidance(
     label: str | None = None,
     colour: str = "#17becf",
     demonstrates: bool = False,
-    options: type[BaseModel] | None = None,
+    options: type[Options] | None = None,
 ) -> Callable[[Callable[[Known], Diagram]], Callable[[Known], Diagram]]:
     """A decorator that adds a kind of guidance; it decorates a function or a class that takes a `Known`.
 

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel
-
+from guiderail.diagrams.options import Options
 from guiderail.diagrams.stations.station import Station
 from guiderail.models.registry import Registry
 
@@ -27,7 +26,7 @@ class StationKind:
     name: str
     build: Callable[..., Station]
     world: str
-    options: type[BaseModel] | None
+    options: type[Options] | None
     words: str
 
 
@@ -37,7 +36,7 @@ STATIONS: Registry[StationKind] = Registry(
 
 
 def register_station(
-    name: str, *, world: str, options: type[BaseModel] | None = None
+    name: str, *, world: str, options: type[Options] | None = None
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
     """A decorator that adds a station; it decorates a class or a function that takes a world and its options.
 

@@ -47,6 +47,10 @@ from guiderail.systems.wrench_sensor import WrenchSensor
 
 Robot = TypeVar("Robot")
 
+INPUTS = ("desired_pose", "command_time")
+OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "holding")
+"""The ports of every station."""
+
 POSE_SIZE = 6
 PLANT_PERIOD = exact_period(0.005)  # [s]
 CONTROL_PERIOD = 4 * PLANT_PERIOD  # [s]

@@ -18,9 +18,9 @@ from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
 from guiderail.diagrams.ledger import add_ledger
 from guiderail.diagrams.observation import Observation, affine
+from guiderail.diagrams.options import validated
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import TaskDiagram
-from guiderail.diagrams.tasks.options import validated
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import LinearConstraints

@@ -13,6 +13,7 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import Number, Options
 from guiderail.diagrams.scene import ARM_VIEW, Scene, Viewpoint, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.bnc_workcell import LOCKED_ANGLE, LOCKED_HEIGHT, BncWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
@@ -20,7 +21,6 @@ from guiderail.diagrams.task import Symmetry
 from guiderail.diagrams.tasks.bnc_rewards import reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.options import Number, Options
 from guiderail.diagrams.tasks.task import Choice, Threshold, register_task
 from guiderail.models.demonstrations import bnc_connector as demonstrations
 from guiderail.models.keep_out import KeepOut

@@ -13,12 +13,12 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.guidance.known import Approach, Template
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import Options
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.options import Options
 from guiderail.diagrams.tasks.task import Choice, Threshold, register_task
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.skills import Skill, load_skill

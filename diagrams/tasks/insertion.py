@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import Field
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from guiderail.diagrams.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets
-from guiderail.diagrams.tasks.options import Numbers, ResetOptions
 from guiderail.diagrams.tasks.task import Task
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.relative_poses import RelativePoses

@@ -14,9 +14,9 @@ from pydrake.systems.framework import Context, Diagram
 
 from guiderail.diagrams.cameras import Camera
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import Numbers, Options, ResetOptions
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.options import Numbers, Options, ResetOptions
 from guiderail.diagrams.tasks.task import Choice, Task, register_task
 from guiderail.models.demonstrations import narrow_passage as demonstrations
 from guiderail.models.errors import InputError

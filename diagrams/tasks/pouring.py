@@ -14,11 +14,11 @@ from guiderail.diagrams.cameras import Camera, look_at
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.known import Template
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.scene import Scene, in_frame, viewpoint
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, vessel_or_refuse
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream
-from guiderail.diagrams.tasks.options import Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.tasks.pouring_conditions import conditions
 from guiderail.diagrams.tasks.pouring_rewards import reward_terms
 from guiderail.diagrams.tasks.task import Choice, Task, Threshold, register_task

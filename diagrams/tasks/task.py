@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from guiderail.diagrams import options as declared
 from guiderail.diagrams.cameras import Camera
 from guiderail.diagrams.guidance.known import Approach, Template
 from guiderail.diagrams.observation import Observed
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import Symmetry
-from guiderail.diagrams.tasks.options import Options, ResetOptions
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.registry import Registry
@@ -67,8 +67,8 @@ class Task(ABC):
 
     name: ClassVar[str] = ""
     world_kind: ClassVar[str] = "workcell"
-    Options: ClassVar[type[Options]] = Options
-    Reset: ClassVar[type[ResetOptions]] = ResetOptions
+    Options: ClassVar[type[declared.Options]] = declared.Options
+    Reset: ClassVar[type[declared.ResetOptions]] = declared.ResetOptions
     rewards: ClassVar[tuple[str, ...]] = ("sparse",)
     observations: ClassVar[tuple[str, ...]] = ("state",)
     defaults: ClassVar[Mapping[str, Any]] = {}
@@ -80,7 +80,7 @@ class Task(ABC):
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
 
-    def __init__(self, options: Options, choice: Choice):
+    def __init__(self, options: declared.Options, choice: Choice):
         self.options = options
         self.choice = choice
 

@@ -9,6 +9,8 @@ from .diagrams.make import make_env as make_env
 from .diagrams.make import make_skill as make_skill
 from .diagrams.observation import Observation as Observation
 from .diagrams.observation import Observed as Observed
+from .diagrams.options import Options as Options
+from .diagrams.options import ResetOptions as ResetOptions
 from .diagrams.stations.registry import register_station as register_station
 from .diagrams.stations.station import Station as Station
 from .diagrams.task import TaskDiagram as TaskDiagram
@@ -16,8 +18,6 @@ from .diagrams.task import exact_period as exact_period
 from .diagrams.tasks.assemble import assemble as assemble
 from .diagrams.tasks.assemble import assemble_skill as assemble_skill
 from .diagrams.tasks.insertion import InsertionTask as InsertionTask
-from .diagrams.tasks.options import Options as Options
-from .diagrams.tasks.options import ResetOptions as ResetOptions
 from .diagrams.tasks.task import Task as Task
 from .diagrams.tasks.task import Threshold as Threshold
 from .diagrams.tasks.task import register_task as register_task

@@ -8,11 +8,11 @@ from guiderail.diagrams.guidance.known import INGREDIENTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
 from guiderail.diagrams.make import make_env, resolve
 from guiderail.diagrams.stations.registry import stations_for
+from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
+from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.task import TASKS
 from guiderail.models.errors import InputError
 
-STATION_INPUTS = ("desired_pose", "command_time")
-STATION_OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "holding")
 OWN = [name for name in TASKS.names() if TASKS.get(name).__module__.startswith("guiderail.")]
 PAIRS = [(task, guidance) for task in OWN for guidance in GUIDANCE.names()]
 

@@ -207,7 +207,7 @@ def test_a_pairing_that_makes_no_sense_is_refused_with_those_that_do(skill, kind
 
 
 def test_safe_residual_is_not_offered_where_nobody_wrote_down_what_to_avoid(skill):
-    with pytest.raises(InputError, match="walls to keep out of, which BncConnector.*use kgrl, kmp, residual, skgrl"):
+    with pytest.raises(InputError, match=r"walls to keep out of, which BncConnector.*use kgrl, kmp, residual, skgrl"):
         build("safe_residual", replace(skill, keep_out=None), "BncConnector")
     assert check_guidance("kmp", ("demonstrations",)).label == "demonstration alone"
 

@@ -1,0 +1,75 @@
+"""`guiderail list`: what there is to choose from, this package's own and whatever installed packages add."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
+from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
+from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
+from guiderail.diagrams.make import CommonOptions
+from guiderail.diagrams.options import PrimitiveOptions, TemplateOptions, described
+from guiderail.diagrams.stations.registry import STATIONS, stations_for
+from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
+from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
+from guiderail.diagrams.tasks.task import TASKS, environment_id
+from guiderail.models.robots.robot import ROBOTS
+from guiderail.tools.learning.learner import LEARNERS
+
+
+def listing() -> dict[str, Any]:
+    """Tasks, guidance, stations, robots and learners by name: what each is, its ports and its options."""
+    return {
+        "tasks": {name: _task(name) for name in TASKS.names()},
+        "guidance": {name: _guidance(name) for name in GUIDANCE.names()},
+        "stations": {name: _station(name) for name in STATIONS.names()},
+        "robots": {name: {"is": _first_line(ROBOTS.get(name))} for name in ROBOTS.names()},
+        "learners": {name: {} for name in LEARNERS.names()},
+        "options": {
+            "of every environment": described(CommonOptions),
+            "of guidance made of demonstrations": described(PrimitiveOptions),
+            "of guidance made of a template": described(TemplateOptions),
+        },
+    }
+
+
+def _task(name: str) -> dict[str, Any]:
+    task = TASKS.get(name)
+    return {
+        "is": _first_line(task),
+        "environment": environment_id(name),
+        "guidance": possible_guidance(task.knows()),
+        "stations": stations_for(task.world_kind),
+        "rewards": list(task.rewards),
+        "observations": list(task.observations),
+        "difficulties": list(task.difficulties),
+        "defaults": {**task.defaults, **task.learner},
+        "options": described(task.Options),
+        "reset_options": described(task.Reset),
+    }
+
+
+def _guidance(name: str) -> dict[str, Any]:
+    kind = GUIDANCE.get(name)
+    return {
+        "is": kind.label,
+        "needs": [list(needed) for needed in kind.needs],
+        "inputs": list(GUIDANCE_INPUTS),
+        "outputs": list(GUIDANCE_OUTPUTS),
+        "options": described(kind.options),
+    }
+
+
+def _station(name: str) -> dict[str, Any]:
+    kind = STATIONS.get(name)
+    return {
+        "is": kind.words,
+        "world": kind.world,
+        "inputs": list(STATION_INPUTS),
+        "outputs": list(STATION_OUTPUTS),
+        "options": described(kind.options),
+    }
+
+
+def _first_line(thing: object) -> str:
+    return str(thing.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ").strip()
