@@ -15,8 +15,8 @@ class JointTorqueWrench(LeafSystem):
     """The wrench of the surroundings on a tool, F = (Jᵀ)⁺ τ_external, low-pass filtered.
 
     τ_external is what is left of the measured joint torques when the arm's own weight and inertia are taken out; an
-    iiwa computes it itself. The pseudoinverse is damped: near a singular posture the estimate fades instead of
-    exploding. The filter is y' = (u − y)/τ, sampled at `period`.
+    arm with torque sensors computes it itself. The pseudoinverse is damped: near a singular posture the estimate fades
+    instead of exploding. The filter is y' = (u − y)/τ, sampled at `period`.
 
     .. pydrake_system::
 

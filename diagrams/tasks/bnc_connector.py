@@ -99,6 +99,7 @@ def make_env(
     uncertainty: str = "calibration",
     grasp_angle: float = 0.0,
     station: str = "rails",
+    robot: str | None = None,
     render_mode: str | None = None,
     hold: int = 10,
     kappa: float = 1.0,
@@ -118,6 +119,7 @@ def make_env(
         uncertainty: "calibration", "disc" or "known": see `BncUncertainty`, which also has the options of a reset.
         grasp_angle: how far the plug tilts in the tool at most, degrees, anew every episode.
         station: "rails" or "arm".
+        robot: which arm, a name of `robot_names()`; the default one unless given.
         render_mode: None, "human" (a browser view) or "rgb_array".
         hold: control steps per decision.
         explored: which of x, y, z, Rz, Ry, Rx an action moves, by number.
@@ -148,7 +150,7 @@ def make_env(
     workcell = BncWorkcell()
     task = build_task(
         workcell,
-        make_station(station, workcell),
+        make_station(station, workcell, robot),
         build_guidance(guidance, skill, "BncConnector"),
         uncertain,
         explored=skill.explored_outputs,

@@ -94,6 +94,7 @@ def make_env(
     observation: str = "state",
     uncertainty: str = "calibration",
     station: str = "rails",
+    robot: str | None = None,
     render_mode: str | None = None,
     hold: int = 5,
     active_constraints: bool = True,
@@ -108,6 +109,7 @@ def make_env(
         observation: "state": position of the clamp in the hole's frame and force, scaled.
         uncertainty: "calibration", "disc" or "known": see `GridClampUncertainty`; it also has the options of a reset.
         station: "rails" or "arm".
+        robot: which arm, a name of `robot_names()`; the default one unless given.
         render_mode: None, "human" (a browser view) or "rgb_array".
         hold: control steps per decision.
         active_constraints: whether commands stay inside the template's cuboid, whoever guides; without, only the
@@ -120,7 +122,7 @@ def make_env(
     workcell = GridClampWorkcell()
     task = build_task(
         workcell,
-        make_station(station, workcell),
+        make_station(station, workcell, robot),
         make_guidance(guidance, active_constraints),
         GridClampUncertainty(uncertainty),
         reward=reward,

@@ -15,6 +15,7 @@ from guiderail.diagrams.ledger import add_ledger
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
+from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.relative_poses import RelativePoses
 
@@ -22,16 +23,18 @@ CLIP = 3.0
 """A policy sees (value − centre) / scale, clipped to ± this."""
 
 
-def make_station(name: str, workcell: Workcell) -> Station:
-    """A simulated station by its name."""
+def make_station(name: str, workcell: Workcell, robot: str | None = None) -> Station:
+    """A simulated station by its name; `robot` says which arm, and rails have none."""
     if name == "rails":
         from guiderail.diagrams.stations.rails import RailsStation
 
+        if robot is not None:
+            raise InputError(f"rails have no robot: leave robot={robot!r} out, or use station='arm'")
         return RailsStation(workcell)
     if name == "arm":
         from guiderail.diagrams.stations.arm import ArmStation
 
-        return ArmStation(workcell)
+        return ArmStation(workcell, robot=robot or DEFAULT_ROBOT)
     raise InputError(f"there is no simulated station '{name}': use 'rails' or 'arm'")
 
 
