@@ -13,6 +13,13 @@ from guiderail.models.vectors import cross
 
 _REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
 
+# Towards a singular posture the arm gets ever heavier at the tool, in the direction that it loses. Up to the first mass
+# [kg] a direction is the impedance's alone, from the second on the posture's; usual ones weigh 1 to 50 kg.
+LIGHT, HEAVY = 300.0, 3000.0
+# The distance from the tool centre at which a turning tool counts as a mass [m].
+LEVER = 0.25
+_SCALE = np.array([1.0, 1.0, 1.0, LEVER, LEVER, LEVER])
+
 
 @dataclass(frozen=True)
 class JointTorques:
@@ -48,11 +55,32 @@ def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: flo
         Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, the inertia at the tool, inverted.
         damping_ratio: ζ.
     """
+    L_modes, eigenvalues = _modes(K, Lambda_inverse)
+    return (L_modes * (2.0 * damping_ratio * np.sqrt(np.maximum(eigenvalues, 0.0)))) @ L_modes.T
+
+
+def _modes(K: np.ndarray, Lambda_inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """L U with L Lᵀ = Λ and (L U)ᵀ Λ⁻¹ L U = 1, U the eigenvectors of L⁻¹ K L⁻ᵀ, (6, 6), and its eigenvalues, (6,)."""
     # With Λ⁻¹ = R Rᵀ, L = R⁻ᵀ: nothing but R has to be inverted.
     R = np.linalg.cholesky(Lambda_inverse)
     eigenvalues, modes = np.linalg.eigh(R.T @ K @ R)
-    L_modes = np.linalg.solve(R.T, modes)
-    return (L_modes * (2.0 * damping_ratio * np.sqrt(np.maximum(eigenvalues, 0.0)))) @ L_modes.T
+    return np.linalg.solve(R.T, modes), eigenvalues
+
+
+def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
+    """Λ without the directions that a singular arm has lost: each eigenvalue, a mass m, times its share of [0, 1].
+
+    The share falls smoothly with log m, from 1 at `LIGHT` to 0 at `HEAVY`: a damped inverse of Λ⁻¹ that damps nothing
+    where the arm is regular. It is what makes the posture's torque act where the tool's wrench can't.
+
+    Args:
+        Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, (6, 6), positive definite, [translational, rotational].
+    """
+    eigenvalues, directions = np.linalg.eigh(_SCALE[:, None] * Lambda_inverse * _SCALE)
+    masses = 1.0 / eigenvalues
+    x = np.clip(np.log(masses / LIGHT) / np.log(HEAVY / LIGHT), 0.0, 1.0)
+    scaled = _SCALE[:, None] * directions
+    return (scaled * (masses * (1.0 - x * x * (3.0 - 2.0 * x)))) @ scaled.T
 
 
 def impedance_torques(
@@ -103,11 +131,21 @@ def impedance_torques(
     wrench = _clipped(along_axes, wrench_limits)
     if R_axes is not None:
         wrench = R @ wrench
-    leak = np.linalg.solve(Lambda_inverse, M_inverse_JT.T @ posture_torque)  # the tool wrench of the posture's torque
+    tool_acceleration = M_inverse_JT.T @ posture_torque
+    if _is_regular(Lambda_inverse):
+        leak = np.linalg.solve(Lambda_inverse, tool_acceleration)  # the tool wrench of the posture's torque
+    else:
+        leak = reachable_inertia(Lambda_inverse) @ tool_acceleration
     wanted_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
     torque = _clipped(wanted_torque, torque_limits)
     is_saturated = bool((np.abs(along_axes) >= wrench_limits).any() or (torque != wanted_torque).any())
     return JointTorques(torque, wrench, is_saturated)
+
+
+def _is_regular(Lambda_inverse: np.ndarray) -> bool:
+    """Whether no direction weighs more than `LIGHT`, for certain: all six together don't."""
+    masses = np.linalg.inv(Lambda_inverse).diagonal() / _SCALE**2
+    return float(masses.sum()) < LIGHT
 
 
 def _clipped(values: np.ndarray, limits: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
+_DIRECTIVES = (".yaml", ".yml")
 
 
 def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
@@ -18,9 +19,20 @@ def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
     Every `Parser` knows the remote package `drake_models`, and refuses to exist where DRAKE_ALLOW_NETWORK forbids
     packages from the network, whatever it is asked to read. A file of ours refers to none.
     """
-    with _remote_packages_may_be_named():
-        (model,) = Parser(plant).AddModels(str(path))
+    (model,) = add_models(plant, path)
     return model
+
+
+def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceIndex]:
+    """Adds the models of an SDF or URDF file, or of a file of Drake model directives (.yaml), on this machine.
+
+    Directives may name packages (folders with a `package.xml`) that lie in the folder of their file.
+    """
+    with _remote_packages_may_be_named():
+        parser = Parser(plant)
+        if Path(path).suffix in _DIRECTIVES:
+            parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
+        return parser.AddModels(str(path))
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
+from guiderail.models.damped_inverse import damped_joint_velocities, follows, is_regular
 from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.systems.support.caching import declare_plant_context
@@ -48,7 +49,9 @@ class CartesianPositionController(LeafSystem):
     (`pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics`). The optimization keeps the direction of
     the tool's motion and every joint's limits of position and velocity; where both can't be had, the motion slows down
     or stops. Where commands stop, the joint command is held: while the desired pose is not finite, older than a timeout
-    or more than a period from the future (`CommandCheck`).
+    or more than a period from the future (`CommandCheck`). Near a singular posture a damped pseudoinverse takes over
+    (`models.damped_inverse`): the tool leaves its direction a little, the joints stay slow, and the return to the
+    posture leads out.
 
     .. pydrake_system::
 
@@ -106,6 +109,7 @@ class CartesianPositionController(LeafSystem):
             raise InputError(f"a position controller's posture must have {num_joints} joints")
         self._plant, self._target, self._tool_centre = plant, target, tool_centre
         self._period, self._speed_limits = period, speed_limits
+        self._posture, self._posture_gain = np.array(posture, dtype=float), posture_gain
         parameters = DifferentialInverseKinematicsParameters(num_joints, num_joints)
         parameters.set_time_step(period)
         parameters.set_nominal_joint_position(np.asarray(posture, dtype=float))
@@ -184,13 +188,12 @@ class CartesianPositionController(LeafSystem):
             plant_context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._target, self._target
         )
         q = self._joint_command(context)
-        result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
-        found = DifferentialInverseKinematicsStatus.kSolutionFound
-        discrete_state.set_value(self._is_stuck, [float(result.status != found)])
-        if result.joint_velocities is not None:
+        velocities, is_stuck = self._joint_velocities(q, V, J)
+        discrete_state.set_value(self._is_stuck, [float(is_stuck)])
+        if velocities is not None:
             # The solver keeps limits to its own tolerance only; what is sent keeps them exactly.
             lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
-            moved = np.clip(q + self._period * result.joint_velocities, lower, upper)
+            moved = np.clip(q + self._period * velocities, lower, upper)
             discrete_state.set_value(self._command, moved)
         return EventStatus.Succeeded()
 
@@ -203,6 +206,15 @@ class CartesianPositionController(LeafSystem):
                 _limited((X_TPd.translation() - X_TP.translation()) / self._period, self._speed_limits.translational),
             ]
         )
+
+    def _joint_velocities(self, q: np.ndarray, V: np.ndarray, J: np.ndarray) -> tuple[np.ndarray | None, bool]:
+        """For the tool velocity V, or None where there are none; and whether V's direction can't be followed."""
+        if is_regular(J):
+            result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
+            return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound
+        velocities = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
+        velocities /= max(1.0, float((np.abs(velocities) / self._plant.GetVelocityUpperLimits()).max()))
+        return velocities, not follows(J, velocities, V)
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
         X_TP = self._tool_centre.CalcPose(self._plant_context.Eval(context), self._target)

@@ -1,9 +1,12 @@
 """The arrows: tools → diagrams → systems → models."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
+
+from guiderail.models.robots.robot import robot_names
 
 ROOT = Path(__file__).parents[1]
 MAY_IMPORT = {
@@ -42,3 +45,12 @@ def test_systems_know_no_task_and_no_robot():
         for name in imports(path):
             known = ("guiderail.models.robots", "guiderail.models.objects", "guiderail.models.demonstrations")
             assert not name.startswith(known), f"{path.relative_to(ROOT)} imports {name}"
+
+
+def test_no_robot_is_known_by_name_outside_its_own_file():
+    """Adding a robot is one file and its model. Only `hardware.py` speaks to one: LCM's messages are the iiwa's."""
+    words = re.compile(rf"\b({'|'.join((*robot_names(), 'iiwa', 'kuka', 'franka'))})", re.IGNORECASE)
+    for folder in ("systems", "diagrams"):
+        for path in (ROOT / folder).rglob("*.py"):
+            named = words.search(path.read_text())
+            assert named is None or path.name == "hardware.py", f"{path.relative_to(ROOT)} names {named}"

@@ -13,7 +13,7 @@ from guiderail.diagrams.stations.registry import STATIONS, stations_for
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.task import TASKS, environment_id
-from guiderail.models.robots.robot import ROBOTS
+from guiderail.models.robots.robot import end_effector_names, find_end_effector, find_robot, robot_names
 from guiderail.tools.learning.learner import LEARNERS
 
 
@@ -23,7 +23,10 @@ def listing() -> dict[str, Any]:
         "tasks": {name: _task(name) for name in TASKS.names()},
         "guidance": {name: _guidance(name) for name in GUIDANCE.names()},
         "stations": {name: _station(name) for name in STATIONS.names()},
-        "robots": {name: {"is": _first_line(ROBOTS.get(name))} for name in ROBOTS.names()},
+        "robots": {
+            name: {"is": find_robot(name).title, "joints": find_robot(name).num_joints} for name in robot_names()
+        },
+        "end_effectors": {name: {"is": find_end_effector(name).title} for name in end_effector_names()},
         "learners": {name: {} for name in LEARNERS.names()},
         "options": {
             "of every environment": described(CommonOptions),

@@ -22,10 +22,12 @@ from guiderail.diagrams.stations.arm import KnownArm, add_arm, add_impedance_con
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance, Station, add_workcell_plant
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
-from guiderail.models.robots.iiwa import NUM_JOINTS
+from guiderail.models.robots.iiwa import IIWA14
+from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 
 STATUS_CHANNEL, COMMAND_CHANNEL = "IIWA_STATUS", "IIWA_COMMAND"
+NUM_JOINTS = IIWA14.num_joints
 
 
 class HardwareStation(Station):
@@ -45,6 +47,7 @@ class HardwareStation(Station):
         period: float = PLANT_PERIOD,
         wrench_time_constant: float = 0.02,
         robot_timeout: float = 10.0,
+        end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
     ):
         """
         Args:
@@ -54,12 +57,13 @@ class HardwareStation(Station):
             period: at which commands are sent [s].
             wrench_time_constant: of the wrench estimate's low-pass filter [s].
             robot_timeout: how long an initialization waits for the robot [s].
+            end_effector: which tool is bolted on, or its name; a gripper has a driver of its own, and stays open here.
         """
         super().__init__()
         builder = DiagramBuilder()
         bus = lcm or DrakeLcm()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(bus))
-        known = KnownArm(workcell)
+        known = KnownArm(workcell, IIWA14, end_effector)
         subscriber = builder.AddNamedSystem(
             "status_subscriber",
             LcmSubscriberSystem.Make(
@@ -134,20 +138,27 @@ class HardwareStation(Station):
 class SimulatedIiwa(Diagram):
     """What a real iiwa and its driver are to `HardwareStation`: listens for torques, answers with joint states."""
 
-    def __init__(self, workcell: Workcell, lcm: DrakeLcmInterface, time_step: float = kIiwaLcmStatusPeriod):
+    def __init__(
+        self,
+        workcell: Workcell,
+        lcm: DrakeLcmInterface,
+        time_step: float = kIiwaLcmStatusPeriod,
+        end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
+    ):
         """
         Args:
             workcell: what stands in the world and what is held.
             lcm: the bus.
             time_step: of the plant [s]; the status goes out every 5 ms, as the real driver's does.
+            end_effector: which tool is bolted on, or its name; a gripper has a driver of its own, and stays open here.
         """
         super().__init__()
         builder = DiagramBuilder()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm))
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
-            builder, workcell, time_step, lambda plant: add_arm(plant, workcell)
+            builder, workcell, time_step, lambda plant: add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
         )
-        self._known = KnownArm(workcell)
+        self._known = KnownArm(workcell, IIWA14, end_effector)
         BuildIiwaControl(
             builder, lcm, self.plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self._known.plant
         )

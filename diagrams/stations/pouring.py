@@ -1,4 +1,4 @@
-"""An iiwa 14 under Cartesian position control that holds a thermos with two balls, and a mug on a table."""
+"""An arm under Cartesian position control that holds a thermos with two balls, and a mug on a table."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -7,15 +7,7 @@ import numpy as np
 from pydrake.geometry import Box, Cylinder
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import (
-    FixedOffsetFrame,
-    Frame,
-    JointActuator,
-    ModelInstanceIndex,
-    PdControllerGains,
-    RigidBody,
-    WeldJoint,
-)
+from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
@@ -24,10 +16,10 @@ from guiderail.diagrams.stations.station import Station, export_station_ports
 from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
-from guiderail.models.parsing import add_model
 from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.robots.iiwa import IIWA_URDF, NUM_JOINTS
+from guiderail.models.robots.assembly import add_drives, add_robot
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.models.robots.robot import DEFAULT_ROBOT, Robot, find_robot
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 from guiderail.systems.contact_watch import ContactWatch
 from guiderail.systems.measured_pose import MeasuredPose
@@ -35,9 +27,8 @@ from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 NUM_BALLS = 2
-# Half way between the pourings that the workspace allows, so that a search ends on the same branch for all of them;
-# joint 7 is turned away from its limit by what a tilt of 122 degrees takes.
-POSTURE = np.array([-0.3, 0.6, 0.2, -1.6, -0.2, -0.7, -0.7])  # [rad]
+# Half way between the pourings that the workspace allows, so that a search ends on the same branch for all of them.
+MIDDLE_OF_POURING = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
 
 # More than any guidance asks for, so that it is the guidance that says how fast.
 SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
@@ -61,11 +52,11 @@ class PouringConfig:
         ball: each of the two that are poured.
         p_WStand: m, the point of the table's surface above which the mug nominally stands.
         stand_height: m, of a stand under the mug: the wrist needs room under a thermos that pours low.
-        grip: m, from the flange to the thermos's axis.
+        grip: m, from the flange to the thermos's axis, which lies across the flange's.
         grip_height: m, from the thermos's tip down to where it is held.
         plant_period: s, seconds of a plant step.
         substeps: plant steps in a control step.
-        gains: Nm/rad, stiffness of the joints' drives; their damping is critical for each joint's typical inertia.
+        robot: which arm, or its name; one whose data have drives and a level posture.
     """
 
     mug: Vessel = MUG
@@ -77,7 +68,15 @@ class PouringConfig:
     grip_height: float = 0.045
     plant_period: float = exact_period(0.005)
     substeps: int = 2
-    gains: tuple[float, ...] = (8000.0, 8000.0, 8000.0, 6000.0, 4000.0, 3000.0, 2000.0)
+    robot: Robot | str = DEFAULT_ROBOT
+
+    @cached_property
+    def arm(self) -> Robot:
+        """The arm's data."""
+        robot = find_robot(self.robot)
+        if robot.drives is None or robot.level_posture is None:
+            raise InputError(f"robot {robot.name!r} can't pour: its data have no drives or no level posture")
+        return robot
 
     @property
     def control_period(self) -> float:
@@ -92,13 +91,10 @@ class PouringConfig:
 
     @cached_property
     def X_FlangeP(self) -> RigidTransform:
-        """The thermos's tip P at the flange: its axis across the flange's."""
-        R = RotationMatrix(np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]))
-        return RigidTransform(R, [-self.grip_height, 0.0, self.grip])
-
-
-# About each joint, for its drive's damping [kg m²]; most of it is the rotors', which turn 100 or 160 times as fast.
-TYPICAL_INERTIA = (7.4, 7.4, 5.4, 5.4, 1.9, 1.5, 1.2)
+        """The thermos's tip P at the flange: its axis across the flange's, along x of a flange that was turned."""
+        turned = RigidTransform(RotationMatrix.MakeZRotation(self.arm.tool_turn), [0.0, 0.0, 0.0])
+        R = RotationMatrix(np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]))
+        return turned @ RigidTransform(R, [self.grip_height, 0.0, self.grip])
 
 
 @register_station("pouring", world="pouring")
@@ -167,7 +163,7 @@ class PouringStation(Station):
         )
         self._controller_tip = tip
         self._controller_plant.Finalize()
-        self.posture = self.solve(np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8]), POSTURE)
+        self.posture = self.solve(MIDDLE_OF_POURING, np.array(config.arm.level_posture))
 
         controller = CartesianPositionController(
             self._controller_plant,
@@ -179,11 +175,12 @@ class PouringStation(Station):
         )
         builder.AddNamedSystem("controller", controller)
         # The drives want a velocity too: without it their damping holds the arm back by centimetres.
+        num_joints = config.arm.num_joints
         drives = StateInterpolatorWithDiscreteDerivative(
-            NUM_JOINTS, config.control_period, suppress_initial_transient=True
+            num_joints, config.control_period, suppress_initial_transient=True
         )
         builder.AddNamedSystem("drives", drives)
-        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(NUM_JOINTS, 2 * NUM_JOINTS)))
+        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
         measured = MeasuredPose(plant, thermos, config.X_WT)
         builder.AddNamedSystem("pose", measured)
         links = [plant.get_body(index) for index in plant.GetBodyIndices(self.arm)]
@@ -225,10 +222,10 @@ class PouringStation(Station):
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)
 
-    def solve(self, pose: np.ndarray, guess: np.ndarray) -> np.ndarray:
-        """Joint positions (7,) with the tip at `pose`, (6,)."""
+    def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
+        """The joint positions (n,) nearest to `posture`, (n,), with the tip at `pose`, (6,)."""
         X_TP = pose_to_transform(pose)
-        return solve_inverse_kinematics(self._controller_plant, self._target, self._controller_tip, X_TP, guess)
+        return solve_inverse_kinematics(self._controller_plant, self._target, self._controller_tip, X_TP, posture)
 
     def set_mug(self, root_context: Context, X_TMug: RigidTransform) -> None:
         """Moves the mug: its tip is then at X_TMug."""
@@ -239,7 +236,7 @@ class PouringStation(Station):
         """Puts the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositions(plant_context, self.arm, self.solve(pose, self.posture))
-        self.plant.SetVelocities(plant_context, self.arm, np.zeros(NUM_JOINTS))
+        self.plant.SetVelocities(plant_context, self.arm, np.zeros(self.config.arm.num_joints))
         X_WP = self._tip.CalcPoseInWorld(plant_context)
         radius = self.config.ball.diameter / 2
         # Side by side as far as the thermos is wider than a ball, and then as low as they touch.
@@ -252,18 +249,16 @@ class PouringStation(Station):
 
 def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[ModelInstanceIndex, Frame, WeldJoint]:
     """Adds the arm at the world's origin, a hand, and the thermos in it; returns the arm, the tip and the wrist."""
-    arm = add_model(plant, IIWA_URDF)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("iiwa_link_0", arm))
+    arm = add_robot(plant, config.arm)
     thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
-    wrist = plant.WeldFrames(plant.GetFrameByName("iiwa_flange", arm), thermos.body_frame(), config.X_FlangeP)
+    wrist = plant.WeldFrames(arm.flange, thermos.body_frame(), config.X_FlangeP)
     _add_hand(plant, thermos, config)
-    for model in (arm, thermos.model_instance()):
+    for model in (arm.model, thermos.model_instance()):
         # Weight is compensated by leaving it out, as a position-controlled arm does by its integrators.
         plant.set_gravity_enabled(model, False)
-    for i, (stiffness, inertia) in enumerate(zip(config.gains, TYPICAL_INERTIA, strict=True)):
-        actuator: JointActuator = plant.GetJointActuatorByName(f"iiwa_motor_{i + 1}", arm)
-        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=2.0 * np.sqrt(stiffness * inertia)))
-    return arm, thermos.body_frame(), wrist
+    if config.arm.drives is not None:
+        add_drives(arm.actuators, config.arm.drives)
+    return arm.model, thermos.body_frame(), wrist
 
 
 def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) -> None:

@@ -1,15 +1,34 @@
-"""Where the iiwa's files lie, and what a controller needs to know of it beyond them."""
+"""KUKA LBR iiwa 14 R820."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
-import numpy as np
+from guiderail.models.robots.robot import JointDrives, Robot, register_robot
 
-FOLDER = Path(__file__).parent
-IIWA_URDF = FOLDER / "iiwa14.urdf"
-CONNECTOR_TOOL_URDF = FOLDER / "connector_tool.urdf"
-
-NUM_JOINTS = 7
-# Elbow up, tool down, far from every limit and singularity; where an inverse kinematics starts and a posture returns.
-READY_POSTURE = np.array([0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0])  # [rad]
+IIWA14 = register_robot(
+    Robot(
+        name="iiwa14",
+        title="KUKA LBR iiwa 14 R820",
+        model=Path(__file__).parent / "iiwa14.urdf",
+        base_frame="iiwa_link_0",
+        flange_frame="iiwa_flange",
+        joints=tuple(f"iiwa_joint_{number}" for number in range(1, 8)),
+        home=(0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0),
+        tool_turn=math.pi,
+        # Without feedback of the joint torques a Cartesian impedance would lag far behind its command.
+        apparent_rotor_inertia=0.1,
+        # Most of what a drive moves is its rotor, which turns 100 or 160 times as fast as its joint.
+        drives=JointDrives(
+            stiffness=(8000.0, 8000.0, 8000.0, 6000.0, 4000.0, 3000.0, 2000.0),
+            inertia=(7.4, 7.4, 5.4, 5.4, 1.9, 1.5, 1.2),
+        ),
+        # Joint 7 is turned away from its limit by what pouring takes, a tilt of 122 degrees.
+        level_posture=(-0.3, 0.6, 0.2, -1.6, -0.2, -0.7, -0.7),
+        source=(
+            "KUKA's data sheet: kinematics, limits; masses, inertias, rotors and gears as in public models of the arm; "
+            "joint damping is a guess"
+        ),
+    )
+)

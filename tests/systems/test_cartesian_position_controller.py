@@ -2,14 +2,15 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.stations.arm import controller_model
+from guiderail.diagrams.stations.arm import KnownArm, controller_model
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.robots.iiwa import READY_POSTURE
+from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
+from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 
+READY_POSTURE = np.array(IIWA14.home)
 START = np.array([0.0, 0.0, 0.02, 0.8, 0.0, 0.0])
 GOAL = START + [0.05, -0.08, 0.06, -0.5, 0.1, -0.2]
 
@@ -162,3 +163,54 @@ def test_refuses_what_makes_no_sense(arm, wrong):
 def test_refuses_speeds_that_make_no_sense():
     with pytest.raises(InputError):
         SpeedLimits(translational=0.0)
+
+
+# With the wrist's axes in line an arm of six joints can't turn its tool about one direction, nor move it along another.
+SINGULAR = np.array([-0.2448, -1.3796, 1.8297, -2.021, 0.0, 0.0])
+
+
+class SixJoints(Commanded):
+    """The same of a UR5e, started in a singular posture."""
+
+    def __init__(self, shift):
+        known = KnownArm(BncWorkcell(), "ur5e")
+        self.plant, self.q_start = known.plant, SINGULAR
+        self.system = CartesianPositionController(
+            known.plant, known.arm.target, known.arm.tool_centre, posture=known.posture
+        )
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.system.get_positions_input_port().FixValue(self.context, SINGULAR)
+        context = known.plant.CreateDefaultContext()
+        known.plant.SetPositions(context, SINGULAR)
+        self.start = transform_to_pose(known.arm.tool_centre.CalcPose(context, known.arm.target))
+        self.desired = self.system.get_desired_pose_input_port().FixValue(self.context, self.start + shift)
+        self.simulator.Initialize()
+
+
+@pytest.mark.parametrize("shift", [[0.05, 0, 0, 0, 0, 0], [0, 0.05, 0, 0, 0, 0], [0, 0, 0, 0.3, 0, 0], [0] * 6])
+def test_out_of_a_singular_posture_no_joint_leaps_and_the_tool_gets_there(shift):
+    """What the wrist can't do at once costs the tool's orientation a little, for a while, and it says so."""
+    commanded = SixJoints(np.array(shift))
+    limit = commanded.plant.GetVelocityUpperLimits()
+    errors, stuck = [], []
+    commanded.advance(0.005)
+    for _ in range(600):
+        q = commanded.joints
+        commanded.advance(0.01)
+        assert (np.abs(commanded.joints - q) / 0.01 <= limit + 1e-6).all()
+        errors.append(np.abs(commanded.pose - commanded.start - shift))
+        stuck.append(commanded.stuck)
+    errors = np.array(errors)
+    assert errors[:, :3].max() < np.abs(shift[:3]).max() + 0.005
+    assert errors[-1, :3].max() < 2e-3
+    assert errors[-1, 3:].max() < 0.05
+    assert max(stuck) == float(bool(np.any(shift)))
+
+
+def test_close_to_a_singular_posture_the_tool_still_goes_its_way():
+    """Through the wrist's singularity by the one turn that it does not lose."""
+    commanded = SixJoints(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
+    commanded.advance(3.0)
+    np.testing.assert_allclose(commanded.pose, commanded.start + [0, 0, 0, 0, 0.5, 0], atol=1e-4)
+    assert commanded.stuck == 0.0

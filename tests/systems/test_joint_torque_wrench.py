@@ -6,8 +6,10 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.models.errors import InputError
-from guiderail.models.robots.iiwa import READY_POSTURE
+from guiderail.models.robots.iiwa import IIWA14
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
+
+READY_POSTURE = np.array(IIWA14.home)
 
 
 @pytest.fixture(scope="module")

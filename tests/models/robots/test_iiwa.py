@@ -1,46 +1,26 @@
 import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import JointIndex
 
 from guiderail.models.parsing import add_model
-from guiderail.models.robots.iiwa import CONNECTOR_TOOL_URDF, IIWA_URDF, READY_POSTURE
+from guiderail.models.robots.assembly import add_end_effector, add_robot
+from guiderail.models.robots.connector_tool import CONNECTOR_TOOL
+from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.tool_wrench import external_wrench
 
 
 @pytest.fixture(scope="module")
 def arm():
     plant = MultibodyPlant(0.0)
-    model = add_model(plant, IIWA_URDF)
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("iiwa_link_0"))
-    add_model(plant, CONNECTOR_TOOL_URDF)
-    plant.WeldFrames(plant.GetFrameByName("iiwa_flange", model), plant.GetFrameByName("tool_body"))
+    add_end_effector(plant, IIWA14, add_robot(plant, IIWA14), CONNECTOR_TOOL)
     plant.Finalize()
     return plant
-
-
-def test_stretched_out_the_flange_is_where_the_data_sheet_says(arm):
-    context = arm.CreateDefaultContext()
-    p_WFlange = arm.GetFrameByName("iiwa_flange").CalcPoseInWorld(context).translation()
-    np.testing.assert_allclose(p_WFlange, [0, 0, 1.306], atol=1e-9)
-
-
-def test_limits_of_the_data_sheet(arm):
-    joints = [
-        arm.get_joint(JointIndex(index)) for index in arm.GetJointIndices() if arm.get_joint(index).num_positions()
-    ]
-    upper = [joint.position_upper_limit() for joint in joints]
-    velocity = [joint.velocity_upper_limit() for joint in joints]
-    np.testing.assert_allclose(np.rad2deg(np.ravel(upper)), [170, 120, 170, 120, 170, 120, 175], atol=1e-3)
-    np.testing.assert_allclose(np.rad2deg(np.ravel(velocity)), [85, 85, 100, 75, 130, 135, 135], atol=1e-3)
-    effort = [arm.get_joint_actuator(index).effort_limit() for index in arm.GetJointActuatorIndices()]
-    assert effort == [320, 320, 176, 176, 110, 40, 40]
 
 
 def test_reflected_rotor_inertia_dominates(arm):
     """n² of a gear of 160 turns a gram square metre into kilograms; without it no explicit impedance is stable."""
     context = arm.CreateDefaultContext()
-    arm.SetPositions(context, READY_POSTURE)
+    arm.SetPositions(context, IIWA14.home)
     reflected = [arm.get_joint_actuator(index).default_reflected_inertia() for index in arm.GetJointActuatorIndices()]
     assert np.diag(arm.CalcMassMatrix(context)).min() > 1.0
     assert reflected[0] == pytest.approx(1.321e-4 * 160**2)
@@ -57,7 +37,7 @@ def test_a_tool_at_rest_feels_what_the_wrist_does_not_carry():
 def test_a_tool_that_spins_and_falls_freely_is_touched_by_nothing(arm):
     """A free body with an offset centre of mass, checked against Drake's own dynamics."""
     plant = MultibodyPlant(0.0)
-    model = add_model(plant, CONNECTOR_TOOL_URDF)
+    model = add_model(plant, CONNECTOR_TOOL.model)
     plant.Finalize()
     body = plant.GetBodyByName("tool_body", model)
     context = plant.CreateDefaultContext()

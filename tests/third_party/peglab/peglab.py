@@ -57,7 +57,9 @@ class Slot(Task):
     def reference(self) -> ReferenceTrajectory:
         phase = np.linspace(0.0, 1.0, NUM_STEPS)
         means = np.column_stack([np.full(NUM_STEPS, 0.35), 0.1 + 0.8 * phase])
-        return ReferenceTrajectory(PERIOD * np.arange(NUM_STEPS), means, np.tile(0.04**2 * np.eye(2), (NUM_STEPS, 1, 1)))
+        return ReferenceTrajectory(
+            PERIOD * np.arange(NUM_STEPS), means, np.tile(0.04**2 * np.eye(2), (NUM_STEPS, 1, 1))
+        )
 
     def constraints(self) -> LinearConstraints:
         return LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])

@@ -1,0 +1,23 @@
+"""A gripper with two parallel fingers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from guiderail.models.robots.robot import EndEffector, JointDrives, register_end_effector
+
+PARALLEL_GRIPPER = register_end_effector(
+    EndEffector(
+        name="parallel_gripper",
+        title="gripper with two parallel fingers",
+        model=Path(__file__).parent / "parallel_gripper.urdf",
+        mount_frame="gripper_body",
+        tool_centre="tool_centre",
+        bodies=("gripper_body", "left_finger", "right_finger", "tool_centre"),
+        joints=("left_finger_joint",),
+        opening={"left_finger_joint": 0.04, "right_finger_joint": 0.04},
+        # Both fingers hang on the one drive.
+        drives=JointDrives(stiffness=(5000.0,), inertia=(0.12,)),
+        source="this project's own design",
+    )
+)

@@ -1,0 +1,280 @@
+"""Every arm under the same impedance, by what it does: it holds, yields, follows, locks a connector and grips."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.geometry import AddContactMaterial, AddRigidHydroelasticProperties, Box, ProximityProperties
+from pydrake.math import RigidTransform
+from pydrake.multibody.math import SpatialForce
+from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialForce
+from pydrake.multibody.tree import SpatialInertia
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.recording import drive_along
+from guiderail.diagrams.stations.arm import MIDDLE_OF_TURN, ArmStation, KnownArm
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.tasks.bnc_connector import make_env
+from guiderail.models.errors import InputError
+from guiderail.models.objects.bnc_motion import MM, insert_and_lock
+from guiderail.models.pose_coordinates import pose_to_transform
+from guiderail.models.robots.robot import find_robot
+
+WORKCELL = BncWorkcell()
+ROBOTS = ("iiwa14", "panda", "ur5e")
+STIFFNESS = np.array([1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0])  # the station's, of [force, torque]
+
+
+class Held:
+    """A station with its jack far away, told to stay where it is put, and a hand that pushes its tool."""
+
+    def __init__(self, robot, pose, *, impedance=None):
+        self.station = ArmStation(WORKCELL, impedance or Impedance(), robot=robot)
+        self.plant, self.arm = self.station.plant, self.station.arm
+        self.simulator = Simulator(self.station)
+        self.context = self.simulator.get_mutable_context()
+        self.plant_context = self.plant.GetMyMutableContextFromRoot(self.context)
+        WORKCELL.set_jack_offset(self.plant, self.plant_context, RigidTransform([0.0, 0.0, -0.5]))
+        self.push(np.zeros(6))
+        self.desired = self.station.get_desired_pose_input_port().FixValue(self.context, pose)
+        self.station.set_pose(self.context, pose)
+        self.simulator.Initialize()
+
+    def push(self, wrench):
+        applied = ExternallyAppliedSpatialForce()
+        applied.body_index = self.plant.GetBodyByName("tool_centre").index()
+        applied.p_BoBq_B = np.zeros(3)
+        applied.F_Bq_W = SpatialForce(tau=np.array(wrench[3:], dtype=float), f=np.array(wrench[:3], dtype=float))
+        self.plant.get_applied_spatial_force_input_port().FixValue(self.plant_context, Value([applied]))
+
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    def X_TP(self):
+        return self.arm.tool_centre.CalcPose(self.plant_context, self.arm.target)
+
+    def put(self, q):
+        """At rest in a posture, and told to stay there."""
+        self.plant.SetPositions(self.plant_context, self.arm.model, q)
+        pose = self.station.get_pose_output_port().Eval(self.station.GetMyContextFromRoot(self.context))
+        self.desired.GetMutableData().set_value(pose)
+        return pose.copy()
+
+    @property
+    def speeds(self):
+        return np.abs(self.plant.GetVelocities(self.plant_context, self.arm.model))
+
+
+def displacement(before, after):
+    turn = (after.rotation() @ before.rotation().inverse()).ToAngleAxis()
+    return np.concatenate([after.translation() - before.translation(), turn.angle() * turn.axis()])
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_every_arm_inserts_and_locks_where_the_pose_is_known(robot):
+    times, motion = insert_and_lock()
+    driven, recording = drive_along(ArmStation(WORKCELL, robot=robot), times, motion)
+    X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
+    assert WORKCELL.is_locked(X)
+    assert np.abs(X.translation()).max() < 0.3 * MM
+    assert recording["contact_force"].max() < 15.0
+    assert not recording["saturation"].any()
+    # In the first second, before anything touches, it lags behind by little.
+    assert np.abs(recording["pose"] - recording["desired_pose"])[:50, :3].max() < 1.5 * MM
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_static_displacement_is_the_compliance_times_the_wrench(robot):
+    held = Held(robot, np.array([-0.10, 0.12, 0.15, 1.2, 0.2, -0.3]))
+    before = held.X_TP()
+    wrench = np.array([6.0, -4.0, 8.0, 0.3, -0.2, 0.4])
+    held.push(wrench)
+    held.advance(4.0)
+    moved, expected = displacement(before, held.X_TP()), wrench / STIFFNESS
+    assert np.linalg.norm(moved[:3] - expected[:3]) < 0.02 * np.linalg.norm(expected[:3])
+    assert np.linalg.norm(moved[3:] - expected[3:]) < 0.02 * np.linalg.norm(expected[3:])
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_pushed_and_released_it_comes_to_rest_at_the_plants_step(robot):
+    """With a tenth of the usual damping even: a controller that is too slow for what it controls would ring."""
+    held = Held(robot, MIDDLE_OF_TURN, impedance=Impedance(damping_ratio=0.1))
+    before = held.X_TP()
+    held.push([15.0, -10.0, 12.0, 0.5, -0.5, 0.5])
+    held.advance(0.3)
+    held.push(np.zeros(6))
+    swings = []
+    for _ in range(40):
+        held.advance(0.1)
+        swings.append(held.speeds.max())
+    assert max(swings[:5]) > 0.05
+    assert max(swings[-5:]) < 0.02 * max(swings[:5])
+    assert np.abs(displacement(before, held.X_TP())).max() < 1e-3
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_quarter_turn_lies_in_the_middle_of_the_last_joints_range(robot):
+    known = KnownArm(WORKCELL, robot)
+    lower, upper = known.plant.GetPositionLowerLimits()[-1], known.plant.GetPositionUpperLimits()[-1]
+    last = [known.solve(MIDDLE_OF_TURN + [0, 0, 0, turn, 0, 0], known.posture)[-1] for turn in (-np.pi / 4, np.pi / 4)]
+    assert abs(known.posture[-1] - 0.5 * (lower + upper)) < np.deg2rad(15.0)
+    # A redundant arm turns with its elbow too, so that its last joint turns by less.
+    assert np.deg2rad(70.0) < abs(last[1] - last[0]) < np.deg2rad(91.0)
+    assert min(min(last) - lower, upper - max(last)) > np.deg2rad(90.0)
+
+
+# The wrist's axes in line, and the arm stretched out: an arm of six joints loses a direction there.
+WRIST, ELBOW = np.array([-0.24, -1.4, 1.85, -2.0, 0.0, 0.0]), np.array([-0.24, -1.4, 0.0, -2.0, -1.57, 0.0])
+
+
+@pytest.mark.parametrize("singular", [WRIST, ELBOW])
+def test_an_arm_of_six_joints_rests_in_a_singular_posture(singular):
+    held = Held("ur5e", MIDDLE_OF_TURN)
+    held.put(singular)
+    held.push([8.0, 5.0, -6.0, 0.3, 0.3, -0.3])
+    speeds = []
+    for _ in range(20):
+        held.advance(0.05)
+        speeds.append(held.speeds.max())
+    held.push(np.zeros(6))
+    held.advance(6.0)
+    assert max(speeds) < 2.0
+    assert held.speeds.max() < 0.03
+
+
+def test_pulled_to_its_full_length_an_arm_does_not_jerk():
+    """The tool is told to go 20 cm farther than the arm is long. Torques change by little from step to step.
+
+    With the plain inverse of the inertia at the tool they jump by more than 10 Nm, back and forth.
+    """
+    held = Held("ur5e", MIDDLE_OF_TURN)
+    nearly = np.array([-0.24, -1.4, 0.3, -2.0, -1.57, 0.0])
+    start = held.put(nearly)
+    controller = held.station.GetSubsystemByName("controller")
+    torque = controller.get_torque_output_port()
+    context = controller.GetMyContextFromRoot(held.context)
+    torques = []
+    for step in range(600):
+        away = min(1.0, step / 200) * np.array([0.1, 0.0, 0.15, 0.0, 0.0, 0.0])
+        held.desired.GetMutableData().set_value(start + away)
+        held.advance(0.01)
+        torques.append(torque.Eval(context).copy())
+    assert np.abs(np.diff(torques, axis=0)).max() < 2.0
+    assert held.speeds.max() < 0.05
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_arms_have_the_same_ports_and_a_reset_is_exact(robot):
+    station = ArmStation(WORKCELL, robot=robot)
+    assert [station.get_input_port(i).get_name() for i in range(station.num_input_ports())] == [
+        "desired_pose",
+        "command_time",
+    ]
+    context = station.CreateDefaultContext()
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        pose = rng.uniform(-1, 1, 6) * [0.05, 0.05, 0.05, 0.7, 0.2, 0.2] + [0, 0, 0.05, np.pi / 4, 0, 0]
+        station.set_pose(context, pose)
+        np.testing.assert_allclose(station.get_pose_output_port().Eval(context), pose, atol=1e-9)
+
+
+def test_a_robot_is_chosen_by_name_where_an_environment_is_made():
+    env = make_env(station="arm", robot="ur5e")
+    assert env.task.diagram.GetSubsystemByName("station").plant.HasBodyNamed("ur5e_forearm")
+    with pytest.raises(InputError, match="did you mean ur5e"):
+        make_env(station="arm", robot="ur5")
+    with pytest.raises(InputError, match="rails have no robot"):
+        make_env(robot="panda")
+
+
+def test_refuses_a_robot_whose_model_moves_by_more_than_its_joints():
+    fewer = dataclasses.replace(
+        find_robot("iiwa14"), joints=find_robot("iiwa14").joints[:6], home=(0.0,) * 6, drives=None, level_posture=None
+    )
+    with pytest.raises(InputError, match="iiwa_joint_7"):
+        ArmStation(WORKCELL, robot=fewer)
+
+
+class BlockOnATable:
+    """A block between the fingers of a gripper that holds nothing yet."""
+
+    X_WT = RigidTransform([0.5, 0.0, 0.2])
+    WEIGHT = 0.2 * 9.81
+
+    def add_fixture(self, plant):
+        friction = CoulombFriction(0.5, 0.5)
+        plant.RegisterCollisionGeometry(
+            plant.world_body(), RigidTransform([0.5, 0.0, 0.155]), Box(0.3, 0.3, 0.05), "table", friction
+        )
+        self.block = plant.AddRigidBody(
+            "block", plant.AddModelInstance("block"), SpatialInertia.SolidBoxWithMass(0.2, 0.04, 0.04, 0.04)
+        )
+        material = ProximityProperties()
+        AddRigidHydroelasticProperties(1.0, material)
+        AddContactMaterial(friction=CoulombFriction(0.8, 0.8), properties=material)
+        plant.RegisterCollisionGeometry(self.block, RigidTransform(), Box(0.04, 0.04, 0.04), "block", material)
+        plant.SetDefaultFloatingBaseBodyPose(self.block, RigidTransform([0.5, 0.0, 0.2]))
+
+    def add_workpiece(self, plant, tool_centre):
+        instance = plant.AddModelInstance("nothing")
+        nothing = plant.AddRigidBody("nothing", instance, SpatialInertia.SolidSphereWithMass(1e-3, 0.005))
+        plant.WeldFrames(tool_centre, nothing.body_frame())
+        return nothing
+
+    def filter_contacts(self, plant, scene_graph):
+        pass
+
+
+@pytest.mark.parametrize("robot", ["panda", "ur5e"])
+def test_a_gripper_grips_lifts_and_lets_go(robot):
+    workcell = BlockOnATable()
+    station = ArmStation(workcell, robot=robot, end_effector="parallel_gripper")
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    plant_context = station.plant.GetMyContextFromRoot(context)
+    station.set_pose(context, np.zeros(6))
+    desired = station.get_desired_pose_input_port().FixValue(context, np.zeros(6))
+    state = station.get_gripper_state_output_port()
+    simulator.Initialize()
+    np.testing.assert_allclose(state.Eval(context), [0.04, 0.0])
+
+    def block_height():
+        return workcell.block.EvalPoseInWorld(plant_context).translation()[2]
+
+    simulator.AdvanceTo(0.2)  # not connected, it stays open
+    assert state.Eval(context)[0] == pytest.approx(0.04, abs=1e-4)
+    fingers = station.get_gripper_position_input_port().FixValue(context, [0.0])
+    simulator.AdvanceTo(0.7)
+    assert state.Eval(context)[0] == pytest.approx(0.02, abs=5e-4)  # the block is between the fingers
+    force = station.plant.get_net_actuation_output_port(station.arm.tool_model).Eval(plant_context)
+    np.testing.assert_allclose(force, [-60.0], atol=1e-6)  # the motor's limit, not its drive's 100 N
+    desired.GetMutableData().set_value([0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    simulator.AdvanceTo(2.2)
+    fingers.GetMutableData().set_value([np.nan])  # no command: it goes on holding
+    simulator.AdvanceTo(2.5)
+    assert block_height() > 0.28
+    wrench = station.get_wrench_output_port().Eval(context)
+    assert wrench[2] == pytest.approx(-workcell.WEIGHT, abs=0.05)
+    assert np.abs(wrench[:2]).max() < 0.05
+    fingers.GetMutableData().set_value([1.0])  # wider than it can
+    simulator.AdvanceTo(3.2)
+    assert state.Eval(context)[0] == pytest.approx(0.04, abs=1e-3)
+    assert block_height() < 0.21
+
+
+def test_a_rigid_tool_has_no_gripper():
+    station = ArmStation(WORKCELL)
+    assert not station.HasInputPort("gripper_position")
+    assert not station.HasOutputPort("gripper_state")
+
+
+def test_pose_and_transform_agree_over_the_arms_workspace():
+    """The tool centre is where its pose says, tilted or not, for a tool that is bolted on turned."""
+    known = KnownArm(WORKCELL, "ur5e")
+    context = known.plant.CreateDefaultContext()
+    pose = np.array([0.03, -0.02, 0.08, 0.9, 0.15, -0.2])
+    known.plant.SetPositions(context, known.solve(pose, known.posture))
+    X = known.arm.tool_centre.CalcPose(context, known.arm.target)
+    np.testing.assert_allclose(X.GetAsMatrix4(), pose_to_transform(pose).GetAsMatrix4(), atol=1e-9)

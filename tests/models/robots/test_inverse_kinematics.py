@@ -1,0 +1,127 @@
+"""Inverse kinematics by what it promises: exact, nearest, within limits, the same every time, or a sentence."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
+
+from guiderail.models.errors import InputError
+from guiderail.models.pose_coordinates import pose_to_transform
+from guiderail.models.robots.assembly import add_robot
+from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.models.robots.robot import find_robot
+
+
+class Arm:
+    def __init__(self, name):
+        self.robot = find_robot(name)
+        self.plant = MultibodyPlant(0.0)
+        self.flange = add_robot(self.plant, self.robot).flange
+        self.plant.Finalize()
+        self.context = self.plant.CreateDefaultContext()
+        self.home = np.array(self.robot.home)
+        self.lower, self.upper = self.plant.GetPositionLowerLimits(), self.plant.GetPositionUpperLimits()
+
+    def pose(self, q):
+        self.plant.SetPositions(self.context, q)
+        return self.flange.CalcPoseInWorld(self.context)
+
+    def solve(self, X, posture=None):
+        posture = self.home if posture is None else posture
+        return solve_inverse_kinematics(self.plant, self.plant.world_frame(), self.flange, X, posture)
+
+    def error(self, q, X):
+        D = X.inverse() @ self.pose(q)
+        return np.linalg.norm([np.linalg.norm(D.translation()), D.rotation().ToAngleAxis().angle()])
+
+    def jacobian(self, q):
+        self.plant.SetPositions(self.context, q)
+        world = self.plant.world_frame()
+        return self.plant.CalcJacobianSpatialVelocity(
+            self.context, JacobianWrtVariable.kV, self.flange, np.zeros(3), world, world
+        )
+
+    def around_home(self, rng):
+        shift = rng.uniform([-0.1, -0.1, -0.1, -1.0, -0.3, -0.3], [0.1, 0.1, 0.1, 1.0, 0.3, 0.3])
+        X = pose_to_transform(shift)
+        X_home = self.pose(self.home)
+        return RigidTransform(X.rotation() @ X_home.rotation(), X.translation() + X_home.translation())
+
+
+@pytest.fixture(scope="module", params=["iiwa14", "panda", "ur5e"])
+def arm(request):
+    return Arm(request.param)
+
+
+def test_is_exact_within_limits_and_the_same_every_time(arm):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        X = arm.around_home(rng)
+        q = arm.solve(X)
+        assert arm.error(q, X) < 1e-9
+        assert ((q >= arm.lower) & (q <= arm.upper)).all()
+        np.testing.assert_array_equal(arm.solve(X), q)
+
+
+def test_is_the_nearest_to_the_posture(arm):
+    """No motion that leaves the tool where it is leads nearer: what separates it from the posture moves the tool."""
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        q = arm.solve(arm.around_home(rng))
+        J = arm.jacobian(q)
+        away = q - arm.home
+        still = away - np.linalg.pinv(J) @ (J @ away)
+        assert np.linalg.norm(still) < 1e-4
+        assert np.linalg.norm(away) < 2.0
+
+
+def test_from_a_posture_that_is_there_already_it_stays():
+    arm = Arm("panda")
+    np.testing.assert_allclose(arm.solve(arm.pose(arm.home)), arm.home, atol=1e-7)
+
+
+def test_a_joint_at_its_limit_stays_within_it():
+    """Nearest to a posture beyond a limit is that joint at its limit; the pose is met exactly all the same."""
+    arm = Arm("panda")
+    X = arm.pose(arm.home)
+    posture = arm.home.copy()
+    posture[6] = arm.upper[6] + 1.0
+    q = arm.solve(X, posture)
+    assert (q <= arm.upper).all()
+    assert arm.error(q, X) < 1e-9
+
+
+def test_a_posture_on_the_wrong_side_is_no_obstacle():
+    """Half a turn away: where the search from the posture fails, others start around it."""
+    arm = Arm("ur5e")
+    X = arm.pose(arm.home)
+    for seed in range(10):
+        posture = np.random.default_rng(seed).uniform(-3.0, 3.0, 6)
+        q = arm.solve(X, posture)
+        assert arm.error(q, X) < 1e-9
+
+
+@pytest.mark.parametrize(("name", "joint"), [("ur5e", 4), ("ur5e", 2), ("iiwa14", 5)])
+def test_a_singular_pose_is_met_too(name, joint):
+    arm = Arm(name)
+    singular = arm.home.copy()
+    singular[joint] = 0.0
+    X = arm.pose(singular)
+    near = singular + 0.05 * np.cos(np.arange(len(singular)))
+    q = arm.solve(X, near)
+    assert arm.error(q, X) < 1e-9
+    assert np.abs(q - near).max() < 0.5
+
+
+def test_says_what_is_out_of_reach(arm):
+    with pytest.raises(InputError, match=r"can't reach \[2\. *0\. *0\. *\] m: move the workcell nearer"):
+        arm.solve(RigidTransform([2.0, 0.0, 0.0]))
+
+
+def test_says_what_only_a_joints_limit_keeps_from():
+    """Beside its own foot, flange down: an elbow that could fold further would do it."""
+    arm = Arm("panda")
+    X = RigidTransform(arm.pose(arm.home).rotation(), [0.05, 0.0, 0.1])
+    with pytest.raises(InputError, match="only beyond a joint's limit"):
+        arm.solve(X)

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.errors import InputError
+from guiderail.systems.gripper_command import GripperCommand
+
+LOWER, UPPER, OPENING = np.array([0.0, -1.0]), np.array([0.04, 1.0]), np.array([0.03, 0.5])
+
+
+class Commanded:
+    def __init__(self):
+        self.system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+
+    def command(self, position):
+        self.system.get_position_input_port().FixValue(self.context, position)
+
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    @property
+    def desired(self):
+        return self.system.get_desired_state_output_port().Eval(self.context)
+
+
+def test_unconnected_it_stays_where_it_starts():
+    commanded = Commanded()
+    commanded.advance(0.1)
+    np.testing.assert_array_equal(commanded.desired, [0.03, 0.5, 0.0, 0.0])
+
+
+def test_a_command_counts_at_once_and_within_limits():
+    commanded = Commanded()
+    commanded.command([0.01, 0.2])
+    np.testing.assert_array_equal(commanded.desired, [0.01, 0.2, 0.0, 0.0])
+    commanded.command([-5.0, 5.0])
+    np.testing.assert_array_equal(commanded.desired, [0.0, 1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_a_number_leaves_its_joint_where_it_was_told_to_be(bad):
+    commanded = Commanded()
+    commanded.command([0.01, 0.2])
+    commanded.advance(0.05)
+    commanded.command([bad, 0.4])
+    for _ in range(3):
+        np.testing.assert_array_equal(commanded.desired, [0.01, 0.4, 0.0, 0.0])
+        commanded.advance(0.05)
+
+
+def test_a_reset_forgets():
+    commanded = Commanded()
+    commanded.command([0.01, 0.2])
+    commanded.advance(0.05)
+    commanded.command([np.nan, np.nan])
+    commanded.system.SetDefaultContext(commanded.context)
+    np.testing.assert_array_equal(commanded.desired, [0.03, 0.5, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"lower": np.zeros(1)},
+        {"opening": np.array([0.05, 0.0])},
+        {"opening": np.array([np.nan, 0.0])},
+        {"upper": np.array([[0.04, 1.0]]), "lower": LOWER[None], "opening": OPENING[None]},
+        {"period": 0.0},
+    ],
+)
+def test_refuses_what_makes_no_sense(wrong):
+    sound = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | wrong
+    with pytest.raises(InputError):
+        GripperCommand(sound.pop("lower"), sound.pop("upper"), sound.pop("opening"), **sound)
+
+
+def test_ports():
+    system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
+    assert system.get_position_input_port().get_name() == "position"
+    assert system.get_desired_state_output_port().get_name() == "desired_state"
+    assert system.get_desired_state_output_port().size() == 4
