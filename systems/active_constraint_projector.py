@@ -1,26 +1,37 @@
-"""Keeps what is commanded inside the active constraints (thesis, equation 2.21)."""
+"""Projects requested poses into the active constraints (thesis, equation 2.21)."""
 
 from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
+from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
-from guiderail.systems.caching import declare_array_cache
-from guiderail.systems.skill_frames import SkillFrames
+from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.skill_frames import SkillFrames
 
 
 class ActiveConstraintProjector(LeafSystem):
-    """The active constraints of the state that a shared control template is in, applied to whatever is requested.
+    """Applies the active constraints of a shared control template's current state to requested poses.
 
-        H^ac = project_q(H^im), reachable in one period from the last command
+        H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
-    (`Skill.command`). The last command is state: it starts at the measured pose, as far inside as one period leads.
-    Between two control instants the output is a pure function of it and of the request. The last safe command is
-    repeated, and `fallback` is 1, while a request is not finite, or while the robot is farther than the leash from its
-    command and the request leads no nearer to it: a robot that is held back is waited for.
+    (`Skill.command`). The last command is state; it is initialized with the measured pose, as far inside the
+    constraints as one period leads. Between two control instants the output is a pure function of it and of the
+    request. The last safe command is repeated, and ``fallback`` is 1, where a request is not finite, and where the
+    tracking error exceeds its bound and the request would not reduce it: the command waits for a robot that is held
+    back.
 
     .. pydrake_system::
 
@@ -38,25 +49,29 @@ class ActiveConstraintProjector(LeafSystem):
 
     All poses are (6,), [x y z Rz Ry Rx] in metres and radians; the other ports are (1,). ``state`` is the number of the
     skill's state. Violations are the larger of metres and radians from the projection, 0 inside.
+
+    Attributes:
+        frames: the poses of the skill's objects, which a reset can set.
     """
 
-    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float, leash: float = np.inf):
+    def __init__(
+        self, skill: Skill, frames: Mapping[str, RigidTransform], period: float, max_tracking_error: float = np.inf
+    ):
         """
         Args:
             skill: the template.
             frames: the poses of its objects by name, in the frame that poses are given in.
-            period: seconds between control steps, positive.
-            leash: [m] how far the robot may be from its command before that waits, positive.
+            period: between two control steps [s], positive.
+            max_tracking_error: distance of the robot from its command beyond which that waits [m], positive.
 
         Raises:
-            ValueError: if an argument is out of range, or a frame is missing.
+            InputError: if an argument is out of range, or a frame is missing.
         """
         super().__init__()
-        if not period > 0 or not leash > 0:
-            raise ValueError(f"the control period and the leash must be positive, not {period} s and {leash} m")
-        self._skill = skill
-        self._period = period
-        self._leash = leash
+        check_period(period)
+        if not max_tracking_error > 0.0:
+            raise InputError(f"the greatest tracking error must be positive, not {max_tracking_error} m")
+        self._skill, self._period, self._max_tracking_error = skill, period, max_tracking_error
         self.frames = SkillFrames(self, skill, frames)
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
@@ -65,46 +80,37 @@ class ActiveConstraintProjector(LeafSystem):
         # The last command, and the pose that was measured when it was given.
         self._last = self.DeclareDiscreteState(12)
         last = self.discrete_state_ticket(self._last)
-        here = {last, self._state_port.ticket(), self.frames.ticket}
-        self._next = declare_array_cache(
-            self, "command", self._calc_command, here | {self._requested_pose_port.ticket()}
+        constraints = {self._state_port.ticket(), self.frames.ticket}
+        self._command = declare_cache(
+            self,
+            "command",
+            self._calc_command,
+            prerequisites_of_calc=constraints | {last, self._requested_pose_port.ticket()},
         )
-        now = {self._next.ticket()}
+        command = {self._command.ticket()}
         self._desired_pose_port = self.DeclareVectorOutputPort(
-            "desired_pose",
-            6,
-            lambda context, output: output.SetFromVector(self._next.Eval(context)[:6]),
-            prerequisites_of_calc=now,
+            "desired_pose", 6, self._calc_desired_pose, prerequisites_of_calc=command
         )
         self._last_desired_pose_port = self.DeclareVectorOutputPort(
-            "last_desired_pose",
-            6,
-            lambda context, output: output.SetFromVector(context.get_discrete_state(self._last).value()[:6]),
-            prerequisites_of_calc={last},
+            "last_desired_pose", 6, self._calc_last_desired_pose, prerequisites_of_calc={last}
         )
         self._fallback_port = self.DeclareVectorOutputPort(
-            "fallback",
-            1,
-            lambda context, output: output.SetAtIndex(0, self._next.Eval(context)[6]),
-            prerequisites_of_calc=now,
+            "fallback", 1, self._calc_fallback, prerequisites_of_calc=command
         )
         self._commanded_violation_port = self.DeclareVectorOutputPort(
-            "commanded_violation",
-            1,
-            lambda context, output: output.SetAtIndex(0, self._violation(context, self._next.Eval(context)[:6])),
-            prerequisites_of_calc=now | here,
+            "commanded_violation", 1, self._calc_commanded_violation, prerequisites_of_calc=command | constraints
         )
         self._measured_violation_port = self.DeclareVectorOutputPort(
             "measured_violation",
             1,
-            lambda context, output: output.SetAtIndex(0, self._violation(context, self._pose_port.Eval(context))),
-            prerequisites_of_calc={self._pose_port.ticket(), self._state_port.ticket(), self.frames.ticket},
+            self._calc_measured_violation,
+            prerequisites_of_calc=constraints | {self._pose_port.ticket()},
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_requested_pose_input_port(self) -> InputPort:
-        """What somebody wants, (6,)."""
+        """The requested pose H^im, (6,)."""
         return self._requested_pose_port
 
     def get_pose_input_port(self) -> InputPort:
@@ -116,7 +122,7 @@ class ActiveConstraintProjector(LeafSystem):
         return self._state_port
 
     def get_desired_pose_output_port(self) -> OutputPort:
-        """The command, (6,), inside the active constraints."""
+        """The command H^ac, (6,), inside the active constraints."""
         return self._desired_pose_port
 
     def get_last_desired_pose_output_port(self) -> OutputPort:
@@ -140,7 +146,7 @@ class ActiveConstraintProjector(LeafSystem):
         return self._skill.violation(state, pose_to_transform(pose), self.frames.eval(context))
 
     def _calc_command(self, context: Context) -> np.ndarray:
-        """The command (6,), and whether it is the last safe one."""
+        """The command (6,), and 1 if it is the last safe one, else 0."""
         last, measured = np.split(context.get_discrete_state(self._last).value(), 2)
         requested = self._requested_pose_port.Eval(context)
         if not np.isfinite(requested).all():
@@ -153,15 +159,30 @@ class ActiveConstraintProjector(LeafSystem):
             self._period,
         )
         desired = transform_to_pose(command.X_WE)
-        lag = np.linalg.norm(last[:3] - measured[:3])
-        if lag > self._leash and np.linalg.norm(desired[:3] - measured[:3]) >= lag:
+        tracking_error = np.linalg.norm(last[:3] - measured[:3])
+        if tracking_error > self._max_tracking_error and np.linalg.norm(desired[:3] - measured[:3]) >= tracking_error:
             return np.append(last, 1.0)
         return np.append(desired, 0.0)
+
+    def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._command.Eval(context)[:6])
+
+    def _calc_last_desired_pose(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state(self._last).value()[:6])
+
+    def _calc_fallback(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._command.Eval(context)[6])
+
+    def _calc_commanded_violation(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._violation(context, self._command.Eval(context)[:6]))
+
+    def _calc_measured_violation(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._violation(context, self._pose_port.Eval(context)))
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         measured = self._pose_port.Eval(context)
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
-        # Not what the state port says: that is decided at this same instant.
+        # Not the state port's value: that is decided at this same instant.
         state = self._skill.state_at(X_WE, frames)
         command = self._skill.command(state, X_WE, X_WE, frames, self._period)
         discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))
@@ -170,5 +191,6 @@ class ActiveConstraintProjector(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
         if context.get_time() > 0:
-            discrete_state.set_value(np.concatenate([self._next.Eval(context)[:6], self._pose_port.Eval(context)]))
+            command, measured = self._command.Eval(context)[:6], self._pose_port.Eval(context)
+            discrete_state.set_value(np.concatenate([command, measured]))
         return EventStatus.Succeeded()

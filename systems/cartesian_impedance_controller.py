@@ -1,24 +1,22 @@
-"""A Cartesian impedance for a torque-controlled arm."""
-
-from __future__ import annotations
+"""Cartesian impedance control of a torque-controlled arm."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.common.value import Value
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import orientation_error, pose_to_transform, transform_to_pose
-from guiderail.systems.command_watch import CommandWatch
+from guiderail.systems.support.caching import declare_cache, declare_plant_context
+from guiderail.systems.support.command_watch import CommandWatch
 
 
 @dataclass(frozen=True)
 class ImpedanceGains:
-    """What an impedance is made of.
+    """Stiffness, damping and limits of a Cartesian impedance, and the posture that the null space is controlled to.
 
     Args:
         stiffness: (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad.
@@ -26,8 +24,8 @@ class ImpedanceGains:
         damping_ratio: of every mode, positive.
         posture: joint positions (n,) that the null space returns to.
         posture_stiffness: [Nm/rad], not negative.
-        posture_damping: how fast motion dies that doesn't move the tool [1/s], not negative; the torque is this times
-            M v, the one damping that takes energy out of the null space in every posture.
+        posture_damping: decay rate of motion in the null space [1/s], not negative; its torque is this rate times M v,
+            which takes energy out of the null space in every posture.
     """
 
     stiffness: np.ndarray
@@ -48,13 +46,13 @@ class ImpedanceGains:
 
 
 class CartesianImpedanceController(LeafSystem):
-    """Lets a tool centre P give way around a desired pose as a spring and a damper would.
+    """Makes an arm's tool centre P behave as a spring and a damper around a desired pose.
 
-    τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits; the law is in
-    `models.cartesian_impedance`. K may be given in the axes of any frame. The orientation's error is a
-    quaternion's, so that no orientation is singular. D follows from K and the arm's inertia at its present posture.
+        τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
 
-    A watchdog holds the last sound command where they stop: see `CommandWatch`.
+    (`impedance_torques`). K may be given in the axes of any frame. The orientation error is a quaternion's, so that no
+    orientation is singular. D follows from K and the arm's inertia at its present posture. Where commands stop, a
+    watchdog holds the last valid one: see `CommandWatch`.
 
     .. pydrake_system::
 
@@ -70,10 +68,10 @@ class CartesianImpedanceController(LeafSystem):
         - saturation
         - holding
 
-    `desired_pose` and `pose` are X_TP as (6,) [x y z Rz Ry Rx]. `state` is (2n,), joint positions and velocities.
-    `command_time` is (1,), the time at which `desired_pose` was given [s]; unconnected, commands never grow old.
-    `torque` is (n,) [Nm]. `impedance_wrench` is (6,), force first, in the axes of T. `saturation` is 1 while the wrench
-    or a motor is at its limit, `holding` 1 while the watchdog holds; both (1,).
+    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``state`` is (2n,), joint
+    positions and velocities. ``command_time`` is (1,), when ``desired_pose`` was given [s]; unconnected, commands never
+    get stale. ``torque`` is (n,) [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T. ``saturation`` is 1
+    while the wrench or a motor is at its limit, ``holding`` 1 while the watchdog holds; both (1,).
     """
 
     def __init__(
@@ -94,11 +92,11 @@ class CartesianImpedanceController(LeafSystem):
             target: T, fixed in the world.
             tool_centre: P.
             gains: the impedance.
-            period: at which the watchdog looks [s], positive.
-            stiffness_frame: whose axes `gains` are along; T unless given. Energy can only be gained from a spring
-                whose axes are turned, so a frame that the tool carries along is passive as long as it hardly turns.
-            compensate_gravity: False where the robot's own controller does it.
-            timeout: age from which a desired pose no longer counts [s], positive.
+            period: at which the watchdog checks commands [s], positive.
+            stiffness_frame: in whose axes the gains are given; T unless given. In the axes of a frame that rotates the
+                impedance is not strictly passive: a spring whose axes are turned can gain energy.
+            compensate_gravity: False where the robot's own controller compensates it.
+            timeout: age beyond which a desired pose is stale [s], positive.
 
         Raises:
             InputError: if an argument is out of range.
@@ -112,78 +110,77 @@ class CartesianImpedanceController(LeafSystem):
         self._compensate_gravity = compensate_gravity
         self._torque_limits = plant.GetEffortUpperLimits()
 
-        self._desired_pose = self.DeclareVectorInputPort("desired_pose", 6)
-        self._state = self.DeclareVectorInputPort("state", 2 * num_joints)
-        self._command_time = self.DeclareVectorInputPort("command_time", 1)
+        self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
+        self._state_port = self.DeclareVectorInputPort("state", 2 * num_joints)
+        self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
         self._watch = CommandWatch(
             self,
-            self._desired_pose,
-            self._command_time,
-            lambda context: self._pose.Eval(context),
+            self._desired_pose_port,
+            self._command_time_port,
+            self._measured_pose,
             period=period,
             timeout=timeout,
         )
 
-        self._kinematics = self.DeclareCacheEntry(
-            "kinematics",
-            ValueProducer(
-                allocate=lambda: Value(plant.CreateDefaultContext()),
-                calc=lambda context, value: plant.SetPositionsAndVelocities(
-                    value.get_mutable_value(), self._state.Eval(context)
-                ),
-            ),
-            {self._state.ticket()},
-        )
-        self._law = self.DeclareCacheEntry(
-            "law",
-            ValueProducer(
-                allocate=lambda: Value(object()),
-                calc=lambda context, value: value.set_value(self._calc_law(context)),
-            ),
-            self._watch.tickets | {self._state.ticket()},
-        )
+        state = {self._state_port.ticket()}
+        self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=state)
+        self._law = declare_cache(self, "law", self._calc_law, prerequisites_of_calc=self._watch.tickets | state)
         law = {self._law.ticket()}
-        self._torque = self.DeclareVectorOutputPort("torque", num_joints, self._calc_torque, law)
-        self._pose = self.DeclareVectorOutputPort("pose", 6, self._calc_pose, {self._state.ticket()})
-        self._wrench = self.DeclareVectorOutputPort("impedance_wrench", 6, self._calc_wrench, law)
-        self._saturation = self.DeclareVectorOutputPort("saturation", 1, self._calc_saturation, law)
-        self._holding = self.DeclareVectorOutputPort("holding", 1, self._watch.calc_holding, self._watch.commands)
+        self._torque_port = self.DeclareVectorOutputPort(
+            "torque", num_joints, self._calc_torque, prerequisites_of_calc=law
+        )
+        self._pose_port = self.DeclareVectorOutputPort("pose", 6, self._calc_pose, prerequisites_of_calc=state)
+        self._impedance_wrench_port = self.DeclareVectorOutputPort(
+            "impedance_wrench", 6, self._calc_impedance_wrench, prerequisites_of_calc=law
+        )
+        self._saturation_port = self.DeclareVectorOutputPort(
+            "saturation", 1, self._calc_saturation, prerequisites_of_calc=law
+        )
+        self._holding_port = self.DeclareVectorOutputPort(
+            "holding", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
+        )
 
-    def get_desired_pose_input_port(self):
-        """Where the tool centre shall be, (6,)."""
-        return self._desired_pose
+    def get_desired_pose_input_port(self) -> InputPort:
+        """The desired pose of the tool centre, (6,)."""
+        return self._desired_pose_port
 
-    def get_state_input_port(self):
-        """Joint positions and velocities, (2n,)."""
-        return self._state
+    def get_state_input_port(self) -> InputPort:
+        """Joint positions and velocities, (2n,) [rad, rad/s]."""
+        return self._state_port
 
-    def get_command_time_input_port(self):
+    def get_command_time_input_port(self) -> InputPort:
         """When the desired pose was given, (1,) [s]; optional."""
-        return self._command_time
+        return self._command_time_port
 
-    def get_torque_output_port(self):
+    def get_torque_output_port(self) -> OutputPort:
         """Joint torques, (n,) [Nm]."""
-        return self._torque
+        return self._torque_port
 
-    def get_pose_output_port(self):
-        """Where the tool centre is, (6,)."""
-        return self._pose
+    def get_pose_output_port(self) -> OutputPort:
+        """The measured pose of the tool centre, (6,)."""
+        return self._pose_port
 
-    def get_impedance_wrench_output_port(self):
+    def get_impedance_wrench_output_port(self) -> OutputPort:
         """What the spring and the damper apply at P in the axes of T, (6,), force first."""
-        return self._wrench
+        return self._impedance_wrench_port
 
-    def get_saturation_output_port(self):
-        """1 at a limit, (1,)."""
-        return self._saturation
+    def get_saturation_output_port(self) -> OutputPort:
+        """1 while the wrench or a motor is at its limit, (1,)."""
+        return self._saturation_port
 
-    def get_holding_output_port(self):
+    def get_holding_output_port(self) -> OutputPort:
         """1 while the watchdog holds, (1,)."""
-        return self._holding
+        return self._holding_port
+
+    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
+        self._plant.SetPositionsAndVelocities(plant_context, self._state_port.Eval(context))
+
+    def _measured_pose(self, context: Context) -> np.ndarray:
+        return self._pose_port.Eval(context)
 
     def _calc_law(self, context: Context) -> JointTorques:
         plant, gains = self._plant, self._gains
-        plant_context = self._kinematics.Eval(context)
+        plant_context = self._plant_context.Eval(context)
         X_TPd = pose_to_transform(self._watch.pose(context))
         X_TP = self._tool_centre.CalcPose(plant_context, self._target)
         R_TAxes = None
@@ -220,10 +217,10 @@ class CartesianImpedanceController(LeafSystem):
         output.SetFromVector(self._law.Eval(context).torque)
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        X_TP = self._tool_centre.CalcPose(self._kinematics.Eval(context), self._target)
+        X_TP = self._tool_centre.CalcPose(self._plant_context.Eval(context), self._target)
         output.SetFromVector(transform_to_pose(X_TP))
 
-    def _calc_wrench(self, context: Context, output: BasicVector) -> None:
+    def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._law.Eval(context).wrench)
 
     def _calc_saturation(self, context: Context, output: BasicVector) -> None:

@@ -1,11 +1,9 @@
 """Cartesian position control for an arm that takes joint positions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.common.value import Value
+from pydrake.math import RigidTransform
 from pydrake.multibody.inverse_kinematics import (
     DifferentialInverseKinematicsParameters,
     DifferentialInverseKinematicsStatus,
@@ -13,15 +11,26 @@ from pydrake.multibody.inverse_kinematics import (
 )
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem, ValueProducer
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
+from guiderail.systems.support.caching import declare_plant_context
+from guiderail.systems.support.command_watch import CommandCheck
+from guiderail.systems.support.sampling import check_period
 
 
 @dataclass(frozen=True)
 class SpeedLimits:
-    """How fast the tool centre may be commanded to move, [m/s] and [rad/s], positive."""
+    """Greatest commanded speeds of the tool centre, [m/s] and [rad/s], positive."""
 
     translational: float = 0.25
     rotational: float = 1.0
@@ -32,11 +41,14 @@ class SpeedLimits:
 
 
 class CartesianPositionController(LeafSystem):
-    """Joint positions whose tool centre moves to a desired pose, by Drake's differential inverse kinematics.
+    """Commands joint positions that move an arm's tool centre P to a desired pose, by differential inverse kinematics.
 
-    Every period it asks for the velocity that would reach the desired pose within it, no faster than the limits,
-    and moves its own joint command by v·period. The optimization behind it keeps the direction of the tool's motion
-    and every joint's limits of position and velocity; where both can't be had, the command slows down or stays.
+        q[k+1] = clip(q[k] + v·period), J v = the velocity that reaches the desired pose in one period, within limits
+
+    (`pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics`). The optimization keeps the direction of
+    the tool's motion and every joint's limits of position and velocity; where both can't be had, the motion slows down
+    or stops. Where commands stop, the joint command is held: while the desired pose is not finite, older than a timeout
+    or more than a period from the future (`CommandCheck`).
 
     .. pydrake_system::
 
@@ -44,15 +56,19 @@ class CartesianPositionController(LeafSystem):
         input_ports:
         - desired_pose
         - positions
+        - command_time (optional)
         output_ports:
         - joint_positions
         - pose
         - stuck
+        - holding
 
-    `desired_pose` is X_TP as (6,) [x y z Rz Ry Rx]; what is not finite is no command, and the arm stays. `positions`
-    is (n,), measured; it is read once, at initialization, and the command starts there. `joint_positions` is the
-    command, (n,) [rad]. `pose` is where the command puts the tool centre, (6,). `stuck` is (1,): 1 while the desired
-    direction can't be followed. All outputs are state or follow from it: nothing feeds through.
+    ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``positions`` is (n,), measured; it is read
+    at initialization, and the joint command starts there. ``command_time`` is (1,), when ``desired_pose`` was given
+    [s]; unconnected, commands never get stale. ``joint_positions`` is the joint command, (n,) [rad]. ``pose`` is (6,),
+    where the joint command puts the tool centre. ``stuck`` is 1 while the desired direction can't be followed,
+    ``holding`` 1 while the joint command is held; both (1,). All outputs are state or follow from it: nothing feeds
+    through.
     """
 
     def __init__(
@@ -65,24 +81,27 @@ class CartesianPositionController(LeafSystem):
         period: float = 0.01,
         speed_limits: SpeedLimits = SpeedLimits(),
         posture_gain: float = 0.5,
+        timeout: float = 0.1,
     ):
         """
         Args:
             plant: the arm alone, finalized; its joints' limits are kept.
             target: T, fixed in the world.
             tool_centre: P.
-            posture: joint positions (n,) that the arm returns to as far as the tool lets it.
-            period: [s], positive; 100 Hz unless given.
+            posture: joint positions (n,) that the null space returns to.
+            period: between two joint commands [s], positive; 100 Hz unless given.
             speed_limits: of the tool centre.
-            posture_gain: how quickly it returns [1/s], not negative.
+            posture_gain: of the return to the posture [1/s], not negative.
+            timeout: age beyond which a desired pose is stale [s], positive.
 
         Raises:
             InputError: if an argument is out of range.
         """
         super().__init__()
+        check_period(period)
         num_joints = plant.num_positions()
-        if not period > 0.0 or not posture_gain >= 0.0:
-            raise InputError("a position controller's period must be positive, and its posture's gain not negative")
+        if not posture_gain >= 0.0:
+            raise InputError(f"a position controller's posture gain must not be negative, not {posture_gain}")
         if np.shape(posture) != (num_joints,):
             raise InputError(f"a position controller's posture must have {num_joints} joints")
         self._plant, self._target, self._tool_centre = plant, target, tool_centre
@@ -95,83 +114,98 @@ class CartesianPositionController(LeafSystem):
         parameters.set_joint_velocity_limits((plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()))
         self._parameters = parameters
 
-        self._desired_pose = self.DeclareVectorInputPort("desired_pose", 6)
-        self._positions = self.DeclareVectorInputPort("positions", num_joints)
+        self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
+        self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
+        self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
+        self._check = CommandCheck(self._desired_pose_port, self._command_time_port, period=period, timeout=timeout)
         self._command = self.DeclareDiscreteState(num_joints)
         self._is_stuck = self.DeclareDiscreteState(1)
-        state = {self.discrete_state_ticket(self._command)}
-        self._kinematics = self.DeclareCacheEntry(
-            "kinematics",
-            ValueProducer(
-                allocate=lambda: Value(plant.CreateDefaultContext()),
-                calc=lambda context, value: plant.SetPositions(value.get_mutable_value(), self._joint_command(context)),
-            ),
-            state,
+        self._is_holding = self.DeclareDiscreteState(1)
+        command = {self.discrete_state_ticket(self._command)}
+        self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=command)
+        self._joint_positions_port = self.DeclareStateOutputPort("joint_positions", self._command)
+        self._pose_port = self.DeclareVectorOutputPort(
+            "pose", 6, self._calc_pose, prerequisites_of_calc={self._plant_context.ticket()}
         )
-        self._joint_positions = self.DeclareStateOutputPort("joint_positions", self._command)
-        self._pose = self.DeclareVectorOutputPort("pose", 6, self._calc_pose, state)
-        self._stuck = self.DeclareStateOutputPort("stuck", self._is_stuck)
-        self.DeclareInitializationDiscreteUpdateEvent(self._start_where_the_arm_is)
+        self._stuck_port = self.DeclareStateOutputPort("stuck", self._is_stuck)
+        self._holding_port = self.DeclareStateOutputPort("holding", self._is_holding)
+        self.DeclareInitializationDiscreteUpdateEvent(self._start_at_measured_positions)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 
-    def get_desired_pose_input_port(self):
-        """Where the tool centre shall be, (6,)."""
-        return self._desired_pose
+    def get_desired_pose_input_port(self) -> InputPort:
+        """The desired pose of the tool centre, (6,)."""
+        return self._desired_pose_port
 
-    def get_positions_input_port(self):
-        """Measured joint positions, (n,)."""
-        return self._positions
+    def get_positions_input_port(self) -> InputPort:
+        """Measured joint positions, (n,) [rad]."""
+        return self._positions_port
 
-    def get_joint_positions_output_port(self):
-        """The joint command, (n,)."""
-        return self._joint_positions
+    def get_command_time_input_port(self) -> InputPort:
+        """When the desired pose was given, (1,) [s]; optional."""
+        return self._command_time_port
 
-    def get_pose_output_port(self):
+    def get_joint_positions_output_port(self) -> OutputPort:
+        """The joint command, (n,) [rad]."""
+        return self._joint_positions_port
+
+    def get_pose_output_port(self) -> OutputPort:
         """Where the joint command puts the tool centre, (6,)."""
-        return self._pose
+        return self._pose_port
 
-    def get_stuck_output_port(self):
+    def get_stuck_output_port(self) -> OutputPort:
         """1 while the desired direction can't be followed, (1,)."""
-        return self._stuck
+        return self._stuck_port
+
+    def get_holding_output_port(self) -> OutputPort:
+        """1 while the joint command is held, (1,)."""
+        return self._holding_port
+
+    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
+        self._plant.SetPositions(plant_context, self._joint_command(context))
 
     def _joint_command(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._command).value()
 
-    def _start_where_the_arm_is(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.get_mutable_value(self._command)[:] = self._positions.Eval(context)
-        discrete_state.get_mutable_value(self._is_stuck)[:] = 0.0
+    def _start_at_measured_positions(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._command, self._positions_port.Eval(context))
+        discrete_state.set_value(self._is_stuck, [0.0])
+        discrete_state.set_value(self._is_holding, [0.0])
         return EventStatus.Succeeded()
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        desired = self._desired_pose.Eval(context)
-        if not np.isfinite(desired).all():
-            return EventStatus.DidNothing()
-        plant, plant_context = self._plant, self._kinematics.Eval(context)
+        is_valid = self._check.is_valid(context, context.get_time())
+        discrete_state.set_value(self._is_holding, [float(not is_valid)])
+        if not is_valid:
+            return EventStatus.Succeeded()
+        plant, plant_context = self._plant, self._plant_context.Eval(context)
         X_TP = self._tool_centre.CalcPose(plant_context, self._target)
-        X_TPd = pose_to_transform(desired)
-        turn = (X_TPd.rotation() @ X_TP.rotation().inverse()).ToAngleAxis()
-        V = np.concatenate(
-            [
-                _limited(turn.angle() * turn.axis() / self._period, self._speed_limits.rotational),
-                _limited((X_TPd.translation() - X_TP.translation()) / self._period, self._speed_limits.translational),
-            ]
-        )
+        V = self._desired_velocity(X_TP, pose_to_transform(self._desired_pose_port.Eval(context)))
         J = plant.CalcJacobianSpatialVelocity(
             plant_context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._target, self._target
         )
         q = self._joint_command(context)
         result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
         found = DifferentialInverseKinematicsStatus.kSolutionFound
-        discrete_state.get_mutable_value(self._is_stuck)[:] = float(result.status != found)
+        discrete_state.set_value(self._is_stuck, [float(result.status != found)])
         if result.joint_velocities is not None:
             # The solver keeps limits to its own tolerance only; what is sent keeps them exactly.
             lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
             moved = np.clip(q + self._period * result.joint_velocities, lower, upper)
-            discrete_state.get_mutable_value(self._command)[:] = moved
+            discrete_state.set_value(self._command, moved)
         return EventStatus.Succeeded()
 
+    def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
+        """Of the tool centre, [rotational, translational] (6,): reaches X_TPd in one period, within the limits."""
+        turn = (X_TPd.rotation() @ X_TP.rotation().inverse()).ToAngleAxis()
+        return np.concatenate(
+            [
+                _limited(turn.angle() * turn.axis() / self._period, self._speed_limits.rotational),
+                _limited((X_TPd.translation() - X_TP.translation()) / self._period, self._speed_limits.translational),
+            ]
+        )
+
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        X_TP = self._tool_centre.CalcPose(self._kinematics.Eval(context), self._target)
+        X_TP = self._tool_centre.CalcPose(self._plant_context.Eval(context), self._target)
         output.SetFromVector(transform_to_pose(X_TP))
 
 

@@ -11,11 +11,13 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.sampling import check_period
+from guiderail.systems.support.sampling import check_period
 
 
 class ConstraintViolation(LeafSystem):
-    """Says by how much G y ≥ c is violated: max over the constraints of c − G y, negative where all are slack.
+    """Measures by how much a pose y violates linear constraints G y ≥ c.
+
+        violation = max over the constraints of c − G y, negative where all are slack
 
     .. pydrake_system::
 
@@ -26,8 +28,8 @@ class ConstraintViolation(LeafSystem):
         - violation
 
     ``pose`` (O,) is commanded or measured; ``violation`` (1,) is in the unit of c, and `UNCONSTRAINED` where there is
-    no constraint. It depends on nothing but the pose and the control step: it also judges guidance that knows of no
-    constraint, and doesn't take the word of guidance that does.
+    no constraint. It depends on the pose and the control step alone: it judges every guidance alike, whether that
+    knows of the constraints or not.
     """
 
     #: What stands for "no constraint": finite, so that it can be logged.
@@ -37,23 +39,23 @@ class ConstraintViolation(LeafSystem):
         """
         Args:
             constraints: on O outputs; where they differ from step to step, the step counts control periods.
-            period: seconds between control steps, positive.
+            period: between two control steps [s], positive.
 
         Raises:
-            ValueError: if the period is not positive.
+            InputError: if the period is not positive.
         """
         super().__init__()
         check_period(period)
         self._constraints, self._period = constraints, period
         self._pose_port = self.DeclareVectorInputPort("pose", constraints.num_outputs)
-        tickets = {self._pose_port.ticket()}
+        prerequisites = {self._pose_port.ticket()}
         self._step = None
         if constraints.num_steps is not None:
             self._step = self.DeclareDiscreteState(1)
             self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
-            tickets.add(self.discrete_state_ticket(self._step))
+            prerequisites.add(self.discrete_state_ticket(self._step))
         self._violation_port = self.DeclareVectorOutputPort(
-            "violation", 1, self._calc_violation, prerequisites_of_calc=tickets
+            "violation", 1, self._calc_violation, prerequisites_of_calc=prerequisites
         )
 
     def get_pose_input_port(self) -> InputPort:

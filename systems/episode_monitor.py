@@ -1,28 +1,38 @@
-"""When an episode ends, and as what."""
+"""Termination of episodes: when one ends, and why."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
-from guiderail.systems.caching import declare_array_cache
-from guiderail.systems.sampling import check_period
+from guiderail.models.errors import InputError
+from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.signal_ports import SignalPorts
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
-"""How an episode can end; a `termination` port carries an index into this. The empty one means: it goes on."""
+"""How an episode can end; a ``termination`` port carries an index into this. The empty one means that it goes on."""
 
 SUCCESS = TERMINATIONS.index("success")
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Something that ends an episode.
+    """A condition that terminates an episode.
 
     Args:
         termination: what the episode ends as, one of `TERMINATIONS`.
-        inputs: the signals it looks at, name to size; conditions of one monitor that name the same signal share it.
-        holds: called with those signals by name, says whether the condition holds now; a pure function.
+        inputs: the signals it depends on, name to size; conditions of one monitor that name the same signal share it.
+        holds: called with those signals by name, returns whether the condition holds; a pure function.
         steps: control steps for which it must hold before the episode ends, at least 1.
         progress: called like `holds`; where given, the steps counted are those since it last rose by `min_progress`
             above its highest value so far, whether they follow one another or not; otherwise they must be consecutive.
@@ -36,18 +46,18 @@ class Condition:
     progress: Callable[..., float] | None = None
     min_progress: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.termination not in TERMINATIONS[1:]:
-            raise ValueError(f"an episode can't end as '{self.termination}', only as one of {TERMINATIONS[1:]}")
+            raise InputError(f"an episode can't end as '{self.termination}', only as one of {TERMINATIONS[1:]}")
         if self.steps < 1:
-            raise ValueError(f"a condition must hold for at least one control step, not {self.steps}")
+            raise InputError(f"a condition must hold for at least one control step, not {self.steps}")
 
 
 class EpisodeMonitor(LeafSystem):
-    """Watches named conditions, in order of precedence, and says which one ended the episode.
+    """Evaluates named conditions, in order of precedence, and outputs which one terminated the episode.
 
-    A condition's count takes in every control step once: the output already counts the step that is just over, the
-    state takes it in at the event of that instant. Once a condition ended the episode, the output stays what it is.
+    A condition counts every control step once: the output already counts the step that is just over, the state at the
+    event of that instant. Once a condition terminated the episode, the output is constant.
 
     .. pydrake_system::
 
@@ -64,32 +74,30 @@ class EpisodeMonitor(LeafSystem):
         """
         Args:
             conditions: where two hold in the same step, the first one counts.
-            period: seconds between control steps, positive.
+            period: between two control steps [s], positive.
 
         Raises:
-            ValueError: if there is no condition, the period is not positive, or two conditions disagree about the
+            InputError: if there is no condition, the period is not positive, or two conditions disagree about the
                 size of a signal.
         """
         super().__init__()
         if not conditions:
-            raise ValueError("a monitor needs at least one condition")
+            raise InputError("a monitor needs at least one condition")
         check_period(period)
         self._conditions = tuple(conditions)
         self._indices = [TERMINATIONS.index(condition.termination) for condition in conditions]
-        sizes: dict[str, int] = {}
-        for condition in conditions:
-            for name, size in condition.inputs.items():
-                if sizes.setdefault(name, size) != size:
-                    raise ValueError(f"signal '{name}' can't be of size {sizes[name]} and {size}")
-        self._signals = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
+        self._signals = SignalPorts(self, *(condition.inputs for condition in conditions))
 
         # Per condition the count and the best progress, then the termination, once there is one.
-        self._fresh = np.append(np.tile([0.0, -np.inf], len(self._conditions)), 0.0)
-        self._state = self.DeclareDiscreteState(self._fresh)
-        tickets = {self.discrete_state_ticket(self._state)}
-        tickets |= {port.ticket() for port in self._signals.values()}
+        self._initial_state = np.append(np.tile([0.0, -np.inf], len(self._conditions)), 0.0)
+        self._state = self.DeclareDiscreteState(self._initial_state)
         # One evaluation a step serves both the output and, at the same instant, the event.
-        self._next = declare_array_cache(self, "next_state", self._calc_next, tickets)
+        self._next = declare_cache(
+            self,
+            "next_state",
+            self._calc_next,
+            prerequisites_of_calc=self._signals.tickets | {self.discrete_state_ticket(self._state)},
+        )
         self._termination_port = self.DeclareVectorOutputPort(
             "termination", 1, self._calc_termination, prerequisites_of_calc={self._next.ticket()}
         )
@@ -97,15 +105,19 @@ class EpisodeMonitor(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_signal_input_port(self, name: str) -> InputPort:
-        """The signal of this name, of the size its conditions gave it."""
-        return self._signals[name]
+        """The signal of this name, of the size that its conditions gave it.
+
+        Raises:
+            InputError: if no condition depends on such a signal.
+        """
+        return self._signals.port(name)
 
     def get_termination_output_port(self) -> OutputPort:
-        """Why the episode ended, (1,), an index into `TERMINATIONS`; 0 while it goes on."""
+        """Why the episode ended, (1,): an index into `TERMINATIONS`, 0 while it goes on."""
         return self._termination_port
 
     def _calc_next(self, context: Context) -> np.ndarray:
-        signals = {name: port.Eval(context) for name, port in self._signals.items()}
+        signals = self._signals.eval(context)
         state = context.get_discrete_state(self._state).value().copy()
         for i, condition in enumerate(self._conditions):
             own = {name: signals[name] for name in condition.inputs}
@@ -121,11 +133,11 @@ class EpisodeMonitor(LeafSystem):
                 state[-1] = self._indices[i]
         return state
 
-    def _calc_termination(self, context: Context, output) -> None:
+    def _calc_termination(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._next.Eval(context)[-1])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._fresh)
+        discrete_state.set_value(self._initial_state)
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:

@@ -3,15 +3,18 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
-from guiderail.systems.sampling import check_period
+from guiderail.models.errors import InputError
+from guiderail.systems.support.sampling import check_period
 
 
 class HistoryBuffer(LeafSystem):
-    """Remembers the last P outputs, so that sKGRL can pass through where it has been.
+    """Stores the last P outputs, which the movement primitive of sKGRL passes through.
+
+        history = [y_{t−P} … y_{t−1}]    (T_p of equation 5.3)
 
     At every control step the newest output enters and the oldest leaves. At initialization the history is filled with
-    ``initial_output`` where that is connected (the measured pose, for a commanded history), else with ``output``: the
-    robot has, as far as the primitive knows, always been where it starts.
+    ``initial_output`` where that is connected (the measured pose, for a commanded history), else with ``output``: as if
+    the robot had always been where it starts.
 
     .. pydrake_system::
 
@@ -23,23 +26,22 @@ class HistoryBuffer(LeafSystem):
         - history
 
     ``output`` and ``initial_output`` are (O,), ``history`` is (P*O,), row-major, oldest first, in the units of
-    ``output``. ``history`` is state: it never depends on ``output`` within a step, which is what lets the primitive
-    close a loop around it.
+    ``output``. ``history`` is state and never feeds through, so that the primitive can close a loop around it.
     """
 
     def __init__(self, num_outputs: int, length: int, period: float):
         """
         Args:
             num_outputs: O, at least 1.
-            length: P, how many outputs are kept, at least 1.
-            period: seconds between control steps, positive.
+            length: P, at least 1.
+            period: between two control steps [s], positive.
 
         Raises:
-            ValueError: if an argument is out of range.
+            InputError: if an argument is out of range.
         """
         super().__init__()
         if num_outputs < 1 or length < 1:
-            raise ValueError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
+            raise InputError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
         check_period(period)
         self._shape = (length, num_outputs)
 
@@ -51,7 +53,7 @@ class HistoryBuffer(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._shift)
 
     def get_output_input_port(self) -> InputPort:
-        """The output to remember, (O,)."""
+        """The output to store, (O,)."""
         return self._output_port
 
     def get_initial_output_input_port(self) -> InputPort:
@@ -59,7 +61,7 @@ class HistoryBuffer(LeafSystem):
         return self._initial_output_port
 
     def get_history_output_port(self) -> OutputPort:
-        """The remembered outputs, (P*O,), oldest first."""
+        """The last P outputs, (P*O,), oldest first."""
         return self._history_port
 
     def _fill(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:

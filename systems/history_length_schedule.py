@@ -1,4 +1,4 @@
-"""How much of its past a movement primitive follows: less in contact, more in free space (thesis, section 5.5)."""
+"""The history length of sKGRL by contact: short in contact, long in free space (thesis, section 5.5)."""
 
 from collections.abc import Sequence
 
@@ -14,14 +14,15 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.errors import InputError
+from guiderail.systems.support.sampling import check_period
 
 
 class HistoryLengthSchedule(LeafSystem):
-    """Shortens the history of sKGRL while the robot touches something, and lengthens it again when it is free.
+    """Shortens the history of sKGRL while the robot is in contact, and lengthens it again in free space.
 
-    Lengths are tried one after the other, never skipped: one shorter at every control step in contact, one longer after
-    every `patience` control steps in free space. Contact begins where the measured force exceeds `touch` and ends where
-    it falls below `release`; in between it stays what it was, so that noise about a threshold changes nothing.
+    Lengths change one by one: to the next shorter at every control step in contact, to the next longer after every
+    `dwell_steps` control steps in free space. Contact is detected with hysteresis: it begins where the measured force
+    exceeds `contact_threshold` and ends where it falls to `release_threshold`.
 
     .. pydrake_system::
 
@@ -32,7 +33,7 @@ class HistoryLengthSchedule(LeafSystem):
         - history_length
 
     ``wrench`` (W,) is measured, its first three numbers a force [N] (both, where there are only two).
-    ``history_length`` (1,) is P; it is state, and begins with the longest.
+    ``history_length`` (1,) is P; it is state, and initially the longest.
     """
 
     def __init__(
@@ -40,18 +41,19 @@ class HistoryLengthSchedule(LeafSystem):
         lengths: Sequence[int],
         period: float,
         *,
-        touch: float = 2.0,
-        release: float = 1.0,
-        patience: int = 10,
+        contact_threshold: float = 2.0,
+        release_threshold: float = 1.0,
+        dwell_steps: int = 10,
         wrench_size: int = 6,
     ):
         """
         Args:
-            lengths: the lengths there are, in any order, each at least 1: with no history at all a command would not
-                begin where the last one ended.
-            period: seconds between control steps, positive.
-            touch, release: N, 0 ≤ release ≤ touch.
-            patience: control steps in free space until the history grows by one length, at least 1.
+            lengths: to choose from, in any order, each at least 1: without any history a command would not begin where
+                the last one ended.
+            period: between two control steps [s], positive.
+            contact_threshold: force above which contact begins [N].
+            release_threshold: force at which it ends [N], from 0 to `contact_threshold`.
+            dwell_steps: control steps in free space before the history gets one length longer, at least 1.
             wrench_size: W, at least 1.
 
         Raises:
@@ -60,20 +62,25 @@ class HistoryLengthSchedule(LeafSystem):
         super().__init__()
         if not len(lengths) or min(lengths) < 1:
             raise InputError(f"history lengths are whole numbers from 1, at least one of them, not {list(lengths)}")
-        if not 0.0 <= release <= touch:
-            raise InputError(f"contact must end below the force where it begins: 0 <= {release} <= {touch} is not so")
-        if patience < 1 or wrench_size < 1 or not period > 0:
+        if not 0.0 <= release_threshold <= contact_threshold:
             raise InputError(
-                f"patience, wrench size and period must be at least 1, 1 and more than 0, "
-                f"not {patience}, {wrench_size} and {period}"
+                f"contact must end at a force from 0 to the one where it begins, {contact_threshold} N, "
+                f"not at {release_threshold} N"
             )
+        if dwell_steps < 1 or wrench_size < 1:
+            raise InputError(f"dwell steps and wrench size must be at least 1, not {dwell_steps} and {wrench_size}")
+        check_period(period)
         self._lengths = sorted({int(length) for length in lengths}, reverse=True)
-        self._touch, self._release, self._patience = touch, release, patience
+        self._contact_threshold, self._release_threshold = contact_threshold, release_threshold
+        self._dwell_steps = dwell_steps
         self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
         # [index into the lengths, longest first; 1 in contact; control steps since the last change in free space]
         self._state = self.DeclareDiscreteState(3)
-        self._length_port = self.DeclareVectorOutputPort(
-            "history_length", 1, self._calc_length, {self.discrete_state_ticket(self._state)}
+        self._history_length_port = self.DeclareVectorOutputPort(
+            "history_length",
+            1,
+            self._calc_history_length,
+            prerequisites_of_calc={self.discrete_state_ticket(self._state)},
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
@@ -82,21 +89,21 @@ class HistoryLengthSchedule(LeafSystem):
         return self._wrench_port
 
     def get_history_length_output_port(self) -> OutputPort:
-        """P, (1,)."""
-        return self._length_port
+        """The history length P, (1,)."""
+        return self._history_length_port
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        index, touching, waited = context.get_discrete_state(self._state).value()
+        index, in_contact, waited = context.get_discrete_state(self._state).value()
         force = float(np.linalg.norm(self._wrench_port.Eval(context)[:3]))
-        touching = force > (self._release if touching else self._touch)
-        if touching:
+        in_contact = force > (self._release_threshold if in_contact else self._contact_threshold)
+        if in_contact:
             index, waited = min(index + 1, len(self._lengths) - 1), 0
         else:
             waited += 1
-            if waited >= self._patience:
+            if waited >= self._dwell_steps:
                 index, waited = max(index - 1, 0), 0
-        discrete_state.set_value(self._state, [index, touching, waited])
+        discrete_state.set_value(self._state, [index, in_contact, waited])
         return EventStatus.Succeeded()
 
-    def _calc_length(self, context: Context, output: BasicVector) -> None:
+    def _calc_history_length(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._lengths[int(context.get_discrete_state(self._state).value()[0])])

@@ -1,18 +1,18 @@
-"""What an impedance's wrench says about contact and about the controller's limits."""
-
-from __future__ import annotations
+"""Contact force and saturation of an impedance controller, from its wrench."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.errors import InputError
 
 
 class ImpedanceMonitor(LeafSystem):
-    """The contact force that an impedance stands for, and whether it is at a limit.
+    """Estimates the contact force from the wrench of an impedance, and detects its saturation.
 
-    At rest the impedance's force is the contact force, K(x_d − x) = f. In a collision it is the better measure of the
-    two: an impact's instantaneous force depends on a simulation's step, the impedance's does not.
+        contact_force = ‖f‖,  at rest f = K (x_d − x)
+
+    In a collision it is a better measure than the contact force itself: an impact's instantaneous force depends on a
+    simulation's step, the impedance's does not.
 
     .. pydrake_system::
 
@@ -23,8 +23,8 @@ class ImpedanceMonitor(LeafSystem):
         - contact_force
         - saturation
 
-    `impedance_wrench` is (6,), force [N] first, then torque [Nm]. `contact_force` is (1,) [N], the norm of its force.
-    `saturation` is (1,): 1 if any of the six is within 0.1 % of its limit, otherwise 0.
+    ``impedance_wrench`` is (6,), force [N] first, then torque [Nm]. ``contact_force`` is (1,) [N], the norm of its
+    force. ``saturation`` is (1,): 1 if any of the six is within 0.1 % of its limit, otherwise 0.
     """
 
     def __init__(self, limits: np.ndarray):
@@ -39,25 +39,29 @@ class ImpedanceMonitor(LeafSystem):
         self._limits = np.array(limits, dtype=float)
         if self._limits.shape != (6,) or not (self._limits > 0.0).all():
             raise InputError(f"an impedance monitor needs six positive limits, not {limits}")
-        self._wrench = self.DeclareVectorInputPort("impedance_wrench", 6)
-        prerequisites = {self._wrench.ticket()}
-        self._contact_force = self.DeclareVectorOutputPort("contact_force", 1, self._calc_contact_force, prerequisites)
-        self._saturation = self.DeclareVectorOutputPort("saturation", 1, self._calc_saturation, prerequisites)
+        self._impedance_wrench_port = self.DeclareVectorInputPort("impedance_wrench", 6)
+        wrench = {self._impedance_wrench_port.ticket()}
+        self._contact_force_port = self.DeclareVectorOutputPort(
+            "contact_force", 1, self._calc_contact_force, prerequisites_of_calc=wrench
+        )
+        self._saturation_port = self.DeclareVectorOutputPort(
+            "saturation", 1, self._calc_saturation, prerequisites_of_calc=wrench
+        )
 
-    def get_impedance_wrench_input_port(self):
+    def get_impedance_wrench_input_port(self) -> InputPort:
         """The wrench that the impedance applies, (6,)."""
-        return self._wrench
+        return self._impedance_wrench_port
 
-    def get_contact_force_output_port(self):
+    def get_contact_force_output_port(self) -> OutputPort:
         """The norm of the impedance's force, (1,) [N]."""
-        return self._contact_force
+        return self._contact_force_port
 
-    def get_saturation_output_port(self):
-        """1 at a limit, otherwise 0, (1,)."""
-        return self._saturation
+    def get_saturation_output_port(self) -> OutputPort:
+        """1 while any component is at its limit, otherwise 0, (1,)."""
+        return self._saturation_port
 
     def _calc_contact_force(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(np.linalg.norm(self._wrench.Eval(context)[:3])))
+        output.SetAtIndex(0, float(np.linalg.norm(self._impedance_wrench_port.Eval(context)[:3])))
 
     def _calc_saturation(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float((np.abs(self._wrench.Eval(context)) >= 0.999 * self._limits).any()))
+        output.SetAtIndex(0, float((np.abs(self._impedance_wrench_port.Eval(context)) >= 0.999 * self._limits).any()))

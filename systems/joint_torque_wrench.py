@@ -1,22 +1,22 @@
-"""The wrench on a tool from what an arm's joints feel, for an arm without a wrist sensor."""
-
-from __future__ import annotations
+"""The wrench on a tool, estimated from an arm's external joint torques: for an arm without a wrist sensor."""
 
 import numpy as np
-from pydrake.common.value import Value
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem, ValueProducer
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.errors import InputError
+from guiderail.systems.support.caching import declare_plant_context
+from guiderail.systems.support.sampling import check_period
 
 
 class JointTorqueWrench(LeafSystem):
-    """The wrench of the surroundings on a tool, F = (Jᵀ)⁺ τ_external, low-pass filtered.
+    """Estimates the wrench of the environment on a tool from external joint torques, low-pass filtered.
 
-    τ_external is what is left of the measured joint torques when the arm's own weight and inertia are taken out; an
-    iiwa computes it itself. The pseudoinverse is damped: near a singular posture the estimate fades instead of
-    exploding. The filter is y' = (u − y)/τ, sampled at `period`.
+        F = (Jᵀ)⁺ τ_external,  τ y' = F − y
+
+    τ_external are the measured joint torques less those of the arm's own weight and inertia; an iiwa computes them
+    itself. The pseudoinverse is damped: near a singular posture the estimate goes to zero instead of diverging.
 
     .. pydrake_system::
 
@@ -27,8 +27,8 @@ class JointTorqueWrench(LeafSystem):
         output_ports:
         - wrench
 
-    `positions` and `external_torque` are (n,). `wrench` is (6,), at the tool centre P in the axes of T, [fx fy fz tx ty
-    tz] in N and Nm. It is state: one sample old, zero after a reset, and never feeds through.
+    ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool centre P in the axes of
+    T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, and never feeds through.
     """
 
     def __init__(
@@ -47,49 +47,46 @@ class JointTorqueWrench(LeafSystem):
             target: T, in whose axes the wrench is reported.
             tool_centre: P.
             period: of the sampling [s], positive.
-            time_constant: τ of the filter [s]; 0 does not filter.
+            time_constant: τ of the filter [s]; 0 disables it.
             damping: of the pseudoinverse, not negative.
 
         Raises:
             InputError: if an argument is out of range.
         """
         super().__init__()
-        if not period > 0.0 or not 0.0 <= time_constant < np.inf or not damping >= 0.0:
-            raise InputError("a wrench estimate's period must be positive, its time constant and damping not negative")
+        check_period(period)
+        if not 0.0 <= time_constant < np.inf or not damping >= 0.0:
+            raise InputError("a wrench estimate's time constant and damping must not be negative")
         num_joints = plant.num_positions()
         self._plant, self._target, self._tool_centre, self._damping = plant, target, tool_centre, damping
-        self._kept = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
-        self._positions = self.DeclareVectorInputPort("positions", num_joints)
-        self._torque = self.DeclareVectorInputPort("external_torque", num_joints)
+        self._decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
+        self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
+        self._external_torque_port = self.DeclareVectorInputPort("external_torque", num_joints)
         self._state = self.DeclareDiscreteState(6)
-        self._wrench = self.DeclareStateOutputPort("wrench", self._state)
-        self._kinematics = self.DeclareCacheEntry(
-            "kinematics",
-            ValueProducer(
-                allocate=lambda: Value(plant.CreateDefaultContext()),
-                calc=lambda context, value: plant.SetPositions(
-                    value.get_mutable_value(), self._positions.Eval(context)
-                ),
-            ),
-            {self._positions.ticket()},
+        self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
+        self._plant_context = declare_plant_context(
+            self, plant, self._set_plant_state, prerequisites_of_calc={self._positions_port.ticket()}
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
-    def get_positions_input_port(self):
-        """Joint positions, (n,)."""
-        return self._positions
+    def get_positions_input_port(self) -> InputPort:
+        """Measured joint positions, (n,) [rad]."""
+        return self._positions_port
 
-    def get_external_torque_input_port(self):
-        """Joint torques that the surroundings cause, (n,) [Nm]."""
-        return self._torque
+    def get_external_torque_input_port(self) -> InputPort:
+        """Joint torques that the environment causes, (n,) [Nm]."""
+        return self._external_torque_port
 
-    def get_wrench_output_port(self):
-        """The filtered wrench of the surroundings on the tool, (6,), force first."""
-        return self._wrench
+    def get_wrench_output_port(self) -> OutputPort:
+        """The filtered wrench of the environment on the tool, (6,), force first."""
+        return self._wrench_port
+
+    def _set_plant_state(self, context: Context, plant_context: Context) -> None:
+        self._plant.SetPositions(plant_context, self._positions_port.Eval(context))
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         J = self._plant.CalcJacobianSpatialVelocity(
-            self._kinematics.Eval(context),
+            self._plant_context.Eval(context),
             JacobianWrtVariable.kV,
             self._tool_centre,
             np.zeros(3),
@@ -97,8 +94,8 @@ class JointTorqueWrench(LeafSystem):
             self._target,
         )
         # [torque, force], as the Jacobian's rows are [rotational, translational]
-        F = np.linalg.solve(J @ J.T + self._damping * np.eye(6), J @ self._torque.Eval(context))
+        F = np.linalg.solve(J @ J.T + self._damping * np.eye(6), J @ self._external_torque_port.Eval(context))
         newest = np.concatenate([F[3:], F[:3]])
         last = context.get_discrete_state(self._state).value()
-        discrete_state.set_value(newest + self._kept * (last - newest))
+        discrete_state.set_value(newest + self._decay * (last - newest))
         return EventStatus.Succeeded()

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.common.value import Value
 from pydrake.systems.framework import (
     BasicVector,
     Context,
@@ -13,11 +12,12 @@ from pydrake.systems.framework import (
     InputPort,
     LeafSystem,
     OutputPort,
-    ValueProducer,
 )
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import LcNsKmp, UnsolvableError
+from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.sampling import check_period
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,33 +28,35 @@ class _Command:
 
 
 class LcNsKmpSystem(LeafSystem):
-    """Commands the output of an `LcNsKmp` at every control step: KGRL without a history, sKGRL with one.
+    """Predicts the command of a linearly constrained null-space primitive (`LcNsKmp`) at every control step.
+
+        output = LC-NS-KMP(step, gain · null_space_action)             KGRL, equation 4.21
+        output = LC-NS-KMP(step, gain · null_space_action, history)    sKGRL, equation 5.1
 
     .. pydrake_system::
 
         name: LcNsKmpSystem
         input_ports:
         - null_space_action
-        - history
-        - history_length
+        - history (where P > 0)
+        - history_length (where there are primitives with shorter histories)
         output_ports:
         - output
         - constraint_violation
         - fallback
 
-    ``null_space_action`` (O,) is the policy's, in [−1, 1] per output, held for a control step; ``history`` (P*O,) is
-    row-major, oldest output first (`HistoryBuffer`), and there is no such port where P = 0. ``history_length`` (1,) is
-    there only where there are primitives with shorter histories: which of them speaks (`HistoryLengthSchedule`). Each
-    is given the newest part of the one history, so that whichever speaks begins where the last command ended.
-    ``output`` (O,) is what to command. ``constraint_violation`` (1,) is max(c − G y) of that command: negative is
-    slack, −1e30 where there is no constraint. ``fallback`` (1,) is 1 where no window within the constraints was found
-    and the last safe command is repeated.
+    ``null_space_action`` (O,) is the policy's, in [−1, 1] per output, held for a control step. ``history`` (P*O,) is
+    row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the length of its
+    history (`HistoryLengthSchedule`); each is given the newest part of ``history``, so that whichever is selected
+    begins where the last command ended. ``output`` (O,) is the command. ``constraint_violation`` (1,) is max(c − G y)
+    of that command: negative is slack, `UNCONSTRAINED` where there is no constraint. ``fallback`` (1,) is 1 where no
+    window within the constraints was found and the last safe command is repeated.
 
     The step is state and counts control periods since time zero; the output is a pure function of step, action and
     history, evaluated once a control step (see CONTRIBUTING.md, "Rates and the order of events").
     """
 
-    #: What `constraint_violation` says where there is no constraint: finite, so that it can be logged and reduced.
+    #: ``constraint_violation`` where there is no constraint: finite, so that it can be logged and reduced.
     UNCONSTRAINED = -1e30
 
     def __init__(
@@ -67,9 +69,9 @@ class LcNsKmpSystem(LeafSystem):
         """
         Args:
             primitive: O outputs, P past outputs.
-            gain: (O,), what an action of one is worth in raw null-space units (`models.primitives.gains`); ones unless
+            gain: (O,), raw null-space action per unit of the policy's action (`models.primitives.gains`); ones unless
                 given.
-            period: seconds between control steps, positive: the reference's own clock.
+            period: between two control steps [s], positive: that of the reference trajectory.
             shorter: primitives of the same motion and constraints with histories of 1 … P − 1 outputs, and their gains.
 
         Raises:
@@ -80,36 +82,40 @@ class LcNsKmpSystem(LeafSystem):
         outputs = primitive.num_outputs
         if any(not 0 < other.history < primitive.history for other, _ in shorter):
             raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
-        self._voices = {
-            voice.history: (voice, _checked_gain(one, outputs)) for voice, one in [(primitive, gain), *shorter]
-        }
-        if not period > 0:
-            raise InputError(f"the control period must be positive, not {period} s")
+        check_period(period)
         self._primitive, self._period = primitive, period
+        self._by_history_length = {
+            other.history: (other, _checked_gain(its_gain, outputs))
+            for other, its_gain in [(primitive, gain), *shorter]
+        }
 
-        self._action_port = self.DeclareVectorInputPort("null_space_action", outputs)
+        self._null_space_action_port = self.DeclareVectorInputPort("null_space_action", outputs)
         self._history_port = (
             self.DeclareVectorInputPort("history", primitive.history * outputs) if primitive.history else None
         )
-        self._length_port = self.DeclareVectorInputPort("history_length", 1) if shorter else None
+        self._history_length_port = self.DeclareVectorInputPort("history_length", 1) if shorter else None
         self._step = self.DeclareDiscreteState(1)
         start = primitive.constraints.nearest(primitive.reference.means[0])
         self._last_safe = self.DeclareDiscreteState(start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
 
-        sources = {
-            self._action_port.ticket(),
+        prerequisites = {
+            self._null_space_action_port.ticket(),
             self.discrete_state_ticket(self._step),
             self.discrete_state_ticket(self._last_safe),
         }
-        sources |= {port.ticket() for port in (self._history_port, self._length_port) if port is not None}
-        self._command = self.DeclareCacheEntry(
-            "command", ValueProducer(allocate=Value[object], calc=self._calc_command), sources
+        prerequisites |= {port.ticket() for port in (self._history_port, self._history_length_port) if port is not None}
+        self._command = declare_cache(self, "command", self._calc_command, prerequisites_of_calc=prerequisites)
+        command = {self._command.ticket()}
+        self._output_port = self.DeclareVectorOutputPort(
+            "output", outputs, self._calc_output, prerequisites_of_calc=command
         )
-        ticket = {self._command.ticket()}
-        self._output_port = self.DeclareVectorOutputPort("output", outputs, self._calc_output, ticket)
-        self._violation_port = self.DeclareVectorOutputPort("constraint_violation", 1, self._calc_violation, ticket)
-        self._fallback_port = self.DeclareVectorOutputPort("fallback", 1, self._calc_fallback, ticket)
+        self._constraint_violation_port = self.DeclareVectorOutputPort(
+            "constraint_violation", 1, self._calc_constraint_violation, prerequisites_of_calc=command
+        )
+        self._fallback_port = self.DeclareVectorOutputPort(
+            "fallback", 1, self._calc_fallback, prerequisites_of_calc=command
+        )
 
     @property
     def primitive(self) -> LcNsKmp:
@@ -118,12 +124,12 @@ class LcNsKmpSystem(LeafSystem):
 
     @property
     def gain(self) -> np.ndarray:
-        """What an action of one is worth to it in raw null-space units, (O,)."""
-        return self._voices[self._primitive.history][1].copy()
+        """Its raw null-space action per unit of the policy's action, (O,)."""
+        return self._by_history_length[self._primitive.history][1].copy()
 
     def get_null_space_action_input_port(self) -> InputPort:
         """The policy's action in [−1, 1], (O,)."""
-        return self._action_port
+        return self._null_space_action_port
 
     def get_history_input_port(self) -> InputPort:
         """The last outputs (P*O,), oldest first.
@@ -136,22 +142,22 @@ class LcNsKmpSystem(LeafSystem):
         return self._history_port
 
     def get_history_length_input_port(self) -> InputPort:
-        """Which of the histories is used, (1,).
+        """The length of the history that is used, (1,).
 
         Raises:
             InputError: if there is only one.
         """
-        if self._length_port is None:
+        if self._history_length_port is None:
             raise InputError("this system has one primitive, hence no such port: give it shorter ones")
-        return self._length_port
+        return self._history_length_port
 
     def get_output_output_port(self) -> OutputPort:
-        """What to command, (O,)."""
+        """The command, (O,)."""
         return self._output_port
 
     def get_constraint_violation_output_port(self) -> OutputPort:
         """max(c − G y) of the command, (1,)."""
-        return self._violation_port
+        return self._constraint_violation_port
 
     def get_fallback_output_port(self) -> OutputPort:
         """1 where the last safe command is repeated, (1,)."""
@@ -165,11 +171,13 @@ class LcNsKmpSystem(LeafSystem):
         discrete_state.set_value(self._step, [step])
         return EventStatus.Succeeded()
 
-    def _calc_command(self, context: Context, value: Value) -> None:
+    def _calc_command(self, context: Context) -> _Command:
         step = int(context.get_discrete_state(self._step).value()[0])
-        length = self._primitive.history if self._length_port is None else int(self._length_port.Eval(context)[0])
-        primitive, gain = self._voices[length]
-        action = gain * self._action_port.Eval(context)
+        length = self._primitive.history
+        if self._history_length_port is not None:
+            length = int(self._history_length_port.Eval(context)[0])
+        primitive, gain = self._by_history_length[length]
+        action = gain * self._null_space_action_port.Eval(context)
         history = None
         if self._history_port is not None:
             history = self._history_port.Eval(context).reshape(-1, primitive.num_outputs)[-length:]
@@ -177,12 +185,12 @@ class LcNsKmpSystem(LeafSystem):
             output, fallback = primitive.predict(step, action, history).output, 0.0
         except UnsolvableError:
             output, fallback = np.array(context.get_discrete_state(self._last_safe).value()), 1.0
-        value.set_value(_Command(step, output, fallback))
+        return _Command(step, output, fallback)
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._command.Eval(context).output)
 
-    def _calc_violation(self, context: Context, output: BasicVector) -> None:
+    def _calc_constraint_violation(self, context: Context, output: BasicVector) -> None:
         command = self._command.Eval(context)
         violation = self._primitive.constraints.violation(command.output, command.step)
         output.SetAtIndex(0, max(violation, self.UNCONSTRAINED))

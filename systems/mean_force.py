@@ -1,16 +1,19 @@
-"""Contact forces as a control step sees them."""
+"""Contact forces, averaged over a control step."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.systems.sampling import declare_sample
+from guiderail.models.errors import InputError
+from guiderail.systems.support.sampling import declare_sample
 
 
 class MeanForce(LeafSystem):
-    """The force averaged over the control step that is just over, from the running sum of the plant's forces.
+    """Averages a force over the control step that is just over, from the running sum of the plant's forces.
 
-    A plant takes many steps within one control step. What it says at the end of them misses a touch that is already
-    over, and when things collide depends on the size of the plant's step; the mean does neither.
+        force = (force_sum − force_sum at the last control step) / substeps
+
+    A plant takes many steps within one control step. Its force at the end of the last of them misses a contact that is
+    already over, and during an impact depends on the size of the plant's step; the mean does neither.
 
     .. pydrake_system::
 
@@ -21,8 +24,8 @@ class MeanForce(LeafSystem):
         - force
         - magnitude
 
-    ``force_sum`` (D,) is the sum over all plant steps so far, N; ``force`` (D,) the mean over the plant steps since the
-    last control step, N, and ``magnitude`` (1,) its norm.
+    ``force_sum`` (D,) is the sum over all plant steps so far [N]; ``force`` (D,) the mean over the plant steps since
+    the last control step [N], and ``magnitude`` (1,) its norm.
     """
 
     def __init__(self, size: int, substeps: int, period: float):
@@ -30,35 +33,39 @@ class MeanForce(LeafSystem):
         Args:
             size: D, at least 1.
             substeps: plant steps in a control step, at least 1.
-            period: seconds between control steps, positive.
+            period: between two control steps [s], positive.
 
         Raises:
-            ValueError: if an argument is out of range.
+            InputError: if an argument is out of range.
         """
         super().__init__()
         if size < 1 or substeps < 1:
-            raise ValueError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
+            raise InputError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
         self._scale = 1.0 / substeps
-        self._sum_port = self.DeclareVectorInputPort("force_sum", size)
-        self._last = declare_sample(self, self._sum_port, period)
-        tickets = {self._sum_port.ticket(), self.discrete_state_ticket(self._last)}
-        self._force_port = self.DeclareVectorOutputPort("force", size, self._calc_force, tickets)
-        self._magnitude_port = self.DeclareVectorOutputPort("magnitude", 1, self._calc_magnitude, tickets)
+        self._force_sum_port = self.DeclareVectorInputPort("force_sum", size)
+        self._last = declare_sample(self, self._force_sum_port, period)
+        prerequisites = {self._force_sum_port.ticket(), self.discrete_state_ticket(self._last)}
+        self._force_port = self.DeclareVectorOutputPort(
+            "force", size, self._calc_force, prerequisites_of_calc=prerequisites
+        )
+        self._magnitude_port = self.DeclareVectorOutputPort(
+            "magnitude", 1, self._calc_magnitude, prerequisites_of_calc=prerequisites
+        )
 
     def get_force_sum_input_port(self) -> InputPort:
-        """The sum of all plant steps' forces, (D,), N."""
-        return self._sum_port
+        """The sum of the forces of all plant steps so far, (D,) [N]."""
+        return self._force_sum_port
 
     def get_force_output_port(self) -> OutputPort:
-        """The mean force of the control step, (D,), N."""
+        """The mean force of the control step, (D,) [N]."""
         return self._force_port
 
     def get_magnitude_output_port(self) -> OutputPort:
-        """The norm of the mean force, (1,), N."""
+        """The norm of the mean force, (1,) [N]."""
         return self._magnitude_port
 
     def _mean(self, context: Context) -> np.ndarray:
-        return (self._sum_port.Eval(context) - context.get_discrete_state(self._last).value()) * self._scale
+        return (self._force_sum_port.Eval(context) - context.get_discrete_state(self._last).value()) * self._scale
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._mean(context))

@@ -1,4 +1,4 @@
-"""Where a body of a plant is, in the coordinates of a station's poses."""
+"""The measured pose of a body, in the coordinates of a station's poses."""
 
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -9,7 +9,9 @@ from guiderail.models.pose_coordinates import transform_to_pose
 
 
 class MeasuredPose(LeafSystem):
-    """The pose X_TP of a body's frame P in a frame T that is fixed in the world.
+    """Measures the pose of a body P in a frame T that is fixed in the world.
+
+        X_TP = X_TW X_WP
 
     .. pydrake_system::
 
@@ -27,23 +29,25 @@ class MeasuredPose(LeafSystem):
         Args:
             plant: finalized.
             body: whose pose is measured.
-            X_WT: the frame it is measured in.
+            X_WT: the frame that it is measured in.
         """
         super().__init__()
         self._body = int(body.index())
         self._X_TW = X_WT.inverse()
-        self._poses_port = self.DeclareAbstractInputPort("body_poses", plant.get_body_poses_output_port().Allocate())
+        self._body_poses_port = self.DeclareAbstractInputPort(
+            "body_poses", plant.get_body_poses_output_port().Allocate()
+        )
         self._pose_port = self.DeclareVectorOutputPort(
-            "pose", 6, self._calc_pose, prerequisites_of_calc={self._poses_port.ticket()}
+            "pose", 6, self._calc_pose, prerequisites_of_calc={self._body_poses_port.ticket()}
         )
 
     def get_body_poses_input_port(self) -> InputPort:
         """The plant's body poses."""
-        return self._poses_port
+        return self._body_poses_port
 
     def get_pose_output_port(self) -> OutputPort:
         """X_TP, (6,)."""
         return self._pose_port
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(transform_to_pose(self._X_TW @ self._poses_port.Eval(context)[self._body]))
+        output.SetFromVector(transform_to_pose(self._X_TW @ self._body_poses_port.Eval(context)[self._body]))

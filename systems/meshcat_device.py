@@ -1,4 +1,4 @@
-"""A person's inputs from the browser view: a gamepad where there is one, sliders and keys everywhere."""
+"""Teleoperation from Meshcat: by a gamepad where there is one, by sliders and keys everywhere."""
 
 from collections.abc import Sequence
 
@@ -6,14 +6,15 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem, OutputPort
 
-from guiderail.systems.sampling import check_period
+from guiderail.models.errors import InputError
+from guiderail.systems.support.sampling import check_period
 
 DEAD_ZONE = 0.1
-"""A stick that nobody touches is rarely at zero."""
+"""Of a gamepad's axes: a stick that is released is rarely at zero."""
 
 
 class MeshcatDevice(LeafSystem):
-    """What a person asks for, in the place of what a policy asks for.
+    """Samples a person's inputs, to take the place of a policy's actions.
 
     .. pydrake_system::
 
@@ -21,8 +22,8 @@ class MeshcatDevice(LeafSystem):
         output_ports:
         - action
 
-    ``action`` is (n,), in [−1, 1], sampled at the control period. An input follows its axis of the gamepad while that
-    is out of its dead zone, and its slider otherwise; each slider has two keys.
+    ``action`` is (n,), in [−1, 1], sampled at the control period. An input is its gamepad axis while that is out of its
+    dead zone, and its slider otherwise; each slider has two keys.
     """
 
     def __init__(
@@ -30,33 +31,33 @@ class MeshcatDevice(LeafSystem):
     ):
         """
         Args:
-            meshcat: the browser view.
+            meshcat: that shows the sliders and reads the gamepad.
             axes: for each input the number of the gamepad's axis and its sign.
-            keys: for each input the keys that lower and raise its slider, in JavaScript's names.
-            period: seconds between two looks, positive.
+            keys: for each input the keys that lower and raise its slider, by JavaScript's codes.
+            period: between two samples [s], positive.
 
         Raises:
-            ValueError: if the period is not positive, or axes and keys are not as many.
+            InputError: if the period is not positive, or there are not as many axes as pairs of keys.
         """
         super().__init__()
         check_period(period)
         if len(axes) != len(keys) or not axes:
-            raise ValueError(f"a device needs as many axes as pairs of keys, not {len(axes)} and {len(keys)}")
+            raise InputError(f"a device needs as many axes as pairs of keys, not {len(axes)} and {len(keys)}")
         self._meshcat, self._axes = meshcat, tuple(axes)
         self._sliders = [f"input {i + 1}" for i in range(len(axes))]
         for name, (lower, higher) in zip(self._sliders, keys, strict=True):
             meshcat.AddSlider(name, -1.0, 1.0, 0.25, 0.0, lower, higher)
         self._state = self.DeclareDiscreteState(len(axes))
         self._action_port = self.DeclareStateOutputPort("action", self._state)
-        self.DeclareInitializationDiscreteUpdateEvent(self._look)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._look)
+        self.DeclareInitializationDiscreteUpdateEvent(self._sample)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
     def get_action_output_port(self) -> OutputPort:
-        """What the person asks for, (n,), in [−1, 1]."""
+        """The person's inputs, (n,), in [−1, 1]."""
         return self._action_port
 
     def read(self) -> np.ndarray:
-        """What the person asks for now, (n,)."""
+        """The person's inputs at this moment, (n,), in [−1, 1]."""
         gamepad = self._meshcat.GetGamepad()
         values = []
         for (axis, sign), slider in zip(self._axes, self._sliders, strict=True):
@@ -64,6 +65,6 @@ class MeshcatDevice(LeafSystem):
             values.append(sign * stick if abs(stick) > DEAD_ZONE else self._meshcat.GetSliderValue(slider))
         return np.clip(values, -1.0, 1.0)
 
-    def _look(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self.read())
         return EventStatus.Succeeded()

@@ -1,31 +1,38 @@
-"""Remembers what was commanded and what came of it, sample by sample."""
+"""A recording of signals in declared state, which a reset clears."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.errors import InputError
+from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.signal_ports import SignalPorts
 
 
 @dataclass(frozen=True)
 class Recording:
-    """N samples. `times` (N,) [s] say since when the command of a sample had acted; the rest was read at its end."""
+    """N samples of named signals.
+
+    Args:
+        times: (N,) [s], the beginnings of the control periods at whose ends the signals were sampled.
+        signals: name to (N, size).
+    """
 
     times: np.ndarray
-    signals: dict[str, np.ndarray]  # name to (N, size)
+    signals: dict[str, np.ndarray]
 
     def __getitem__(self, name: str) -> np.ndarray:
         return self.signals[name]
 
 
 class Recorder(LeafSystem):
-    """Samples named signals once a control period, at its end, into state that a reset clears.
+    """Samples named signals once a control period, at its end.
 
-    At the instant k·period it takes in what its inputs were just before: the command that acted since (k−1)·period and
-    what it led to. That makes one row of a demonstration. Once `num_samples` are full it records no more.
+    The sample at the instant k·period has the values just before: the command that was held since (k−1)·period and what
+    it led to, one row of a demonstration. Once there are `num_samples` it records no more. The samples are declared
+    state, which a reset clears.
 
     .. pydrake_system::
 
@@ -35,44 +42,47 @@ class Recorder(LeafSystem):
         output_ports:
         - num_recorded
 
-    `num_recorded` is (1,). The samples themselves are read with `recording`.
+    ``num_recorded`` is (1,). The samples themselves are read with `recording`.
     """
 
-    def __init__(self, signals: dict[str, int], num_samples: int, period: float):
+    def __init__(self, signals: Mapping[str, int], num_samples: int, period: float):
         """
         Args:
             signals: name to size of what is recorded, at least one.
-            num_samples: room for how many samples, at least 1.
+            num_samples: the greatest number of samples, at least 1.
             period: of the sampling [s], positive.
 
         Raises:
             InputError: if an argument is out of range.
         """
         super().__init__()
-        if not signals or min(signals.values()) < 1 or num_samples < 1:
-            raise InputError("a recorder needs at least one signal of at least one number, and room for one sample")
-        if not period > 0.0:
-            raise InputError(f"a recorder's period must be positive, not {period} s")
-        self._signals = {name: self.DeclareVectorInputPort(name, size) for name, size in signals.items()}
+        if not signals or num_samples < 1:
+            raise InputError("a recorder needs at least one signal, and room for one sample")
+        check_period(period)
+        self._signals = SignalPorts(self, signals)
         self._sizes = dict(signals)
         self._num_samples = num_samples
         self._period = period
         self._width = sum(signals.values())
         self._count = self.DeclareDiscreteState(1)
         self._samples = self.DeclareDiscreteState(num_samples * self._width)
-        self._num_recorded = self.DeclareStateOutputPort("num_recorded", self._count)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, period, self._record)
+        self._num_recorded_port = self.DeclareStateOutputPort("num_recorded", self._count)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._record)
 
-    def get_signal_input_port(self, name: str):
-        """The signal of this name."""
-        return self._signals[name]
+    def get_signal_input_port(self, name: str) -> InputPort:
+        """The signal of this name.
 
-    def get_num_recorded_output_port(self):
-        """How many samples there are, (1,)."""
-        return self._num_recorded
+        Raises:
+            InputError: if no such signal is recorded.
+        """
+        return self._signals.port(name)
+
+    def get_num_recorded_output_port(self) -> OutputPort:
+        """The number of samples so far, (1,)."""
+        return self._num_recorded_port
 
     def recording(self, context: Context) -> Recording:
-        """What was recorded so far; `context` is this system's."""
+        """A copy of the samples so far; `context` is this system's."""
         count = int(context.get_discrete_state(self._count).value()[0])
         samples = context.get_discrete_state(self._samples).value().reshape(-1, self._width)[:count]
         ends = np.cumsum(list(self._sizes.values()))
@@ -84,9 +94,10 @@ class Recorder(LeafSystem):
 
     def _record(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = int(context.get_discrete_state(self._count).value()[0])
-        if count == self._num_samples:
+        # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
+        if context.get_time() == 0 or count == self._num_samples:
             return EventStatus.DidNothing()
-        row = np.concatenate([port.Eval(context) for port in self._signals.values()])
+        row = np.concatenate(list(self._signals.eval(context).values()))
         samples = discrete_state.get_mutable_value(self._samples)
         samples[count * self._width : (count + 1) * self._width] = row
         discrete_state.get_mutable_value(self._count)[0] = count + 1

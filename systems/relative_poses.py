@@ -1,4 +1,4 @@
-"""Where some bodies of a plant are, as seen from another one."""
+"""Poses of bodies of a plant, relative to another one."""
 
 from collections.abc import Sequence
 
@@ -7,9 +7,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
+from guiderail.models.errors import InputError
+
 
 class RelativePoses(LeafSystem):
-    """The poses X_RB of bodies B in the frame of a reference body R.
+    """Measures the poses of bodies B relative to a reference body R.
+
+        X_RB = X_RW X_WB
 
     .. pydrake_system::
 
@@ -27,35 +31,37 @@ class RelativePoses(LeafSystem):
         """
         Args:
             plant: finalized.
-            bodies: whose poses are asked for, at least one.
-            reference: from which they are seen.
+            bodies: B, at least one.
+            reference: R.
 
         Raises:
-            ValueError: if there is no body.
+            InputError: if there is no body.
         """
         super().__init__()
         if not bodies:
-            raise ValueError("relative poses need at least one body")
+            raise InputError("relative poses need at least one body")
         self._bodies = [int(body.index()) for body in bodies]
         self._reference = int(reference.index())
-        self._poses_port = self.DeclareAbstractInputPort("body_poses", plant.get_body_poses_output_port().Allocate())
+        self._body_poses_port = self.DeclareAbstractInputPort(
+            "body_poses", plant.get_body_poses_output_port().Allocate()
+        )
         self._relative_poses_port = self.DeclareVectorOutputPort(
             "relative_poses",
             6 * len(self._bodies),
             self._calc_relative_poses,
-            prerequisites_of_calc={self._poses_port.ticket()},
+            prerequisites_of_calc={self._body_poses_port.ticket()},
         )
 
     def get_body_poses_input_port(self) -> InputPort:
         """The plant's body poses."""
-        return self._poses_port
+        return self._body_poses_port
 
     def get_relative_poses_output_port(self) -> OutputPort:
         """Position and rotation vector of each body, (6·n,)."""
         return self._relative_poses_port
 
     def _calc_relative_poses(self, context: Context, output: BasicVector) -> None:
-        poses = self._poses_port.Eval(context)
+        poses = self._body_poses_port.Eval(context)
         X_WR = poses[self._reference]
         for i, body in enumerate(self._bodies):
             X_RB = X_WR.InvertAndCompose(poses[body])

@@ -1,4 +1,4 @@
-"""A command and what a policy adds to it."""
+"""Residual learning's sum of a reference and a policy's action."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
@@ -7,7 +7,9 @@ from guiderail.models.errors import InputError
 
 
 class Residual(LeafSystem):
-    """Adds a policy's residual to a reference: p̂ = p^kmp + K Δp (thesis, section 4.4.1).
+    """Adds a policy's residual to a reference (thesis, section 4.4.1).
+
+        desired_pose = reference + K action
 
     .. pydrake_system::
 
@@ -18,14 +20,14 @@ class Residual(LeafSystem):
         output_ports:
         - desired_pose
 
-    All are (O,); ``action`` is in [−1, 1]. (Drake's `Adder` would say the same, but it counts as depending on time:
-    whatever comes after it would be computed anew at every step of the plant.)
+    All are (O,); ``action`` is in [−1, 1]. (Drake's `Adder` computes the same but counts as depending on time: what is
+    connected behind it would be computed anew at every step of the plant.)
     """
 
     def __init__(self, gain: np.ndarray):
         """
         Args:
-            gain: K (O,), what an action of one adds to each output, in its unit.
+            gain: the diagonal of K, (O,), in the reference's units per unit of action.
 
         Raises:
             InputError: if the gain is not a vector of finite numbers.
@@ -36,15 +38,15 @@ class Residual(LeafSystem):
             raise InputError(f"a residual's gain is one finite number per output, not {gain}")
         self._reference_port = self.DeclareVectorInputPort("reference", self._gain.size)
         self._action_port = self.DeclareVectorInputPort("action", self._gain.size)
-        self._desired_port = self.DeclareVectorOutputPort(
+        self._desired_pose_port = self.DeclareVectorOutputPort(
             "desired_pose",
             self._gain.size,
-            self._calc,
+            self._calc_desired_pose,
             prerequisites_of_calc={self._reference_port.ticket(), self._action_port.ticket()},
         )
 
     def get_reference_input_port(self) -> InputPort:
-        """What is commanded without a residual, (O,)."""
+        """The command without the residual, (O,)."""
         return self._reference_port
 
     def get_action_input_port(self) -> InputPort:
@@ -53,7 +55,7 @@ class Residual(LeafSystem):
 
     def get_desired_pose_output_port(self) -> OutputPort:
         """The sum, (O,)."""
-        return self._desired_port
+        return self._desired_pose_port
 
-    def _calc(self, context: Context, output: BasicVector) -> None:
+    def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._reference_port.Eval(context) + self._gain * self._action_port.Eval(context))

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.systems.caching import declare_array_cache
+from guiderail.models.errors import InputError
+from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.signal_ports import SignalPorts
 
 
 @dataclass(frozen=True)
@@ -16,7 +18,7 @@ class RewardTerm:
     Args:
         name: of its output port.
         inputs: the signals it depends on, name to size; terms that name the same signal share it.
-        value: called with those signals by name, gives the term of this control step; a pure function.
+        value: called with those signals by name, returns the term of this control step; a pure function.
     """
 
     name: str
@@ -25,7 +27,9 @@ class RewardTerm:
 
 
 class RewardSystem(LeafSystem):
-    """Adds up named terms, r = Σ_i r_i (as in thesis, equation 4.22), and shows each of them.
+    """Computes a reward as the sum of named terms, each of which is an output too.
+
+        r = Σ_i r_i    (as in equation 4.22)
 
     .. pydrake_system::
 
@@ -36,7 +40,7 @@ class RewardSystem(LeafSystem):
         - reward
         - one per term
 
-    Every output is (1,). The system has no state: a term that compares with the last control step gets that from a
+    Every output is (1,). The system has no state: a term that depends on the last control step gets its values from a
     `ZeroOrderHold` of the control period.
     """
 
@@ -46,29 +50,24 @@ class RewardSystem(LeafSystem):
             terms: at least one, of different names, none of them "reward".
 
         Raises:
-            ValueError: if there is no term, a name is taken, or two terms disagree about the size of a signal.
+            InputError: if there is no term, a name is taken, or two terms disagree about the size of a signal.
         """
         super().__init__()
         names = [term.name for term in terms]
         if not names or len(set(names)) < len(names) or "reward" in names:
-            raise ValueError(f"a reward needs terms of different names, other than 'reward', not {names}")
-        sizes: dict[str, int] = {}
-        for term in terms:
-            for name, size in term.inputs.items():
-                if sizes.setdefault(name, size) != size:
-                    raise ValueError(f"signal '{name}' can't be of size {sizes[name]} and {size}")
+            raise InputError(f"a reward needs terms of different names, other than 'reward', not {names}")
         self._terms = tuple(terms)
-        self._signals = {name: self.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
-        self._values = declare_array_cache(
+        self._signals = SignalPorts(self, *(term.inputs for term in terms))
+        self._values = declare_cache(
             self,
             "terms",
             self._calc_terms,
-            {port.ticket() for port in self._signals.values()} or {self.nothing_ticket()},
+            prerequisites_of_calc=self._signals.tickets or {self.nothing_ticket()},
         )
-        tickets = {self._values.ticket()}
-        self._reward_port = self.DeclareVectorOutputPort("reward", 1, self._calc_reward, prerequisites_of_calc=tickets)
+        values = {self._values.ticket()}
+        self._reward_port = self.DeclareVectorOutputPort("reward", 1, self._calc_reward, prerequisites_of_calc=values)
         self._term_ports = {
-            term.name: self.DeclareVectorOutputPort(term.name, 1, self._term_calc(i), prerequisites_of_calc=tickets)
+            term.name: self.DeclareVectorOutputPort(term.name, 1, self._term_calc(i), prerequisites_of_calc=values)
             for i, term in enumerate(terms)
         }
 
@@ -78,19 +77,29 @@ class RewardSystem(LeafSystem):
         return tuple(self._term_ports)
 
     def get_signal_input_port(self, name: str) -> InputPort:
-        """The signal of this name, of the size its terms gave it."""
-        return self._signals[name]
+        """The signal of this name, of the size that its terms gave it.
+
+        Raises:
+            InputError: if no term depends on such a signal.
+        """
+        return self._signals.port(name)
 
     def get_reward_output_port(self) -> OutputPort:
         """The sum of all terms, (1,)."""
         return self._reward_port
 
     def get_term_output_port(self, name: str) -> OutputPort:
-        """The term of this name, (1,)."""
+        """The term of this name, (1,).
+
+        Raises:
+            InputError: if there is none.
+        """
+        if name not in self._term_ports:
+            raise InputError(f"the reward has no term '{name}', only {', '.join(self._term_ports)}")
         return self._term_ports[name]
 
     def _calc_terms(self, context: Context) -> np.ndarray:
-        signals = {name: port.Eval(context) for name, port in self._signals.items()}
+        signals = self._signals.eval(context)
         return np.array([term.value(**{name: signals[name] for name in term.inputs}) for term in self._terms], float)
 
     def _calc_reward(self, context: Context, output: BasicVector) -> None:

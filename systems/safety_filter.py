@@ -1,15 +1,19 @@
-"""Stops commands before they become a collision."""
+"""Projects commanded positions out of boxes that must not be entered."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.keep_out import KeepOut
-from guiderail.systems.caching import declare_array_cache
-from guiderail.systems.sampling import declare_sample
+from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.sampling import declare_sample
 
 
 class SafetyFilter(LeafSystem):
-    """Projects a commanded position by hand-made active constraints (thesis, section 4.4.1), see `KeepOut`.
+    """Projects commanded positions by hand-made active constraints (thesis, section 4.4.1).
+
+        safe_pose = project(pose, desired_pose)
+
+    (`KeepOut.project`). The measured pose is sampled at control steps: between two of them the command is constant.
 
     .. pydrake_system::
 
@@ -22,38 +26,41 @@ class SafetyFilter(LeafSystem):
         - intervention
 
     ``desired_pose`` and ``pose`` (measured) are (O,). ``safe_pose`` (O,) is what may be commanded, ``intervention``
-    (1,) is 1 where a box changed the command. The measured pose is sampled at control steps: between two of them the
-    command stays what it is.
+    (1,) is 1 where a box changed the command.
     """
 
     def __init__(self, keep_out: KeepOut, period: float):
         """
         Args:
-            keep_out: what to keep away from.
-            period: seconds between control steps, positive.
+            keep_out: the boxes and constraints.
+            period: between two control steps [s], positive.
 
         Raises:
-            ValueError: if the period is not positive.
+            InputError: if the period is not positive.
         """
         super().__init__()
         self._keep_out = keep_out
         outputs = keep_out.num_outputs
-        self._desired_port = self.DeclareVectorInputPort("desired_pose", outputs)
+        self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
         self._sampled = declare_sample(self, self._pose_port, period)
-        self._safe = declare_array_cache(
+        self._projection = declare_cache(
             self,
-            "safe",
-            self._calc,
-            {self._desired_port.ticket(), self.discrete_state_ticket(self._sampled)},
+            "projection",
+            self._calc_projection,
+            prerequisites_of_calc={self._desired_pose_port.ticket(), self.discrete_state_ticket(self._sampled)},
         )
-        tickets = {self._safe.ticket()}
-        self._safe_port = self.DeclareVectorOutputPort("safe_pose", outputs, self._calc_safe_pose, tickets)
-        self._intervention_port = self.DeclareVectorOutputPort("intervention", 1, self._calc_intervention, tickets)
+        projection = {self._projection.ticket()}
+        self._safe_pose_port = self.DeclareVectorOutputPort(
+            "safe_pose", outputs, self._calc_safe_pose, prerequisites_of_calc=projection
+        )
+        self._intervention_port = self.DeclareVectorOutputPort(
+            "intervention", 1, self._calc_intervention, prerequisites_of_calc=projection
+        )
 
     def get_desired_pose_input_port(self) -> InputPort:
         """The command to check, (O,)."""
-        return self._desired_port
+        return self._desired_pose_port
 
     def get_pose_input_port(self) -> InputPort:
         """The measured pose, (O,)."""
@@ -61,19 +68,20 @@ class SafetyFilter(LeafSystem):
 
     def get_safe_pose_output_port(self) -> OutputPort:
         """What may be commanded, (O,)."""
-        return self._safe_port
+        return self._safe_pose_port
 
     def get_intervention_output_port(self) -> OutputPort:
         """1 where a box changed the command, (1,)."""
         return self._intervention_port
 
-    def _calc(self, context: Context) -> np.ndarray:
+    def _calc_projection(self, context: Context) -> np.ndarray:
+        """The safe pose (O,), and 1 if a box changed the command, else 0."""
         position = context.get_discrete_state(self._sampled).value()
-        safe, intervened = self._keep_out.project(position, self._desired_port.Eval(context))
+        safe, intervened = self._keep_out.project(position, self._desired_pose_port.Eval(context))
         return np.append(safe, float(intervened))
 
     def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._safe.Eval(context)[:-1])
+        output.SetFromVector(self._projection.Eval(context)[:-1])
 
     def _calc_intervention(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._safe.Eval(context)[-1])
+        output.SetAtIndex(0, self._projection.Eval(context)[-1])

@@ -1,24 +1,24 @@
-"""A few inputs, mapped to the pose they ask for (thesis, equations 2.19 and 2.20)."""
+"""Maps a few inputs to a requested pose (thesis, equations 2.19 and 2.20)."""
 
 from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
-from guiderail.systems.sampling import check_period
-from guiderail.systems.skill_frames import SkillFrames
+from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.skill_frames import SkillFrames
 
 
 class SctInputMapping(LeafSystem):
-    """The input mapping of the state that a shared control template is in.
+    """Applies the input mapping of a shared control template's current state to a policy's or a person's inputs.
 
-        H^im = displace_q(H, map_q(u))
+        H^im = displace_q(H, map_q(u))    (equations 2.19 and 2.20)
 
-    during one period, from the pose H that `pose` brings. Inputs are clipped to [−1, 1]; of an input that is not finite
-    comes a pose that is not finite either, for whoever checks poses to see.
+    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. An input that is not finite results
+    in a pose that is not finite, so that the projector behind it refuses it.
 
     .. pydrake_system::
 
@@ -32,6 +32,9 @@ class SctInputMapping(LeafSystem):
 
     ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians;
     ``state`` is (1,), the number of the skill's state.
+
+    Attributes:
+        frames: the poses of the skill's objects, which a reset can set.
     """
 
     def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float):
@@ -39,10 +42,10 @@ class SctInputMapping(LeafSystem):
         Args:
             skill: the template.
             frames: the poses of its objects by name, in the frame that poses are given in.
-            period: seconds for which an input moves, positive.
+            period: for which an input is held [s], positive.
 
         Raises:
-            ValueError: if the period is not positive, or a frame is missing.
+            InputError: if the period is not positive, or a frame is missing.
         """
         super().__init__()
         check_period(period)
@@ -65,11 +68,11 @@ class SctInputMapping(LeafSystem):
         )
 
     def get_action_input_port(self) -> InputPort:
-        """The inputs of a person or a policy, (n,), in [−1, 1]."""
+        """The inputs u of a policy or a person, (n,), in [−1, 1]."""
         return self._action_port
 
     def get_pose_input_port(self) -> InputPort:
-        """The pose to displace, (6,)."""
+        """The pose H to displace, (6,)."""
         return self._pose_port
 
     def get_state_input_port(self) -> InputPort:
@@ -77,10 +80,10 @@ class SctInputMapping(LeafSystem):
         return self._state_port
 
     def get_requested_pose_output_port(self) -> OutputPort:
-        """The displaced pose H^im, (6,), not yet constrained."""
+        """The requested pose H^im, (6,), not yet constrained."""
         return self._requested_pose_port
 
-    def _calc_requested_pose(self, context: Context, output) -> None:
+    def _calc_requested_pose(self, context: Context, output: BasicVector) -> None:
         action = self._action_port.Eval(context)
         if not np.isfinite(action).all():
             output.SetFromVector(np.full(6, np.nan))

@@ -1,22 +1,31 @@
-"""Which state a shared control template is in, and how far it is to the next one (thesis, section 2.3)."""
+"""The finite state machine of a shared control template (thesis, section 2.3)."""
 
 from collections.abc import Mapping
 
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.skills.skill import Skill
-from guiderail.systems.sampling import check_period
-from guiderail.systems.skill_frames import SkillFrames
+from guiderail.systems.support.sampling import check_period
+from guiderail.systems.support.skill_frames import SkillFrames
 
 
 class SctStateMachine(LeafSystem):
-    """The finite state machine of a shared control template.
+    """Runs the finite state machine of a shared control template, by its transition distances.
 
-    At every control instant it makes at most one transition, on the pose from just before: forward where the state's
-    transition distance has fallen below its threshold, back where that of the state before exceeds it again by the
-    hysteresis. An episode begins in the state that the initial pose is in.
+        q[k+1] = q[k] + 1 where d_q < threshold_q,  q[k] − 1 where d_{q−1} > threshold_{q−1} + hysteresis
+
+    (`Skill.next_state`), on the pose just before the control instant: at most one transition each. An episode begins in
+    the state that the initial pose is in.
 
     .. pydrake_system::
 
@@ -29,11 +38,14 @@ class SctStateMachine(LeafSystem):
         - transition_distance
         - progress
 
-    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians; the latter is looked at once, when
-    the episode begins, because then a command may not know yet where the robot is. ``state`` is (1,), the number of the
-    state, and never feeds through. ``transition_distance`` is (1,), d_t of the current state in metres or radians.
+    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians; the latter is measured, and read at
+    initialization, when a commanded ``pose`` may not be initialized yet. ``state`` is (1,), the number of the state,
+    and never feeds through. ``transition_distance`` is (1,), d_t of the current state in metres or radians.
     ``progress`` is (1,) and rises as the distances fall, over all states on one scale: its increase is d_{t−1} − d_t of
     equation 3.2.
+
+    Attributes:
+        frames: the poses of the skill's objects, which a reset can set.
     """
 
     def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float):
@@ -41,10 +53,10 @@ class SctStateMachine(LeafSystem):
         Args:
             skill: the template.
             frames: the poses of its objects by name, in the frame that poses are given in.
-            period: seconds between control steps, positive.
+            period: between two control steps [s], positive.
 
         Raises:
-            ValueError: if the period is not positive, or a frame is missing.
+            InputError: if the period is not positive, or a frame is missing.
         """
         super().__init__()
         check_period(period)
@@ -54,28 +66,22 @@ class SctStateMachine(LeafSystem):
         self._initial_pose_port = self.DeclareVectorInputPort("initial_pose", 6)
         self._state = self.DeclareDiscreteState([float(skill.initial_state)])
         self._state_port = self.DeclareStateOutputPort("state", self._state)
-        everything = {self._pose_port.ticket(), self.discrete_state_ticket(self._state), self.frames.ticket}
+        prerequisites = {self._pose_port.ticket(), self.discrete_state_ticket(self._state), self.frames.ticket}
         self._transition_distance_port = self.DeclareVectorOutputPort(
-            "transition_distance",
-            1,
-            lambda context, output: output.SetAtIndex(0, self._skill.distance(*self._where(context))),
-            prerequisites_of_calc=everything,
+            "transition_distance", 1, self._calc_transition_distance, prerequisites_of_calc=prerequisites
         )
         self._progress_port = self.DeclareVectorOutputPort(
-            "progress",
-            1,
-            lambda context, output: output.SetAtIndex(0, self._skill.progress(*self._where(context))),
-            prerequisites_of_calc=everything,
+            "progress", 1, self._calc_progress, prerequisites_of_calc=prerequisites
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_pose_input_port(self) -> InputPort:
-        """The pose whose distances count, (6,)."""
+        """The pose that the transition distances are measured from, (6,)."""
         return self._pose_port
 
     def get_initial_pose_input_port(self) -> InputPort:
-        """The measured pose, (6,): it decides in which state an episode begins."""
+        """The measured pose, (6,): it determines the state in which an episode begins."""
         return self._initial_pose_port
 
     def get_state_output_port(self) -> OutputPort:
@@ -83,16 +89,22 @@ class SctStateMachine(LeafSystem):
         return self._state_port
 
     def get_transition_distance_output_port(self) -> OutputPort:
-        """How far it is to the end of this state, (1,), [m] or [rad]."""
+        """The current state's transition distance d_t, (1,) [m] or [rad]."""
         return self._transition_distance_port
 
     def get_progress_output_port(self) -> OutputPort:
-        """How much of the task is done, (1,)."""
+        """The progress in the task, (1,), over all states on one scale."""
         return self._progress_port
 
-    def _where(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:
+    def _state_pose_frames(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:
         state = int(context.get_discrete_state(self._state).value()[0])
         return state, pose_to_transform(self._pose_port.Eval(context)), self.frames.eval(context)
+
+    def _calc_transition_distance(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._skill.distance(*self._state_pose_frames(context)))
+
+    def _calc_progress(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._skill.progress(*self._state_pose_frames(context)))
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         X_WE = pose_to_transform(self._initial_pose_port.Eval(context))
@@ -102,5 +114,5 @@ class SctStateMachine(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
         if context.get_time() > 0:
-            discrete_state.set_value([float(self._skill.next_state(*self._where(context)))])
+            discrete_state.set_value([float(self._skill.next_state(*self._state_pose_frames(context)))])
         return EventStatus.Succeeded()

@@ -1,6 +1,4 @@
-"""A wrist wrench sensor that reports only what the surroundings do to the tool."""
-
-from __future__ import annotations
+"""A wrist force/torque sensor, compensated for the tool's weight and inertia."""
 
 import numpy as np
 from pydrake.common.value import Value
@@ -8,18 +6,28 @@ from pydrake.math import RotationMatrix
 from pydrake.multibody.math import SpatialAcceleration, SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, Joint, RigidBody
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from guiderail.models.errors import InputError
 from guiderail.models.tool_wrench import external_wrench
+from guiderail.systems.support.sampling import check_period
 
 
 class WrenchSensor(LeafSystem):
-    """The wrench of the surroundings on a tool at its centre of compliance, low-pass filtered.
+    """Measures the wrench of the environment on a tool at its centre of compliance, low-pass filtered.
 
-    Behind a wrist (a joint) hangs a rigid tool. What the wrist feels contains the tool's weight and inertia; the sensor
-    removes them (Newton and Euler, `models.tool_wrench`), moves the rest to the centre of compliance P, turns it
-    into the axes of a frame that is fixed in the world, and filters it by y' = (u − y)/τ, sampled at `period`.
+        F = M A + bias(V) − M [0, g] − F_wrist,  τ y' = F − y
+
+    (`external_wrench`). The wrist is a joint, the tool is rigid and welded to its child. F is moved to the centre of
+    compliance P and expressed in the axes of a frame that is fixed in the world.
 
     .. pydrake_system::
 
@@ -32,7 +40,7 @@ class WrenchSensor(LeafSystem):
         output_ports:
         - wrench
 
-    The inputs are the plant's output ports of those names. `wrench` is (6,), [fx fy fz tx ty tz] in N and Nm. It is
+    The inputs are the plant's output ports of those names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is
     state: one sample old, zero after a reset, and never feeds through.
     """
 
@@ -50,18 +58,17 @@ class WrenchSensor(LeafSystem):
         Args:
             plant: finalized; its output ports feed this system.
             wrist: whose reaction is measured; its child is the first of `tool`.
-            tool: the bodies that hang behind the wrist, welded together.
+            tool: the bodies behind the wrist, welded together.
             centre: the centre of compliance P, fixed to the first of `tool`.
-            R_WAxes: the axes in which the wrench is reported.
-            period: of the sampling [s], positive; the plant's time step loses nothing.
-            time_constant: τ of the filter [s]; 0 does not filter.
+            R_WAxes: the axes in which the wrench is expressed.
+            period: of the sampling [s], positive; best the plant's time step.
+            time_constant: τ of the filter [s]; 0 disables it.
 
         Raises:
-            InputError: if an argument is out of range or the first of `tool` doesn't hang on the wrist.
+            InputError: if an argument is out of range, or the first of `tool` is not the wrist's child.
         """
         super().__init__()
-        if not period > 0.0:
-            raise InputError(f"a wrench sensor's period must be positive, not {period} s")
+        check_period(period)
         if not 0.0 <= time_constant < np.inf:
             raise InputError(f"a wrench sensor's time constant must not be negative, not {time_constant} s")
         if not tool or wrist.child_body().index() != tool[0].index():
@@ -71,50 +78,69 @@ class WrenchSensor(LeafSystem):
         self._tool = int(tool[0].index())
         X_ToolWrist = wrist.frame_on_child().CalcPose(nominal, tool[0].body_frame())
         X_ToolP = centre.CalcPose(nominal, tool[0].body_frame())
-        # About the tool's own origin and in its axes, its inertia and the ways to and from there are constant.
+        # About the tool's own origin and in its axes, its inertia and the two wrench transforms are constant.
         self._M_Tool = plant.CalcSpatialInertia(
             nominal, tool[0].body_frame(), [body.index() for body in tool]
         ).CopyToFullMatrix6()
-        self._wrist_to_tool = _moved(X_ToolWrist.rotation().matrix(), X_ToolWrist.translation())
-        self._tool_to_centre = _moved(np.eye(3), -X_ToolP.translation())
+        self._wrist_to_tool = _wrench_transform(X_ToolWrist.rotation().matrix(), X_ToolWrist.translation())
+        self._tool_to_centre = _wrench_transform(np.eye(3), -X_ToolP.translation())
         self._R_AxesW = R_WAxes.inverse().matrix()
         has_weight = plant.is_gravity_enabled(tool[0].model_instance())
         self._gravity_W = plant.gravity_field().gravity_vector() if has_weight else np.zeros(3)
-        self._kept = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
+        self._decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
 
-        self._reactions = self.DeclareAbstractInputPort("reaction_forces", Value([SpatialForce()]))
-        poses = plant.get_body_poses_output_port()
-        self._poses = self.DeclareAbstractInputPort("body_poses", poses.Allocate())
-        self._velocities = self.DeclareAbstractInputPort("body_spatial_velocities", Value([SpatialVelocity()]))
-        self._accelerations = self.DeclareAbstractInputPort(
+        self._reaction_forces_port = self.DeclareAbstractInputPort("reaction_forces", Value([SpatialForce()]))
+        self._body_poses_port = self.DeclareAbstractInputPort(
+            "body_poses", plant.get_body_poses_output_port().Allocate()
+        )
+        self._body_spatial_velocities_port = self.DeclareAbstractInputPort(
+            "body_spatial_velocities", Value([SpatialVelocity()])
+        )
+        self._body_spatial_accelerations_port = self.DeclareAbstractInputPort(
             "body_spatial_accelerations", Value([SpatialAcceleration()])
         )
         self._state = self.DeclareDiscreteState(6)
-        self._wrench = self.DeclareStateOutputPort("wrench", self._state)
+        self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
-    def connect(self, builder, plant: MultibodyPlant) -> None:
-        """Feeds this sensor from the plant's own output ports."""
-        builder.Connect(plant.get_reaction_forces_output_port(), self._reactions)
-        builder.Connect(plant.get_body_poses_output_port(), self._poses)
-        builder.Connect(plant.get_body_spatial_velocities_output_port(), self._velocities)
-        builder.Connect(plant.get_body_spatial_accelerations_output_port(), self._accelerations)
+    def connect(self, builder: DiagramBuilder, plant: MultibodyPlant) -> None:
+        """Connects all inputs to the plant's output ports."""
+        builder.Connect(plant.get_reaction_forces_output_port(), self._reaction_forces_port)
+        builder.Connect(plant.get_body_poses_output_port(), self._body_poses_port)
+        builder.Connect(plant.get_body_spatial_velocities_output_port(), self._body_spatial_velocities_port)
+        builder.Connect(plant.get_body_spatial_accelerations_output_port(), self._body_spatial_accelerations_port)
 
-    def get_wrench_output_port(self):
-        """The filtered wrench of the surroundings on the tool, (6,), force first."""
-        return self._wrench
+    def get_reaction_forces_input_port(self) -> InputPort:
+        """The plant's joint reaction forces."""
+        return self._reaction_forces_port
+
+    def get_body_poses_input_port(self) -> InputPort:
+        """The plant's body poses."""
+        return self._body_poses_port
+
+    def get_body_spatial_velocities_input_port(self) -> InputPort:
+        """The plant's body velocities."""
+        return self._body_spatial_velocities_port
+
+    def get_body_spatial_accelerations_input_port(self) -> InputPort:
+        """The plant's body accelerations."""
+        return self._body_spatial_accelerations_port
+
+    def get_wrench_output_port(self) -> OutputPort:
+        """The filtered wrench of the environment on the tool, (6,), force first."""
+        return self._wrench_port
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         newest = self._measure(context)
         last = context.get_discrete_state(self._state).value()
-        discrete_state.set_value(newest + self._kept * (last - newest))
+        discrete_state.set_value(newest + self._decay * (last - newest))
         return EventStatus.Succeeded()
 
     def _measure(self, context: Context) -> np.ndarray:
-        F_reaction = self._wrist_to_tool @ self._reactions.Eval(context)[self._wrist].get_coeffs()
-        R_WTool = self._poses.Eval(context)[self._tool].rotation().matrix()
-        V_W = self._velocities.Eval(context)[self._tool].get_coeffs()
-        A_W = self._accelerations.Eval(context)[self._tool].get_coeffs()
+        F_reaction = self._wrist_to_tool @ self._reaction_forces_port.Eval(context)[self._wrist].get_coeffs()
+        R_WTool = self._body_poses_port.Eval(context)[self._tool].rotation().matrix()
+        V_W = self._body_spatial_velocities_port.Eval(context)[self._tool].get_coeffs()
+        A_W = self._body_spatial_accelerations_port.Eval(context)[self._tool].get_coeffs()
         torque_force = external_wrench(
             F_reaction,
             self._M_Tool,
@@ -126,7 +152,7 @@ class WrenchSensor(LeafSystem):
         return (at_centre[::-1] @ (self._R_AxesW @ R_WTool).T).ravel()
 
 
-def _moved(R: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """What takes a wrench [torque, force] at B in B's axes to A's origin and axes, X_AB = (R, p), (6, 6)."""
+def _wrench_transform(R: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """The (6, 6) that transforms a wrench [torque, force] at B, in B's axes, to A's origin and axes; X_AB = (R, p)."""
     p_cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
     return np.block([[R, p_cross @ R], [np.zeros((3, 3)), R]])

@@ -22,17 +22,17 @@ from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, make_env, make_station
 from guiderail.models.objects.bnc_motion import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
-from guiderail.systems.command_watch import CommandWatch
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.recorder import Recorder
+from guiderail.systems.support.command_watch import CommandWatch
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 # Outermost callbacks only: one that is called within another would count twice.
 CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
     (CartesianImpedanceController, "_calc_law"),
-    (CommandWatch, "_remember"),
+    (CommandWatch, "_update"),
     (CommandWatchdog, "_calc_safe_pose"),
     (ImpedanceMonitor, "_calc_contact_force"),
     (ImpedanceMonitor, "_calc_saturation"),

@@ -5,6 +5,7 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.skills import parse_skill
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
@@ -33,8 +34,8 @@ START = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
 class Rig:
     """The projector with its inputs at hand."""
 
-    def __init__(self, start=START, leash=np.inf):
-        self.system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD, leash)
+    def __init__(self, start=START, max_tracking_error=np.inf):
+        self.system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD, max_tracking_error)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.system.get_state_input_port().FixValue(self.context, [0.0])
@@ -115,7 +116,7 @@ def test_a_command_is_taken_in_once_at_each_instant():
     np.testing.assert_allclose(rig.system.get_last_desired_pose_output_port().Eval(rig.context), START + step)
 
 
-def test_what_is_not_finite_repeats_the_last_safe_command():
+def test_a_request_that_is_not_finite_repeats_the_last_safe_command():
     rig = Rig()
     before, _ = rig.step(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
     desired, fallback = rig.step(np.full(6, np.nan))
@@ -123,8 +124,8 @@ def test_what_is_not_finite_repeats_the_last_safe_command():
     np.testing.assert_array_equal(desired, before)
 
 
-def test_a_robot_that_is_held_back_is_waited_for():
-    rig = Rig(leash=0.02)
+def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
+    rig = Rig(max_tracking_error=0.02)
     for _ in range(100):
         desired, fallback = rig.step(np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0]), measured=START)
     assert fallback == 1.0
@@ -162,7 +163,7 @@ def test_a_reset_can_move_an_object():
     assert desired[2] == pytest.approx(0.25)
 
 
-@pytest.mark.parametrize(("period", "leash"), [(0.0, 1.0), (-0.1, 1.0), (0.1, 0.0), (float("nan"), 1.0)])
-def test_refuses_what_makes_no_sense(period, leash):
-    with pytest.raises(ValueError, match="positive"):
-        ActiveConstraintProjector(SKILL, FRAMES, period, leash)
+@pytest.mark.parametrize(("period", "max_tracking_error"), [(0.0, 1.0), (-0.1, 1.0), (0.1, 0.0), (float("nan"), 1.0)])
+def test_refuses_what_makes_no_sense(period, max_tracking_error):
+    with pytest.raises(InputError, match="positive"):
+        ActiveConstraintProjector(SKILL, FRAMES, period, max_tracking_error)

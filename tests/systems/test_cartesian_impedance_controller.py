@@ -224,7 +224,7 @@ def test_when_commands_stop_the_last_sound_pose_is_held():
     np.testing.assert_allclose(arm.pose(), safe, atol=5e-4)
 
 
-def test_what_is_not_a_number_is_no_command():
+def test_a_command_that_is_not_finite_is_not_followed():
     arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
     arm.command(np.full(6, np.nan))

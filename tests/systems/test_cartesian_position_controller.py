@@ -11,6 +11,7 @@ from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 
 START = np.array([0.0, 0.0, 0.02, 0.8, 0.0, 0.0])
+GOAL = START + [0.05, -0.08, 0.06, -0.5, 0.1, -0.2]
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +36,10 @@ class Commanded:
         self.desired = self.system.get_desired_pose_input_port().FixValue(self.context, START)
         self.simulator.Initialize()
 
-    def command(self, pose):
+    def command(self, pose, time=None):
         self.desired.GetMutableData().set_value(pose)
+        if time is not None:
+            self.system.get_command_time_input_port().FixValue(self.context, [time])
 
     def advance(self, seconds):
         self.simulator.AdvanceTo(self.context.get_time() + seconds)
@@ -53,6 +56,10 @@ class Commanded:
     def stuck(self):
         return self.system.get_stuck_output_port().Eval(self.context)[0]
 
+    @property
+    def holding(self):
+        return self.system.get_holding_output_port().Eval(self.context)[0]
+
 
 def test_starts_where_the_arm_is(arm):
     commanded = Commanded(arm)
@@ -66,10 +73,9 @@ def test_nothing_feeds_through(arm):
 
 def test_arrives_at_the_desired_pose(arm):
     commanded = Commanded(arm)
-    goal = START + [0.05, -0.08, 0.06, -0.5, 0.1, -0.2]
-    commanded.command(goal)
+    commanded.command(GOAL)
     commanded.advance(2.0)
-    np.testing.assert_allclose(commanded.pose, goal, atol=1e-5)
+    np.testing.assert_allclose(commanded.pose, GOAL, atol=1e-5)
     assert commanded.stuck == 0.0
 
 
@@ -95,14 +101,58 @@ def test_out_of_reach_it_stays_within_the_joints_limits(arm):
     assert np.isfinite(commanded.joints).all()
 
 
-def test_what_is_not_a_number_is_no_command(arm):
+def test_holds_its_joint_command_while_the_desired_pose_is_not_finite(arm):
     commanded = Commanded(arm)
     commanded.command(np.full(6, np.nan))
     commanded.advance(0.1)
     np.testing.assert_array_equal(commanded.joints, commanded.q_start)
+    assert commanded.holding == 1.0
+    commanded.command(GOAL)
+    commanded.advance(0.1)
+    assert (commanded.joints != commanded.q_start).any()
+    assert commanded.holding == 0.0
 
 
-@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"posture": np.zeros(3)}, {"posture_gain": -1.0}])
+def test_holds_its_joint_command_when_commands_stop(arm):
+    commanded = Commanded(arm, timeout=0.1)
+    commanded.command(GOAL, time=0.0)
+    commanded.advance(0.095)
+    assert commanded.holding == 0.0
+    commanded.advance(0.02)
+    assert commanded.holding == 1.0
+    stopped = commanded.joints
+    commanded.advance(0.5)
+    np.testing.assert_array_equal(commanded.joints, stopped)
+    assert np.linalg.norm(commanded.pose - GOAL) > 0.05
+    # A fresh command counts at the next period, and an old one doesn't count again.
+    commanded.command(GOAL, time=commanded.context.get_time())
+    commanded.advance(0.01)
+    assert commanded.holding == 0.0
+    commanded.command(START, time=0.0)
+    commanded.advance(0.01)
+    assert commanded.holding == 1.0
+
+
+@pytest.mark.parametrize("time", [0.02, 1e6, np.inf, np.nan])
+def test_a_command_from_the_future_or_from_no_time_is_not_followed(arm, time):
+    commanded = Commanded(arm)
+    commanded.command(GOAL, time=time)
+    commanded.advance(0.005)
+    np.testing.assert_array_equal(commanded.joints, commanded.q_start)
+    assert commanded.holding == 1.0
+
+
+def test_command_times_change_nothing_while_commands_come(arm):
+    plain, timed = Commanded(arm), Commanded(arm)
+    plain.command(GOAL)
+    for step in range(20):
+        timed.command(GOAL, time=0.01 * step)
+        for commanded in (plain, timed):
+            commanded.simulator.AdvanceTo(0.01 * (step + 1))
+    np.testing.assert_array_equal(timed.joints, plain.joints)
+
+
+@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"posture": np.zeros(3)}, {"posture_gain": -1.0}, {"timeout": 0.0}])
 def test_refuses_what_makes_no_sense(arm, wrong):
     plant, model = arm
     with pytest.raises(InputError):

@@ -1,20 +1,26 @@
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.models.errors import InputError
 from guiderail.systems.command_watchdog import CommandWatchdog
 
+PERIOD, TIMEOUT = 2.0**-6, 2.0**-3
 START, FIRST, SECOND = np.zeros(6), np.full(6, 1.0), np.full(6, 2.0)
 
 
 class Watched:
-    def __init__(self, command):
-        self.system = CommandWatchdog(period=0.01, timeout=0.1)
+    """A watchdog whose robot is at `START`, with its inputs at hand."""
+
+    def __init__(self, command, time=None, start=START):
+        self.system = CommandWatchdog(PERIOD, TIMEOUT, pose_size=len(start))
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        self.system.get_pose_input_port().FixValue(self.context, START)
-        self.command(command)
+        self.pristine = self.system.CreateDefaultContext()
+        self.system.get_pose_input_port().FixValue(self.context, start)
+        self.command(command, time)
         self.simulator.Initialize()
 
     def command(self, pose, time=None):
@@ -22,50 +28,151 @@ class Watched:
         if time is not None:
             self.system.get_command_time_input_port().FixValue(self.context, [time])
 
-    def read(self):
-        holding = self.system.get_holding_output_port().Eval(self.context)[0]
-        return self.system.get_safe_pose_output_port().Eval(self.context).copy(), holding
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    def check(self, pose, holding):
+        np.testing.assert_array_equal(self.system.get_safe_pose_output_port().Eval(self.context), pose)
+        assert self.system.get_holding_output_port().Eval(self.context) == [holding]
 
 
-def test_a_sound_command_passes_at_once():
+def test_a_valid_command_passes_at_once():
     watched = Watched(FIRST)
-    np.testing.assert_array_equal(watched.read()[0], FIRST)
+    watched.check(FIRST, holding=0)
     watched.command(SECOND)
-    np.testing.assert_array_equal(watched.read()[0], SECOND)
-    assert watched.read()[1] == 0.0
+    watched.check(SECOND, holding=0)
 
 
-def test_an_old_command_gives_way_to_the_last_sound_one():
+def test_without_a_time_commands_never_get_stale():
     watched = Watched(FIRST)
-    watched.command(FIRST, time=0.0)
-    watched.simulator.AdvanceTo(0.05)
-    watched.simulator.AdvanceTo(0.3)
-    watched.command(SECOND, time=0.0)
-    pose, holding = watched.read()
-    np.testing.assert_array_equal(pose, FIRST)
-    assert holding == 1.0
+    watched.advance(100 * TIMEOUT)
+    watched.check(FIRST, holding=0)
 
 
-def test_it_lets_go_when_commands_come_back():
-    watched = Watched(FIRST)
-    watched.command(FIRST, time=0.0)
-    watched.simulator.AdvanceTo(0.3)
-    watched.command(SECOND, time=0.3)
-    pose, holding = watched.read()
-    np.testing.assert_array_equal(pose, SECOND)
-    assert holding == 0.0
+def test_a_stale_command_gives_way_to_the_last_one_that_was_followed():
+    watched = Watched(FIRST, time=0.0)
+    watched.advance(TIMEOUT)
+    watched.check(FIRST, holding=0)
+    # Found at the first check at which it is stale: a period after the timeout at the latest.
+    watched.advance(2.5 * PERIOD)
+    watched.check(FIRST, holding=1)
+    watched.command(SECOND, time=0.0)  # an old message that arrives late
+    watched.check(FIRST, holding=1)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
+def test_a_fresh_command_after_a_stale_one_counts_at_once(phase):
+    watched = Watched(FIRST, time=0.0)
+    watched.advance(3 * TIMEOUT + phase * PERIOD)
+    watched.check(FIRST, holding=1)
+    watched.command(SECOND, time=watched.context.get_time())
+    watched.check(SECOND, holding=0)
+
+
+def test_a_command_that_arrives_late_and_gets_stale_at_once_is_what_is_held():
+    watched = Watched(FIRST, time=0.0)
+    watched.advance(4.5 * PERIOD)
+    # Still followed, and stale at the very next check.
+    watched.command(SECOND, time=watched.context.get_time() - TIMEOUT - 0.25 * PERIOD)
+    watched.check(SECOND, holding=0)
+    watched.advance(PERIOD)
+    watched.check(SECOND, holding=1)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
+def test_a_command_from_the_future_is_never_followed(phase):
+    """It would never get stale."""
+    watched = Watched(FIRST, time=0.0)
+    watched.advance(3 * PERIOD + phase * PERIOD)
+    for ahead in (1.5 * PERIOD, 1000.0, np.inf):
+        watched.command(SECOND, time=watched.context.get_time() + ahead)
+        watched.check(FIRST, holding=1)
+    watched.advance(3 * PERIOD)
+    watched.check(FIRST, holding=1)
+
+
+def test_a_clock_that_is_ahead_by_less_than_a_period_is_no_reason_to_stop():
+    watched = Watched(FIRST, time=0.5 * PERIOD)
+    watched.check(FIRST, holding=0)
+
+
+def test_a_time_that_is_no_number_is_no_command():
+    watched = Watched(FIRST, time=np.nan)
+    watched.check(START, holding=1)
 
 
 @pytest.mark.parametrize("nonsense", [np.nan, np.inf])
 def test_before_any_command_it_holds_where_the_robot_is(nonsense):
     watched = Watched(np.full(6, nonsense))
-    watched.simulator.AdvanceTo(0.05)
-    pose, holding = watched.read()
-    np.testing.assert_array_equal(pose, START)
-    assert holding == 1.0
+    watched.check(START, holding=1)
+    watched.advance(3 * PERIOD)
+    watched.check(START, holding=1)
 
 
-@pytest.mark.parametrize(("period", "timeout"), [(0.0, 0.1), (0.01, 0.0), (np.nan, 0.1)])
-def test_refuses_what_makes_no_sense(period, timeout):
+def test_a_command_that_is_not_finite_gives_way_and_comes_back():
+    watched = Watched(FIRST)
+    watched.advance(3 * PERIOD)
+    watched.command(np.array([2.0, 2.0, np.nan, 2.0, 2.0, 2.0]))
+    watched.check(FIRST, holding=1)
+    watched.command(SECOND)
+    watched.check(SECOND, holding=0)
+
+
+@pytest.mark.parametrize("size", [1, 2, 7])
+def test_poses_of_any_size(size):
+    watched = Watched(np.full(size, np.nan), start=np.arange(float(size)))
+    watched.check(np.arange(float(size)), holding=1)
+    watched.command(np.ones(size))
+    watched.check(np.ones(size), holding=0)
+
+
+def test_a_reset_forgets():
+    watched = Watched(FIRST, time=0.0)
+    watched.advance(3 * TIMEOUT)
+    watched.context.SetTimeStateAndParametersFrom(watched.pristine)
+    watched.simulator.Initialize()
+    watched.check(FIRST, holding=0)
+    watched.command(np.full(6, np.nan))
+    watched.check(START, holding=1)
+
+
+def test_between_two_checks_nothing_is_computed_anew():
+    """Python that runs at every step of a plant is what makes a simulation slow."""
+    calls = []
+
+    class Counted(CommandWatchdog):
+        def _calc_safe_pose(self, context, output):
+            calls.append(context.get_time())
+            super()._calc_safe_pose(context, output)
+
+    builder = DiagramBuilder()
+    hold = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
+    time_hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
+    system = builder.AddSystem(Counted(PERIOD, TIMEOUT))
+    builder.Connect(hold.get_output_port(), system.get_desired_pose_input_port())
+    builder.Connect(time_hold.get_output_port(), system.get_command_time_input_port())
+    for name, port in (
+        ("command", hold.get_input_port()),
+        ("time", time_hold.get_input_port()),
+        ("pose", system.get_pose_input_port()),
+    ):
+        builder.ExportInput(port, name)
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    for name, value in (("command", FIRST), ("time", [0.0]), ("pose", START)):
+        diagram.GetInputPort(name).FixValue(context, value)
+    simulator.Initialize()
+    steps = 40
+    for step in range(8 * steps):
+        simulator.AdvanceTo((step + 0.5) * PERIOD / 8)
+        system.get_safe_pose_output_port().Eval(system.GetMyContextFromRoot(context))
+    assert len(calls) <= steps + 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [(0.0, 0.1), (0.01, 0.0), (np.nan, 0.1), (np.inf, 0.1), (0.01, np.nan), (0.01, 0.1, 0)]
+)
+def test_refuses_what_makes_no_sense(arguments):
     with pytest.raises(InputError):
-        CommandWatchdog(period, timeout)
+        CommandWatchdog(*arguments)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.constraint_violation import ConstraintViolation
 
@@ -45,5 +46,5 @@ def test_follows_constraints_that_change_from_step_to_step():
 
 
 def test_refuses_what_makes_no_sense():
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         ConstraintViolation(LinearConstraints.none(2), 0.0)

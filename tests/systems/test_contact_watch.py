@@ -16,6 +16,7 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
+from guiderail.models.errors import InputError
 from guiderail.systems.contact_watch import ContactWatch
 
 STEP = 2.0**-9
@@ -110,7 +111,7 @@ def test_refuses_what_makes_no_sense():
     plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=STEP), builder)
     body = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(0.1, RADIUS))
     plant.Finalize()
-    with pytest.raises(ValueError, match="overlap"):
+    with pytest.raises(InputError, match="overlap"):
         ContactWatch(plant, [body], [body], STEP)
-    with pytest.raises(ValueError, match="period"):
+    with pytest.raises(InputError, match="period"):
         ContactWatch(plant, [body], [plant.world_body()], 0.0)

@@ -1,6 +1,7 @@
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, Condition, EpisodeMonitor
 
 PERIOD = 0.1
@@ -89,5 +90,5 @@ def test_the_first_of_two_conditions_counts():
     ],
 )
 def test_refuses_what_makes_no_sense(make):
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         make()

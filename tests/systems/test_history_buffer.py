@@ -3,6 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
+from guiderail.models.errors import InputError
 from guiderail.systems.history_buffer import HistoryBuffer
 
 
@@ -100,7 +101,7 @@ def test_a_reset_forgets(system):
 
 @pytest.mark.parametrize("arguments", [(0, 3, 0.1), (2, 0, 0.1), (2, 3, 0.0), (2, 3, float("nan"))])
 def test_refuses_what_makes_no_sense(arguments):
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         HistoryBuffer(*arguments)
 
 

@@ -23,19 +23,19 @@ def lengths_under(forces, **arguments):
     return lengths
 
 
-def test_shrinks_in_contact_and_grows_back_patiently_without_skipping():
-    lengths = lengths_under([0, 0, 3, 3, 3, 3] + [0] * 9, patience=3)
+def test_gets_shorter_in_contact_and_longer_after_dwelling_in_free_space_one_length_at_a_time():
+    lengths = lengths_under([0, 0, 3, 3, 3, 3] + [0] * 9, dwell_steps=3)
     assert lengths == [10, 10, 5, 2, 1, 1, 1, 1, 2, 2, 2, 5, 5, 5, 10]
 
 
 def test_noise_about_a_threshold_changes_nothing():
     noisy = 1.5 + 0.4 * np.array([1, -1] * 20)
     assert set(lengths_under(noisy)) == {10}
-    assert lengths_under([3.0, 3.0, 3.0, *noisy], patience=1)[3:] == [1] * 40
+    assert lengths_under([3.0, 3.0, 3.0, *noisy], dwell_steps=1)[3:] == [1] * 40
 
 
-def test_a_touch_in_between_starts_the_waiting_anew():
-    assert lengths_under([3, 3, 3, 0, 0, 3, 0, 0], patience=3)[2:] == [1] * 6
+def test_a_contact_in_between_restarts_the_dwelling():
+    assert lengths_under([3, 3, 3, 0, 0, 3, 0, 0], dwell_steps=3)[2:] == [1] * 6
 
 
 def test_torques_are_no_contact():
@@ -44,7 +44,13 @@ def test_torques_are_no_contact():
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"touch": 1.0, "release": 2.0}, {"patience": 0}, {"wrench_size": 0}, {"lengths": []}, {"lengths": [0, 3]}],
+    [
+        {"contact_threshold": 1.0, "release_threshold": 2.0},
+        {"dwell_steps": 0},
+        {"wrench_size": 0},
+        {"lengths": []},
+        {"lengths": [0, 3]},
+    ],
 )
 def test_what_makes_no_sense_is_refused(arguments):
     with pytest.raises(InputError):

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.systems.mean_force import MeanForce
 
 
@@ -23,5 +24,5 @@ def test_averages_over_the_control_step_and_forgets_the_one_before():
 
 @pytest.mark.parametrize("arguments", [(0, 4, 0.1), (2, 0, 0.1), (2, 4, 0.0)])
 def test_refuses_what_makes_no_sense(arguments):
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         MeanForce(*arguments)

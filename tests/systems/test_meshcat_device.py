@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.systems.meshcat_device import MeshcatDevice
 
 AXES = [(0, 1.0), (1, -1.0)]
@@ -65,5 +66,5 @@ def test_a_gamepad_with_fewer_axes_is_no_error(browser):
 
 @pytest.mark.parametrize(("axes", "keys", "period"), [(AXES, KEYS, 0.0), (AXES, KEYS[:1], 0.1), ([], [], 0.1)])
 def test_refuses_what_makes_no_sense(browser, axes, keys, period):
-    with pytest.raises(ValueError, match=r"device|period"):
+    with pytest.raises(InputError, match=r"device|period"):
         MeshcatDevice(browser, axes, keys, period)

@@ -38,6 +38,20 @@ def test_a_row_is_a_command_and_what_it_led_to(ramp):
     np.testing.assert_allclose(recording.times, [0, PERIOD, 2 * PERIOD])
 
 
+@pytest.mark.parametrize("period", [0.02, 0.1, 1 / 3, 0.007])
+def test_records_each_command_exactly_once_whatever_the_rounding_of_time(period):
+    builder = DiagramBuilder()
+    line = PiecewisePolynomial.FirstOrderHold([0.0, 1000 * period], np.array([[0.0, 1000.0]]))
+    source = builder.AddSystem(TrajectorySource(line))
+    hold = builder.AddSystem(ZeroOrderHold(period, 1))
+    recorder = builder.AddSystem(Recorder({"command": 1}, num_samples=400, period=period))
+    builder.Connect(source.get_output_port(), hold.get_input_port())
+    builder.Connect(hold.get_output_port(), recorder.get_signal_input_port("command"))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(400.5 * period)
+    np.testing.assert_allclose(read(simulator, recorder)["command"][:, 0], np.arange(400), atol=1e-9)
+
+
 def test_stops_when_it_is_full(ramp):
     simulator, recorder = ramp
     simulator.AdvanceTo(20 * PERIOD)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from guiderail.models.errors import InputError
 from guiderail.systems.reward_system import RewardSystem, RewardTerm
 
 
@@ -36,6 +37,11 @@ def test_is_the_sum_of_its_terms(system, context):
     assert system.get_reward_output_port().Eval(context) == [0.0]
 
 
+def test_a_term_that_there_is_not_is_refused_with_those_that_there_are(system):
+    with pytest.raises(InputError, match="'speed', only effort, height"):
+        system.get_term_output_port("speed")
+
+
 def test_follows_its_inputs(system, context):
     system.get_reward_output_port().Eval(context)
     system.get_signal_input_port("pose").FixValue(context, [1.0, 4.0])
@@ -65,5 +71,5 @@ def test_evaluates_each_term_once_however_many_ports_are_read():
     ],
 )
 def test_refuses_what_makes_no_sense(terms):
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         RewardSystem(terms)

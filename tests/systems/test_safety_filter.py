@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.safety_filter import SafetyFilter
@@ -53,5 +54,5 @@ def test_the_command_stays_what_it_is_between_control_steps(system):
 
 
 def test_refuses_what_makes_no_sense():
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         SafetyFilter(KeepOut([[0, 0]], [[1, 1]], LinearConstraints.none(2), 0.1), period=0.0)

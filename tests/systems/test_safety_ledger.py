@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.systems.safety_ledger import SafetyLedger
 
 PERIOD = 0.1
@@ -111,5 +112,5 @@ def test_a_reset_empties_it():
 
 @pytest.mark.parametrize("arguments", [(0.0,), (float("nan"),), (0.1, 0)])
 def test_refuses_what_makes_no_sense(arguments):
-    with pytest.raises(ValueError):
+    with pytest.raises(InputError):
         SafetyLedger(*arguments)

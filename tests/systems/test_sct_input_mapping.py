@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills import load_skill
 from guiderail.systems.sct_input_mapping import SctInputMapping
@@ -59,6 +60,11 @@ def test_a_reset_can_move_an_object(system):
     np.testing.assert_allclose(aside, POSE, atol=1e-12)
 
 
+def test_an_object_that_the_skill_does_not_have_is_refused(system):
+    with pytest.raises(InputError, match="no frame cup, only mug_tip"):
+        system.frames.set(system.CreateDefaultContext(), {"cup": RigidTransform()})
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_stays_visible(system, bad):
     assert np.isnan(requested(system, np.array([0.0, bad, 0.0]), 1)).all()
@@ -66,7 +72,7 @@ def test_what_is_not_finite_stays_visible(system, bad):
 
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan")])
 def test_refuses_what_makes_no_sense(skill, period):
-    with pytest.raises(ValueError, match="period"):
+    with pytest.raises(InputError, match="period"):
         SctInputMapping(skill, FRAMES, period)
-    with pytest.raises(ValueError, match="mug_tip"):
+    with pytest.raises(InputError, match="mug_tip"):
         SctInputMapping(skill, {}, PERIOD)

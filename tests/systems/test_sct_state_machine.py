@@ -3,6 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
+from guiderail.models.errors import InputError
 from guiderail.models.skills import load_skill
 from guiderail.systems.sct_state_machine import SctStateMachine
 
@@ -82,7 +83,7 @@ def test_distance_and_progress_are_the_skills(skill):
 
 
 def test_refuses_what_makes_no_sense(skill):
-    with pytest.raises(ValueError, match="period"):
+    with pytest.raises(InputError, match="period"):
         SctStateMachine(skill, FRAMES, 0.0)
-    with pytest.raises(ValueError, match="mug_tip"):
+    with pytest.raises(InputError, match="mug_tip"):
         SctStateMachine(skill, {}, PERIOD)

@@ -1,23 +1,29 @@
-"""What systems share that look at something once a control step."""
+"""Control periods, and inputs that are sampled once in each."""
 
+import numpy as np
 from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, EventStatus, InputPort, LeafSystem
+
+from guiderail.models.errors import InputError
 
 
 def check_period(period: float) -> None:
-    """Refuses a control period that is none.
+    """Refuses a period that no event can have.
+
+    Args:
+        period: [s].
 
     Raises:
-        ValueError: if it isn't positive.
+        InputError: if it is not positive and finite.
     """
-    if not period > 0:
-        raise ValueError(f"the control period must be positive, not {period} s")
+    if not 0.0 < period < np.inf:
+        raise InputError(f"a system's period must be positive and finite, not {period} s")
 
 
 def declare_sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
-    """Declares a state of `system`: what `port` was at the last control step, and at first at initialization.
+    """Declares a discrete state of `system` that holds `port`, sampled at initialization and once a period.
 
     Raises:
-        ValueError: if the period isn't positive.
+        InputError: if the period is not positive and finite.
     """
     check_period(period)
     state = system.DeclareDiscreteState(port.size())

@@ -3,19 +3,20 @@
 from collections.abc import Mapping
 
 import numpy as np
-from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
 
+from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.skills.skill import Skill
+from guiderail.systems.support.caching import declare_cache
 
 
 class SkillFrames:
-    """Declares the frames of a skill as numeric parameters of a LeafSystem, and gives them back as poses.
+    """Declares the frames of a skill as numeric parameters of a LeafSystem, and returns them as poses.
 
-    They are parameters and not inputs because they hold for an episode: a guidance diagram keeps the ports that all
-    guidance has, and a reset moves an object by `set`.
+    They are parameters and not inputs because they are constant during an episode: a guidance diagram keeps the ports
+    that all guidance has, and a reset moves an object by `set`.
     """
 
     def __init__(self, system: LeafSystem, skill: Skill, frames: Mapping[str, RigidTransform]):
@@ -23,29 +24,25 @@ class SkillFrames:
         Args:
             system: the system that has the parameters; its outputs depend on `ticket`.
             skill: whose frames they are.
-            frames: their poses by default, one for each name.
+            frames: their default poses, one for each name.
 
         Raises:
-            ValueError: if a frame of the skill is missing.
+            InputError: if a frame of the skill is missing.
         """
         missing = [name for name in skill.frames if name not in frames]
         if missing:
-            raise ValueError(f"the skill {skill.name} needs the frame {missing[0]}")
+            raise InputError(f"the skill {skill.name} needs the frame {missing[0]}: give its pose")
         self._names = skill.frames
         self._indices = [
             system.DeclareNumericParameter(BasicVector(transform_to_pose(frames[name]))) for name in skill.frames
         ]
-        self._cache = system.DeclareCacheEntry(
-            "skill_frames",
-            ValueProducer(
-                allocate=lambda: Value[object]({}), calc=lambda context, value: value.set_value(self._calc(context))
-            ),
-            {system.all_parameters_ticket()},
+        self._cache = declare_cache(
+            system, "skill_frames", self._calc, prerequisites_of_calc={system.all_parameters_ticket()}
         )
 
     @property
-    def ticket(self):
-        """What depends on the frames depends on this."""
+    def ticket(self) -> DependencyTicket:
+        """What is computed from the frames depends on this."""
         return self._cache.ticket()
 
     @property
@@ -54,12 +51,18 @@ class SkillFrames:
         return self._names
 
     def eval(self, context: Context) -> dict[str, RigidTransform]:
-        """The poses by name."""
+        """The poses by name; `context` is the system's."""
         return self._cache.Eval(context)
 
     def set(self, context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Moves frames in the system's context; the others stay where they are."""
+        """Moves frames in the system's context; those that are not named stay where they are.
+
+        Raises:
+            InputError: if the skill has no such frame.
+        """
         for name, X_WF in frames.items():
+            if name not in self._names:
+                raise InputError(f"the skill has no frame {name}, only {', '.join(self._names)}")
             index = self._indices[self._names.index(name)]
             context.get_mutable_numeric_parameter(index).SetFromVector(transform_to_pose(X_WF))
 

@@ -1,0 +1,1 @@
+"""What several systems are made of, and what is no LeafSystem itself."""

@@ -1,0 +1,41 @@
+import pytest
+from pydrake.systems.framework import LeafSystem
+
+from guiderail.models.errors import InputError
+from guiderail.systems.support.signal_ports import SignalPorts
+
+
+@pytest.fixture
+def system():
+    return LeafSystem()
+
+
+def test_signals_of_one_name_share_a_port_in_the_order_of_their_first_mention(system):
+    signals = SignalPorts(system, {"pose": 2, "force": 1}, {"force": 1, "action": 3})
+    names = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
+    assert names == ["pose", "force", "action"]
+    assert signals.port("action") is system.get_input_port(2)
+    assert {int(t) for t in signals.tickets} == {int(system.get_input_port(i).ticket()) for i in range(3)}
+
+
+def test_are_read_together(system):
+    signals = SignalPorts(system, {"pose": 2, "force": 1})
+    context = system.CreateDefaultContext()
+    signals.port("pose").FixValue(context, [1.0, 2.0])
+    signals.port("force").FixValue(context, [3.0])
+    assert {name: value.tolist() for name, value in signals.eval(context).items()} == {"pose": [1, 2], "force": [3]}
+
+
+def test_one_name_has_one_size(system):
+    with pytest.raises(InputError, match="'pose' can't be of size 2 and 6"):
+        SignalPorts(system, {"pose": 2}, {"pose": 6})
+
+
+def test_a_signal_has_at_least_one_number(system):
+    with pytest.raises(InputError, match="'pose'"):
+        SignalPorts(system, {"pose": 0})
+
+
+def test_a_name_that_there_is_not_is_refused_with_those_that_there_are(system):
+    with pytest.raises(InputError, match="'wrench', only pose, force"):
+        SignalPorts(system, {"pose": 2, "force": 1}).port("wrench")

@@ -1,0 +1,199 @@
+"""What holds for every LeafSystem of the project, so that who knows one finds their way in all of them."""
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, LeafSystem, OutputPort, ValueProducer
+
+import guiderail.systems
+from guiderail import systems
+from guiderail.diagrams.stations.arm import controller_model
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.models.keep_out import KeepOut
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
+from guiderail.models.skills import load_skill
+
+FOLDER = Path(guiderail.systems.__file__).parent
+TESTS = Path(__file__).parent
+FILES = sorted(path for path in FOLDER.glob("*.py") if path.stem != "__init__")
+PERIOD = 0.125
+BOX = LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
+
+
+def classes(path):
+    return [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef)]
+
+
+def system_names(path):
+    return [c.name for c in classes(path) if any(isinstance(b, ast.Name) and b.id == "LeafSystem" for b in c.bases)]
+
+
+NAMES = [name for path in FILES for name in system_names(path)]
+
+
+def primitive(history):
+    times = PERIOD * np.arange(20)
+    reference = ReferenceTrajectory(times, np.column_stack([times, times]), np.tile(0.01 * np.eye(2), (20, 1, 1)))
+    return LcNsKmp(reference, history=history, horizon=4)
+
+
+@pytest.fixture(scope="module")
+def built():
+    """One instance of each system, with every port that it can have."""
+    plant, arm = controller_model(BncWorkcell())
+    skill, frames = load_skill("pouring"), {"mug_tip": RigidTransform()}
+    body, other = arm.tool[0], plant.world_body()
+    gains = systems.ImpedanceGains(np.eye(6), np.ones(6), np.zeros(7))
+    condition = systems.Condition("success", {"u": 2}, lambda u: False)
+    term = systems.RewardTerm("cost", {"u": 2}, lambda u: 0.0)
+    browser = SimpleNamespace(AddSlider=lambda *arguments: None)
+    instances = [
+        systems.ActiveConstraintProjector(skill, frames, PERIOD),
+        systems.CartesianImpedanceController(plant, arm.target, arm.tool_centre, gains, period=PERIOD),
+        systems.CartesianPositionController(plant, arm.target, arm.tool_centre, posture=np.zeros(7), period=PERIOD),
+        systems.CommandWatchdog(PERIOD),
+        systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
+        systems.ContactWatch(plant, [body], [other], PERIOD),
+        systems.EpisodeMonitor([condition], PERIOD),
+        systems.HistoryBuffer(2, 3, PERIOD),
+        systems.HistoryLengthSchedule([1, 2], PERIOD),
+        systems.ImpedanceMonitor(np.ones(6)),
+        systems.JointTorqueWrench(plant, arm.target, arm.tool_centre, period=PERIOD, time_constant=0.0),
+        systems.LcNsKmpSystem(primitive(2), None, PERIOD, [(primitive(1), np.ones(2))]),
+        systems.MeanForce(2, 4, PERIOD),
+        systems.MeasuredPose(plant, body, RigidTransform()),
+        systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
+        systems.Recorder({"u": 2}, 4, PERIOD),
+        systems.RelativePoses(plant, [body], other),
+        systems.Residual(np.ones(2)),
+        systems.RewardSystem([term]),
+        systems.SafetyFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0), PERIOD),
+        systems.SafetyLedger(PERIOD),
+        systems.SctInputMapping(skill, frames, PERIOD),
+        systems.SctStateMachine(skill, frames, PERIOD),
+        systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_centre, RotationMatrix(), PERIOD, 0.0),
+    ]
+    return {type(instance).__name__: instance for instance in instances}
+
+
+@pytest.fixture(params=NAMES)
+def system(request, built):
+    return built[request.param]
+
+
+def ports(system):
+    """Kind, name and port of all of them."""
+    for kind in ("input", "output"):
+        for index in range(getattr(system, f"num_{kind}_ports")()):
+            port = getattr(system, f"get_{kind}_port")(index)
+            yield kind, port.get_name(), port
+
+
+def getters(system, kind):
+    return {name: getattr(system, name) for name in vars(type(system)) if re.fullmatch(rf"get_\w+_{kind}_port", name)}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_file_holds_one_system_that_has_its_name_is_exported_and_tested(path):
+    (name,) = system_names(path)
+    assert re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() == path.stem
+    assert issubclass(getattr(systems, name), LeafSystem)
+    assert (TESTS / f"test_{path.stem}.py").is_file()
+
+
+def test_what_is_no_system_is_elsewhere():
+    for path in (FOLDER / "support").glob("*.py"):
+        assert not system_names(path), path
+
+
+def test_everything_public_is_exported():
+    public = {c.name for path in FILES for c in classes(path) if not c.name.startswith("_")}
+    assert public <= set(systems.__all__)
+    assert set(systems.__all__) <= set(dir(systems))
+    for name in systems.__all__:
+        assert getattr(systems, name) is not None
+    with pytest.raises(AttributeError, match="Nothing"):
+        systems.Nothing  # noqa: B018
+
+
+def test_one_system_is_imported_without_the_others():
+    program = "import sys; from guiderail.systems import Recorder; print('sklearn' in sys.modules)"
+    finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert finished.stdout.strip() == "False"
+
+
+def test_every_system_is_examined_here(built):
+    assert sorted(built) == sorted(NAMES)
+
+
+def test_every_port_has_a_documented_getter(system):
+    for kind, name, port in ports(system):
+        methods = getters(system, kind)
+        method = methods.get(f"get_{name}_{kind}_port")
+        if method is not None:
+            assert getattr(system, f"_{name}_port") is port
+            found = method()
+        else:
+            # Ports whose names the constructor is given have one getter, by name.
+            (method,) = (m for m in methods.values() if "name" in inspect.signature(m).parameters)
+            found = method(name)
+        assert found is port
+        assert inspect.signature(method).return_annotation is (InputPort if kind == "input" else OutputPort)
+        assert inspect.getdoc(method)
+
+
+def test_the_documented_ports_are_those_that_there_are(system):
+    (block,) = re.findall(r"\.\. pydrake_system::\n\n((?:    .*\n)+)", inspect.getdoc(type(system)) + "\n")
+    assert re.search(r"name: (\w+)", block)[1] == type(system).__name__
+    for kind in ("input", "output"):
+        documented = re.search(rf"{kind}_ports:\n((?: *- .*\n)+)", block)
+        lines = re.findall(r"- (.*)", documented[1]) if documented else []
+        actual = [name for k, name, _ in ports(system) if k == kind]
+        named = [line.split(" (")[0] for line in lines if not line.startswith("one per ")]
+        assert actual[: len(named)] == named
+        assert len(actual) == len(named) or len(named) < len(lines)
+
+
+def test_no_output_depends_on_time_or_on_everything(system):
+    """A cache entry's prerequisites are what it is computed anew for, and what counts as direct feedthrough."""
+    nothing, parameters = system.nothing_ticket(), system.all_parameters_ticket()
+    probe = system.DeclareCacheEntry(
+        "probe", ValueProducer(allocate=lambda: Value(0), calc=lambda context, value: None), {nothing}
+    )
+    entries = [system.get_cache_entry(CacheIndex(i)) for i in range(int(probe.cache_index()))]
+    declared = {int(e.ticket()): e for e in entries if int(e.ticket()) > int(system.configuration_ticket())}
+    sources = {int(nothing), int(parameters)}
+    sources |= {int(port.ticket()) for kind, _, port in ports(system) if kind == "input"}
+    states = range(system.CreateDefaultContext().num_discrete_state_groups())
+    sources |= {int(system.discrete_state_ticket(DiscreteStateIndex(i))) for i in states}
+    outputs = [e for e in entries if e.description().startswith("output port ")]
+    assert len(outputs) == system.num_output_ports()
+    pending = list(outputs)
+    while pending:
+        entry = pending.pop()
+        assert not entry.has_default_prerequisites(), entry.description()
+        for ticket in map(int, entry.prerequisites()):
+            if ticket in declared:
+                pending.append(declared[ticket])
+            else:
+                assert ticket in sources, f"{entry.description()} depends on ticket {ticket}"
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")), ids=lambda path: path.stem)
+def test_prerequisites_are_given_by_keyword_and_users_get_an_input_error(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            name = node.func.attr
+            if name in ("DeclareVectorOutputPort", "DeclareAbstractOutputPort", "DeclareCacheEntry"):
+                assert "prerequisites_of_calc" in {keyword.arg for keyword in node.keywords}, f"line {node.lineno}"
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+            assert node.exc.func.id in ("InputError", "AttributeError"), f"line {node.lineno}"
