@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from guiderail.systems.mean_force import MeanForce
     from guiderail.systems.measured_pose import MeasuredPose
     from guiderail.systems.meshcat_device import MeshcatDevice
+    from guiderail.systems.policy_system import PolicyError, PolicySystem
     from guiderail.systems.recorder import Recorder, Recording
     from guiderail.systems.relative_poses import RelativePoses
     from guiderail.systems.residual import Residual
@@ -53,6 +54,8 @@ __all__ = [
     "MeanForce",
     "MeasuredPose",
     "MeshcatDevice",
+    "PolicyError",
+    "PolicySystem",
     "Recorder",
     "Recording",
     "RelativePoses",
@@ -72,6 +75,7 @@ _SYSTEM_OF = {
     "TERMINATIONS": "EpisodeMonitor",
     "Condition": "EpisodeMonitor",
     "ImpedanceGains": "CartesianImpedanceController",
+    "PolicyError": "PolicySystem",
     "Recording": "Recorder",
     "RewardTerm": "RewardSystem",
     "SpeedLimits": "CartesianPositionController",

@@ -72,6 +72,7 @@ def built():
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),
         systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
+        systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
         systems.Recorder({"u": 2}, 4, PERIOD),
         systems.RelativePoses(plant, [body], other),
         systems.Residual(np.ones(2)),
@@ -196,4 +197,4 @@ def test_prerequisites_are_given_by_keyword_and_users_get_an_input_error(path):
             if name in ("DeclareVectorOutputPort", "DeclareAbstractOutputPort", "DeclareCacheEntry"):
                 assert "prerequisites_of_calc" in {keyword.arg for keyword in node.keywords}, f"line {node.lineno}"
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            assert node.exc.func.id in ("InputError", "AttributeError"), f"line {node.lineno}"
+            assert node.exc.func.id in ("InputError", "PolicyError", "AttributeError"), f"line {node.lineno}"

@@ -1,0 +1,198 @@
+"""The policy in a diagram: what it observes, when it acts, and that an environment does the same."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
+from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
+from pydrake.systems.sensors import ImageRgba8U
+
+from guiderail.diagrams.tasks.narrow_passage import make_env
+from guiderail.models.errors import InputError
+from guiderail.systems.policy_system import PolicyError, PolicySystem
+
+PERIOD = 2.0**-5
+
+
+class Counter(LeafSystem):
+    """How many periods have begun: 1 after the discrete updates of time zero, n + 1 after those of n · PERIOD."""
+
+    def __init__(self):
+        super().__init__()
+        count = self.DeclareDiscreteState(1)
+        self.DeclareStateOutputPort("count", count)
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self._increment)
+
+    def _increment(self, context, discrete_state):
+        discrete_state.set_value(context.get_discrete_state(0).value() + 1)
+        return EventStatus.Succeeded()
+
+
+class Loop:
+    """A counter that a policy observes, and the hold of the control period behind that policy."""
+
+    def __init__(self, policy, hold=1):
+        builder = DiagramBuilder()
+        counter = builder.AddSystem(Counter())
+        self.system = builder.AddSystem(PolicySystem(policy, 1, 1, hold * PERIOD))
+        self.hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
+        builder.Connect(counter.get_output_port(), self.system.get_observation_input_port())
+        builder.Connect(self.system.get_action_output_port(), self.hold.get_input_port())
+        self.simulator = Simulator(builder.Build())
+        self.context = self.simulator.get_mutable_context()
+        self.pristine = self.context.Clone()
+        self.simulator.Initialize()
+
+    def reset(self):
+        self.context.SetTimeStateAndParametersFrom(self.pristine)
+        self.simulator.Initialize()
+
+    def read(self, system):
+        return float(system.get_output_port().Eval(system.GetMyContextFromRoot(self.context))[0])
+
+    def held(self, steps):
+        """What is held during each of the next control steps."""
+        held = []
+        for _ in range(steps):
+            # To the middle of a step: then all events of its first instant are over.
+            n = int(self.context.get_time() / PERIOD + 0.5)
+            self.simulator.AdvanceTo((n + 0.5) * PERIOD)
+            held.append(self.read(self.hold))
+        return held
+
+
+def tenth(observation):
+    return observation / 16.0
+
+
+def test_acts_before_the_discrete_updates_of_its_instant():
+    """The policy sees the counter from before the instant, and the hold takes the new action in at the same one."""
+    assert Loop(tenth).held(5) == [0.0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]
+
+
+def test_one_period_later_is_what_a_discrete_update_would_give():
+    """The counterexample: a system that acts by a discrete update is a step late, so the order above is no accident."""
+
+    class Late(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.observation = self.DeclareVectorInputPort("observation", 1)
+            self.DeclareStateOutputPort("action", self.DeclareDiscreteState(1))
+            self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self.decide)
+
+        def decide(self, context, discrete_state):
+            discrete_state.set_value(tenth(self.observation.Eval(context)))
+
+    builder = DiagramBuilder()
+    counter, late, hold = (builder.AddSystem(s) for s in (Counter(), Late(), ZeroOrderHold(PERIOD, 1)))
+    builder.Connect(counter.get_output_port(), late.get_input_port())
+    builder.Connect(late.get_output_port(), hold.get_input_port())
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(3.5 * PERIOD)
+    assert hold.get_output_port().Eval(hold.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
+
+
+def test_an_action_lasts_until_the_next_decision():
+    calls = []
+    loop = Loop(lambda observation: calls.append(observation) or tenth(observation), hold=4)
+    assert loop.held(10) == [0.0] * 4 + [4 / 16] * 4 + [8 / 16] * 2
+    assert [c.tolist() for c in calls] == [[0.0], [4.0], [8.0]]
+
+
+def test_no_action_before_the_first_decision_and_after_a_reset():
+    loop = Loop(lambda observation: np.ones(1))
+    assert loop.read(loop.system) == 0.0
+    assert loop.held(3) == [1.0] * 3
+    loop.reset()
+    assert loop.read(loop.system) == 0.0
+    assert loop.held(2) == [1.0] * 2
+
+
+def test_the_action_never_feeds_through():
+    assert not PolicySystem(tenth, 3, 3, PERIOD).HasAnyDirectFeedthrough()
+
+
+def test_observes_what_an_environment_returns():
+    """A vector as float32; an image without its alpha, as a copy that outlives the simulation."""
+    seen = []
+
+    def policy(observation):
+        seen.append(observation)
+        return np.zeros(1)
+
+    Loop(policy).held(1)
+    image = ImageRgba8U(4, 3)
+    image.mutable_data[:] = np.arange(48, dtype=np.uint8).reshape(3, 4, 4)
+    builder = DiagramBuilder()
+    camera = builder.AddSystem(ConstantValueSource(Value(image)))
+    system = builder.AddSystem(PolicySystem(policy, Value(ImageRgba8U()), 1, PERIOD))
+    builder.Connect(camera.get_output_port(), system.get_observation_input_port())
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(0.5 * PERIOD)
+    assert seen[0].dtype == np.float32
+    assert seen[1].dtype == np.uint8
+    np.testing.assert_array_equal(seen[1], image.data[:, :, :3])
+
+
+def test_actions_beyond_the_action_space_are_clipped_as_an_environment_clips_them():
+    assert Loop(lambda observation: np.array([3.0])).held(1) == [1.0]
+
+
+@pytest.mark.parametrize(
+    "returned", [[np.nan], [np.inf], [0.0, 0.0], 0.0, [[0.0]], [], None, "forward", (np.zeros(1), None)]
+)
+def test_a_policy_that_returns_no_action_stops_the_robot(returned):
+    loop = Loop(lambda observation: returned)
+    with pytest.raises(PolicyError, match="the robot must stop"):
+        loop.held(1)
+    assert loop.read(loop.system) == 0.0
+
+
+def test_an_error_of_the_policy_itself_is_not_hidden():
+    def broken(observation):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        Loop(broken).held(1)
+
+
+@pytest.mark.parametrize(
+    "arguments", [(0, 1, PERIOD), (1, 0, PERIOD), (1, 1, 0.0), (1, 1, np.nan), (Value(ImageRgba8U()), 0, PERIOD)]
+)
+def test_refuses_what_makes_no_sense(arguments):
+    with pytest.raises(InputError):
+        PolicySystem(tenth, *arguments)
+
+
+@pytest.mark.parametrize("hold", [1, 5])
+def test_a_simulator_does_bit_for_bit_what_the_environment_does(hold):
+    """The narrow passage under sKGRL, with a policy that depends on everything it observes."""
+    steps = 30
+
+    def policy(observation):
+        return np.sin(np.array([[3.0], [-5.0]]) * observation.sum() + [[0.3], [1.1]])[:, 0]
+
+    env = make_env(guidance="skgrl", hold=hold)
+    observation, info = env.reset(seed=7)
+    while info["control_steps"] < steps:
+        observation, *_, info = env.step(policy(observation))
+    commanded, measured = (np.array(rows)[:steps] for rows in (env.trace.commanded, env.trace.measured))
+
+    task = make_env(guidance="skgrl", hold=hold).task
+    builder = DiagramBuilder()
+    diagram = builder.AddSystem(task.diagram)
+    system = PolicySystem(policy, task.observation_space.shape[0], 2, hold * task.control_period)
+    builder.AddSystem(system)
+    builder.Connect(diagram.GetOutputPort("observation"), system.get_observation_input_port())
+    builder.Connect(system.get_action_output_port(), diagram.GetInputPort("action"))
+    simulator = Simulator(builder.Build())
+    context = simulator.get_mutable_context()
+    task.randomize(context, np.random.Generator(np.random.PCG64(7)), {})
+    simulator.Initialize()
+    for n in range(steps):
+        simulator.AdvanceTo((n + 1) * task.control_period)
+        own = diagram.GetMyContextFromRoot(context)
+        np.testing.assert_array_equal(diagram.GetOutputPort("desired_pose").Eval(own), commanded[n])
+        np.testing.assert_array_equal(diagram.GetOutputPort("pose").Eval(own), measured[n])
+    assert np.abs(np.diff(commanded, axis=0)).max() > 0.0
