@@ -28,7 +28,7 @@ class Vessel:
     bottom: float = 0.006  # [m]
     mass: float = 0.3  # [kg]
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("inner_diameter", "depth", "wall", "bottom", "mass"):
             if not 0 < getattr(self, name) < np.inf:
                 raise InputError(f"A vessel's {name} must be positive, not {getattr(self, name)}.")

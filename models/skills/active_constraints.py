@@ -61,7 +61,7 @@ class PositionConstraint(ActiveConstraint):
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         """The allowed position for p_FE [m]; a new array or the very same one where it is allowed."""
 
-    def project(self, X_WE, frames):
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
         p_FE = position_in(self.frame, X_WE, frames)
         p_FP = self.project_position(p_FE)
         # An allowed pose is returned untouched: the way through the frame and back would cost the last digits.
@@ -77,10 +77,10 @@ class HalfSpace(PositionConstraint):
     offset_m: float
     frame: str = WORLD
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(len(self.normal) == 3 and np.any(self.normal), f"normal must be three numbers, not {self.normal}.")
 
-    def project_position(self, p_FE):
+    def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         short = self.offset_m - normal @ p_FE
         return p_FE if short <= 0 else p_FE + short * normal
@@ -95,11 +95,11 @@ class Box(PositionConstraint):
     upper_m: tuple[float, ...]
     frame: str = WORLD
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(len(self.lower_m) == len(self.upper_m) == 3, "lower_m and upper_m must be three numbers each.")
         require(np.all(np.less_equal(self.lower_m, self.upper_m)), "lower_m must not exceed upper_m.")
 
-    def project_position(self, p_FE):
+    def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         p_FP = np.clip(p_FE, self.lower_m, self.upper_m)
         return p_FE if np.array_equal(p_FP, p_FE) else p_FP
 
@@ -116,10 +116,10 @@ class Cylinder(PositionConstraint):
     min_radius_m: float = 0.0
     max_radius_m: float = UNBOUNDED
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(0 <= self.min_radius_m <= self.max_radius_m, "radii must satisfy 0 ≤ min_radius_m ≤ max_radius_m.")
 
-    def project_position(self, p_FE):
+    def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         radius = math.hypot(p_FE[0], p_FE[1])
         if self.min_radius_m <= radius <= self.max_radius_m:
             return p_FE
@@ -137,10 +137,10 @@ class Sector(PositionConstraint):
     min_deg: float
     max_deg: float
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(self.min_deg <= self.max_deg <= self.min_deg + 360, "angles must span 0 to 360 degrees.")
 
-    def project_position(self, p_FE):
+    def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         least, most = math.radians(self.min_deg), math.radians(self.max_deg)
         azimuth = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (least + most))
         if least <= azimuth <= most:
@@ -170,10 +170,10 @@ class KeepAbove(ActiveConstraint):
     frame: str = WORLD
     points_m: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0),)  # p_EP
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(len(self.points_m) > 0 and all(len(p) == 3 for p in self.points_m), "points_m are (x, y, z) each.")
 
-    def project(self, X_WE, frames):
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
         p_WP = X_WE.rotation().matrix() @ np.array(self.points_m).T + X_WE.translation()[:, np.newaxis]
         if self.frame == WORLD:
             up_W, origin = np.array([0.0, 0.0, 1.0]), 0.0
@@ -194,10 +194,10 @@ class Funnel(PositionConstraint):
     height_m: float  # at radius_m and inside of it
     slope: float  # rise over run
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(self.radius_m >= 0 and self.slope >= 0, "radius_m and slope must not be negative.")
 
-    def project_position(self, p_FE):
+    def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         radius = math.hypot(p_FE[0], p_FE[1])
         ceiling = self.height_m + self.slope * max(0.0, radius - self.radius_m)
         return p_FE if p_FE[2] <= ceiling else np.array([p_FE[0], p_FE[1], ceiling])
@@ -211,10 +211,10 @@ class FixedOrientation(ActiveConstraint):
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
     frame: str = WORLD
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(len(self.rpy_deg) == 3, f"rpy_deg must be three angles, not {len(self.rpy_deg)}.")
 
-    def project(self, X_WE, frames):
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
         R_FE = rotation_deg(self.rpy_deg)
         R_WE = R_FE if self.frame == WORLD else frames[self.frame].rotation().multiply(R_FE)
         return RigidTransform(R_WE, X_WE.translation())
@@ -253,7 +253,7 @@ class TiltConstraint(ActiveConstraint):
         R_FE = axes(self.frame, frames).InvertAndCompose(X_WE.rotation())
         return angle_about(axis, R_FE.multiply(R_FRest.inverse()).matrix())
 
-    def project(self, X_WE, frames):
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
         p_FE = position_in(self.frame, X_WE, frames)
         axis, R_FRest = tilt_axis(p_FE), self._at_rest(p_FE)
         least, most = (math.radians(limit) for limit in self.limits_deg(math.sqrt(p_FE @ p_FE)))
@@ -283,10 +283,10 @@ class TiltLimits(TiltConstraint):
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
     turns_along: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
 
-    def limits_deg(self, distance_m):
+    def limits_deg(self, distance_m: float) -> tuple[float, float]:
         return self.min_deg, self.max_deg
 
 
@@ -301,14 +301,14 @@ class TiltByDistance(TiltConstraint):
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
     turns_along: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(
             len(self.distance_m) == len(self.tilt_deg) >= 1 and np.all(np.diff(self.distance_m) > 0),
             "distance_m must increase, with one tilt_deg for each distance.",
         )
         require(min(self.tilt_deg) >= -180 and max(self.tilt_deg) <= 180, "tilt_deg must be between −180 and 180.")
 
-    def limits_deg(self, distance_m):
+    def limits_deg(self, distance_m: float) -> tuple[float, float]:
         tilt = interpolate(distance_m, self.distance_m, self.tilt_deg)
         return tilt, tilt
 
@@ -328,11 +328,11 @@ class Arc(ActiveConstraint):
     max_deg: float = 180.0
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
         require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
 
-    def project(self, X_WE, frames):
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
         p_FE = position_in(self.frame, X_WE, frames)
         least, most = np.deg2rad([self.min_deg, self.max_deg])
         angle = float(np.arctan2(p_FE[1], p_FE[0]))

@@ -58,7 +58,7 @@ class Translation(InputMapping):
     frame: str = WORLD
     axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _require_axes(self.inputs, self.axes)
         require(self.speed_m_per_s > 0, f"speed_m_per_s must be positive, not {self.speed_m_per_s}.")
 
@@ -66,7 +66,7 @@ class Translation(InputMapping):
     def used_inputs(self) -> tuple[int, ...]:
         return self.inputs
 
-    def displacement(self, inputs, X_WE, frames, period_s):
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         v_FE = self.speed_m_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
         return RigidTransform(RotationMatrix(), axes_in_world(self.frame, X_WE, frames) @ v_FE * period_s)
 
@@ -81,7 +81,7 @@ class Rotation(InputMapping):
     frame: str = WORLD
     axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         _require_axes(self.inputs, self.axes)
         require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
 
@@ -89,7 +89,7 @@ class Rotation(InputMapping):
     def used_inputs(self) -> tuple[int, ...]:
         return self.inputs
 
-    def displacement(self, inputs, X_WE, frames, period_s):
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         w_FE = self.speed_rad_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
         turn = axes_in_world(self.frame, X_WE, frames) @ w_FE * period_s
         angle = float(np.linalg.norm(turn))
@@ -105,7 +105,7 @@ class TiltTowards(InputMapping):
     speed_rad_per_s: float  # at full input
     frame: str
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(len(self.inputs) == 2, f"tilt_towards needs two inputs, x and y, not {len(self.inputs)}.")
         require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
 
@@ -113,7 +113,7 @@ class TiltTowards(InputMapping):
     def used_inputs(self) -> tuple[int, ...]:
         return self.inputs
 
-    def displacement(self, inputs, X_WE, frames, period_s):
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         p_FE = position_in(self.frame, X_WE, frames)
         along = float(np.clip(inputs[list(self.inputs)] @ bearing(p_FE)[:2], -1.0, 1.0))
         axis_W = axes_in_world(self.frame, X_WE, frames) @ tilt_axis(p_FE)
@@ -130,7 +130,7 @@ class Scaled(InputMapping):
     factor: tuple[float, ...]  # in [0, 1], one for each distance, linear in between
     of: InputMapping
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(
             len(self.distance_m) == len(self.factor) >= 1 and np.all(np.diff(self.distance_m) > 0),
             "distance_m must increase, with one factor for each distance.",
@@ -145,7 +145,7 @@ class Scaled(InputMapping):
     def frame_names(self) -> tuple[str, ...]:
         return (*super().frame_names, *self.of.frame_names)
 
-    def displacement(self, inputs, X_WE, frames, period_s):
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         distance = float(np.linalg.norm(position_in(self.frame, X_WE, frames)))
         factor = interpolate(distance, self.distance_m, self.factor)
         return self.of.displacement(factor * inputs, X_WE, frames, period_s)
@@ -164,7 +164,7 @@ class Uneven(InputMapping):
     below: float  # in (0, 1]
     of: InputMapping
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")
 
     @property
@@ -175,5 +175,5 @@ class Uneven(InputMapping):
     def frame_names(self) -> tuple[str, ...]:
         return self.of.frame_names
 
-    def displacement(self, inputs, X_WE, frames, period_s):
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         return self.of.displacement(np.where(inputs < 0.0, self.below, self.above) * inputs, X_WE, frames, period_s)

@@ -36,7 +36,7 @@ class Distance(TransitionDistance):
     frame: str
     point_m: tuple[float, ...] = (0.0, 0.0, 0.0)
 
-    def value(self, X_WE, frames):
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         p_PE = position_in(self.frame, X_WE, frames) - self.point_m
         return math.sqrt(p_PE @ p_PE)
 
@@ -48,7 +48,7 @@ class Height(TransitionDistance):
 
     frame: str
 
-    def value(self, X_WE, frames):
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return float(position_in(self.frame, X_WE, frames)[2])
 
 
@@ -59,7 +59,7 @@ class AxisDistance(TransitionDistance):
 
     frame: str
 
-    def value(self, X_WE, frames):
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return float(np.hypot(*position_in(self.frame, X_WE, frames)[:2]))
 
 
@@ -74,10 +74,10 @@ class TiltToGo(TransitionDistance):
     turns_along: bool = False  # as in the constraint on the tilt
     unit = "deg"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         require(-180 <= self.until_deg <= 180, f"until_deg must be between −180 and 180, not {self.until_deg}.")
 
-    def value(self, X_WE, frames):
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         tilt = TiltLimits(self.frame, -180.0, 180.0, self.rpy_deg, self.turns_along).tilt(X_WE, frames)
         return float(np.deg2rad(self.until_deg) - tilt)
 
@@ -91,5 +91,5 @@ class RotationToGo(TransitionDistance):
     frame: str = WORLD
     unit = "deg"
 
-    def value(self, X_WE, frames):
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return angle_between(X_WE.rotation(), axes(self.frame, frames).multiply(rotation_deg(self.rpy_deg)))

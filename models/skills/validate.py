@@ -4,7 +4,7 @@ The checks sample: they place the skill's objects and the end effector at random
 laws do. A mistake that shows in one pose of a few hundred is found, a rarer one may not be.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,8 @@ TOLERANCE = 1e-9  # [m or rad]
 GREEDY_STEPS = 400
 GREEDY_PERIOD = 0.05  # [s]
 CONTROL_PERIOD = 0.01  # [s]
+
+Scenes = Sequence[tuple[RigidTransform, Frames]]
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def _unreachable(skill: Skill) -> Iterator[Finding]:
             yield Finding(True, f"no transition leads to the state {state.name}; add one, or leave the state out")
 
 
-def _constraints(skill: Skill, scenes) -> Iterator[Finding]:
+def _constraints(skill: Skill, scenes: Scenes) -> Iterator[Finding]:
     """Each constraint idempotent; their sequence too, and inside every one of them."""
     for number, state in enumerate(skill.states):
         for i, constraint in enumerate(state.active_constraints):
@@ -115,7 +117,7 @@ def _difference(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
     )
 
 
-def _transitions(skill: Skill, scenes, rng: np.random.Generator) -> Iterator[Finding]:
+def _transitions(skill: Skill, scenes: Scenes, rng: np.random.Generator) -> Iterator[Finding]:
     """Some inputs, from some pose inside a state's constraints, bring its distance below every threshold."""
     for number, state in enumerate(skill.states):
         goals = [(f"the transition to {t.to}", t.below) for t in state.transitions]
@@ -160,7 +162,7 @@ def _greedy(skill: Skill, number: int, X_WE: RigidTransform, frames: Frames, eno
     return best
 
 
-def _jumps(skill: Skill, scenes) -> Iterator[Finding]:
+def _jumps(skill: Skill, scenes: Scenes) -> Iterator[Finding]:
     """What the next state's constraints would move at a transition is no more than one control step can."""
     for number, state in enumerate(skill.states):
         for transition in state.transitions:
