@@ -15,8 +15,9 @@ class JointTorqueWrench(LeafSystem):
 
         F = (Jᵀ)⁺ τ_external,  τ y' = F − y
 
-    τ_external are the measured joint torques less those of the arm's own weight and inertia; an iiwa computes them
-    itself. The pseudoinverse is damped: near a singular posture the estimate goes to zero instead of diverging.
+    τ_external are the measured joint torques less those of the arm's own weight and inertia; an arm with torque sensors
+    computes them itself. The pseudoinverse is damped: near a singular posture the estimate goes to zero instead of
+    diverging.
 
     .. pydrake_system::
 

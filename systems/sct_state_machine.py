@@ -22,10 +22,10 @@ from guiderail.systems.support.skill_frames import SkillFrames
 class SctStateMachine(LeafSystem):
     """Runs the finite state machine of a shared control template, by its transition distances.
 
-        q[k+1] = q[k] + 1 where d_q < threshold_q,  q[k] − 1 where d_{q−1} > threshold_{q−1} + hysteresis
+        q → q' where d_q < threshold of the transition to q',  q' → q where d_q > threshold + hysteresis
 
-    (`Skill.next_state`), on the pose just before the control instant: at most one transition each. An episode begins in
-    the state that the initial pose is in.
+    (`Skill.next_state`), for the pose just before the control instant, and at most one transition at each. An episode
+    begins in the state that the initial pose is in.
 
     .. pydrake_system::
 

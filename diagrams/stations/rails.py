@@ -24,6 +24,7 @@ from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
     PLANT_PERIOD,
     POSE_SIZE,
     Impedance,
@@ -82,7 +83,7 @@ class RailsStation(Station):
         )
         plant, self.rails = self.plant, carriage.model
 
-        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(time_step))
+        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
         # The desired pose is the desired state's first half; the desired velocity is zero, so that damping damps.
         desired_state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
         pose = builder.AddNamedSystem("pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)))

@@ -64,6 +64,7 @@ def built():
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.ContactWatch(plant, [body], [other], PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
+        systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ImpedanceMonitor(np.ones(6)),
