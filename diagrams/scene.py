@@ -12,6 +12,7 @@ Viewpoint = tuple[tuple[float, float, float], tuple[float, float, float]]
 """Where to look from, and where to look at, in the world [m]."""
 
 ARM_VIEW: Viewpoint = ((1.05, -0.75, 0.55), (0.42, 0.0, 0.32))
+TOOL_VIEW: Viewpoint = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.make import known
-from guiderail.diagrams.tasks.bnc_connector import HISTORY_VARIANCE, reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import RHO, reference_trajectory
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.models.smoothness import log_dimensionless_jerk, spectral_arc_length
@@ -57,7 +57,7 @@ def methods() -> list[Method]:
     for history, variance in ((10, 1e-8), (10, 1e-10), (10, 1e-11), (10, 1e-12), (2, 1e-11), (20, 1e-11)):
         settings = {"history": history, "history_variance": variance}
         listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", _white(), 1, settings))
-    usual = {"history": 10, "history_variance": HISTORY_VARIANCE}
+    usual = {"history": 10, "history_variance": RHO}
     listed.append(Method("sKGRL adaptive", "skgrl", _white(), 1, usual | {"adaptive_history": True}))
     listed.append(Method(f"KGRL repeat {HOLD}", "kgrl", _white(HOLD), HOLD))
     listed += [Method(f"sKGRL repeat {n}", "skgrl", _white(n), n, usual) for n in (HOLD, SLOW)]

@@ -26,6 +26,11 @@ FILTERED_PAIRS = [
 BOARD, BOARD_CLEARANCE, BOARD_COLOUR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]  # [m]
 LOCKED_HEIGHT = 0.6e-3  # [m]
 LOCKED_ANGLE = np.deg2rad(4.0)
+LOCKED_BESIDE = 1.0e-3  # [m] a plug that is as low and as turned beside the jack is not locked
+
+# A jack has two equal sides: half a turn about its axis changes the signs of what lies across it.
+HALF_TURN = np.array([-1.0, -1.0, 1.0, 1.0, -1.0, -1.0])  # of a pose's x, y, z, Rz, Ry, Rx
+HALF_TURN_OF_WRENCH = np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,17 @@ class BncWorkcell:
         """Where the plug is as seen from where it locks, offsets included: the identity when it is locked."""
         X_JPlug = plant.GetFrameByName("plug").CalcPose(plant_context, plant.GetFrameByName("jack"))
         return self.X_JT.inverse() @ X_JPlug
+
+    def locks(self, plug: np.ndarray) -> bool:
+        """Whether a plug at `plug`, X_JPlug as position and rotation vector (6,), is locked and on the jack's axis.
+
+        The rotation vector of an upright plug is its turn about z.
+        """
+        return bool(
+            abs(plug[2] - self.dimensions.locked_height) < LOCKED_HEIGHT
+            and abs(plug[5] + self.dimensions.detent_angle) < LOCKED_ANGLE
+            and np.hypot(plug[0], plug[1]) < LOCKED_BESIDE
+        )
 
     @staticmethod
     def is_locked(X_LockedPlug: RigidTransform) -> bool:

@@ -19,6 +19,8 @@ STICTION_TOLERANCE = 1e-5
 """How fast a contact that sticks may creep [m/s]. With Drake's 1e-3 a clamp that stands beside its holes, pressed with
 27 N and pushed sideways with 2 N, a third of what friction bears, drifts at 0.18 mm/s; so, at 0.004 mm/s. Over an
 episode of 10 s that is the difference between slipping in by itself and standing still."""
+SEATED = 0.5e-3  # [m] a clamp that is lower than this has snapped in
+SEATED_BESIDE = 1.0e-3  # [m] a clamp that is as low beside its holes has not
 HOLES = tuple(f"hole_{number}" for number in range(5))
 PEGS = tuple(f"peg_{number}" for number in range(5))
 # A peg meets its own hole, the bead the lip, the pad the slab: nothing else.
@@ -89,3 +91,7 @@ class GridClampWorkcell:
         """Where the clamp is as seen from where it snaps in, offsets included: the identity when it has."""
         X_GClamp = plant.GetFrameByName("clamp").CalcPose(plant_context, plant.GetFrameByName("table"))
         return self.X_GT.inverse() @ X_GClamp
+
+    def is_seated(self, clamp: np.ndarray) -> bool:
+        """Whether a clamp at `clamp`, X_GClamp as position and rotation vector (6,), has snapped in."""
+        return bool(clamp[2] - self.X_GT.translation()[2] < SEATED and np.hypot(clamp[0], clamp[1]) < SEATED_BESIDE)

@@ -14,8 +14,8 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.observation import Observed
 from guiderail.diagrams.options import Number, Options
-from guiderail.diagrams.scene import ARM_VIEW, Scene, Viewpoint, box_edges, in_frame, viewpoint
-from guiderail.diagrams.stations.bnc_workcell import LOCKED_ANGLE, LOCKED_HEIGHT, BncWorkcell
+from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, HALF_TURN_OF_WRENCH, BncWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.task import Symmetry
 from guiderail.diagrams.tasks.bnc_rewards import reward_terms
@@ -30,31 +30,22 @@ from guiderail.models.units import DEGREE, MM
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
-NUM_STEPS = demonstrations.NUM_STEPS
-COMPONENTS = 16
+NUM_STEPS, COMPONENTS = demonstrations.NUM_STEPS, 16
 # How well a hand repeats itself: added to the demonstrations' covariance as a standard deviation.
 FLOOR = np.array([0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE])
 
-# ρ [m², rad²]. The thesis's 1e-8 is (0.1 mm)², much for demonstrations that vary by a millimetre: linear jerk at
-# the same exploration RMS is then 2.6 times below KGRL's, at 1e-10 19 and at 1e-11 47 times (`guiderail study
-# smoothness`, an action at every control step).
-HISTORY_VARIANCE = 1e-11
+# ρ [m², rad²]. The thesis's 1e-8 is (0.1 mm)², much for demonstrations that vary by a millimetre.
+RHO = 1e-11
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
 COLLISION_FORCE = 35.0  # [N], of the impedance
-LOCKED_BESIDE = 1.0 * MM  # a plug that is as low and as turned beside the jack is not locked
 LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
 
 # What a policy sees, [time, pose, wrench], is centred and scaled by these. The wrench's torques are small, and they
 # are what tells on which side of the rim the plug sits: 0.02 Nm at 4 N.
-END = NUM_STEPS * CONTROL_PERIOD
+HALF = 0.5 * (NUM_STEPS * CONTROL_PERIOD)
 POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
-
-# A jack has two equal sides: half a turn about its axis changes the signs of what lies across it.
-HALF_TURN = np.array([-1.0, -1.0, 1.0, 1.0, -1.0, -1.0])  # of a pose's x, y, z, Rz, Ry, Rx
-HALF_TURN_OF_WRENCH = np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
-TOOL_VIEW: Viewpoint = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 
 
 @lru_cache(maxsize=1)
@@ -78,13 +69,7 @@ class BncConnector(InsertionTask):
     options: BncOptions
     workpiece, fixture = "plug", "jack"
     rewards = ("sparse", "shaped")
-    defaults = {  # noqa: RUF012
-        "guidance": "skgrl",
-        "station": "rails",
-        "hold": 10,
-        "explored": (0, 1),
-        "history_variance": HISTORY_VARIANCE,
-    }
+    defaults = {"guidance": "skgrl", "station": "rails", "hold": 10, "explored": (0, 1), "history_variance": RHO}
     num_steps = NUM_STEPS
     collision = Threshold("contact_force", COLLISION_FORCE)
     isotropic_groups = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
@@ -114,7 +99,7 @@ class BncConnector(InsertionTask):
     def observed(self) -> Sequence[Observed]:
         """Time, pose and wrench."""
         return (
-            Observed("time", 0.5 * END, 0.5 * END),
+            Observed("time", HALF, HALF),
             Observed("pose", POSE_CENTRE, POSE_SCALE),
             Observed("wrench", 0.0, WRENCH_SCALE),
         )
@@ -125,17 +110,7 @@ class BncConnector(InsertionTask):
 
     def conditions(self) -> list[Condition]:
         """Locked for a while, or pushed too hard."""
-        locked_height, locked_angle = self._workcell.dimensions.locked_height, -self._workcell.dimensions.detent_angle
-
-        def is_locked(plug: np.ndarray) -> bool:
-            """`plug` is X_JPlug, position and rotation vector, which for an upright plug is its turn about z."""
-            return bool(
-                abs(plug[2] - locked_height) < LOCKED_HEIGHT
-                and abs(plug[5] - locked_angle) < LOCKED_ANGLE
-                and np.hypot(plug[0], plug[1]) < LOCKED_BESIDE
-            )
-
-        return [Condition("success", {"plug": 6}, is_locked, steps=LOCKED_STEPS), self.force_limit()]
+        return [Condition("success", {"plug": 6}, self._workcell.locks, steps=LOCKED_STEPS), self.force_limit()]
 
     def symmetry(self) -> Symmetry:
         """Half a turn about the jack's axis."""
@@ -156,8 +131,8 @@ class BncConnector(InsertionTask):
 
     def camera(self) -> Camera:
         """Looks slightly down at the jack."""
-        target = np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.02]
-        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=0.11, height=0.05))
+        X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.02], distance=0.11, height=0.05)
+        return Camera((640, 480), np.deg2rad(30.0), X_WC)
 
     def scene(self) -> Scene:
         """The demonstrations, and the square that commands stay in."""
@@ -168,6 +143,10 @@ class BncConnector(InsertionTask):
             demonstrations=tuple(demonstrations.load().outputs),
             constraint=tuple(to_world(edge) for edge in box_edges(ALIGNMENT, 0.0, 0.015)),
             viewpoint=near,
-            arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
+            arm_views={
+                "the tool": ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172)),
+                "the connector": near,
+                "the arm": ARM_VIEW,
+            },
             line_radius=0.0001,
         )

@@ -17,19 +17,18 @@ from guiderail.diagrams.options import Options
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
 from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.grid_clamp_rewards import reward_terms
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.task import Choice, Threshold, register_task
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.skills import Skill, load_skill
 from guiderail.models.units import MM
-from guiderail.systems.episode_monitor import SUCCESS, Condition
+from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
 # More than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m.
 COLLISION_FORCE = 35.0  # [N], of the impedance
-SEATED = 0.5 * MM  # a clamp that is lower than this has snapped in
-SEATED_BESIDE = 1.0 * MM  # a clamp that is as low beside its holes has not
 SEATED_STEPS = 3  # control steps for which it must be seated before that counts
 
 # The command waits while the clamp is farther than this from it: 12 N, twice what the snap asks for.
@@ -42,9 +41,6 @@ START_BESIDE = 0.2 * MM  # along x and along y
 # What a policy sees, [position, force], is centred and scaled by these.
 CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
-
-SUCCESS_REWARD = 50.0  # equation 3.11
-SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # equation 3.12: [1/m], [1/N²]
 
 
 def make_skill() -> Skill:
@@ -70,8 +66,8 @@ class GridClamp(InsertionTask):
     options: GridClampOptions
     workpiece, fixture = "clamp", "table"
     rewards = ("shaped", "no_force", "sparse")
-    defaults = {"guidance": "sct", "station": "rails", "hold": 5, "active_constraints": True}  # noqa: RUF012
-    learner = {"algorithm": "sac", "preset": "clamp"}  # noqa: RUF012
+    defaults = {"guidance": "sct", "station": "rails", "hold": 5, "active_constraints": True}
+    learner = {"algorithm": "sac", "preset": "clamp"}
     num_steps = 500  # 100 decisions at 10 Hz; the thesis's episodes take 140 on average
     collision = Threshold("contact_force", COLLISION_FORCE)
 
@@ -101,29 +97,13 @@ class GridClamp(InsertionTask):
         return Observed("pose", CENTRE[:3], SCALE[:3], first_three), Observed("wrench", 0.0, SCALE[3:], first_three)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Equations 3.11 and 3.12; what they give once a decision is divided among its control steps."""
-        hold, reward = self.choice.hold, self.choice.reward
-        terms = [
-            RewardTerm(
-                "terminal_reward", {"termination": 1}, lambda termination: SUCCESS_REWARD * (termination[0] == SUCCESS)
-            ),
-            RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / hold),
-        ]
-        if reward != "no_force":
-            terms.append(RewardTerm("force_cost", {"wrench": 6}, lambda wrench: _force_cost(wrench[:3]) / hold))
-        if reward != "sparse":
-            terms.append(RewardTerm("shaping", {"pose": POSE_SIZE, "last_pose": POSE_SIZE}, _distance_gained))
-        return terms
+        """Equations 3.11 and 3.12."""
+        return reward_terms(self.choice.reward, num_actions, self.choice.hold)
 
     def conditions(self) -> list[Condition]:
         """Seated for a while, or pushed too hard."""
-        seat = self._workcell.X_GT.translation()[2]
-
-        def is_seated(clamp: np.ndarray) -> bool:
-            """`clamp` is X_GC, position and rotation vector."""
-            return bool(clamp[2] - seat < SEATED and np.hypot(clamp[0], clamp[1]) < SEATED_BESIDE)
-
-        return [Condition("success", {"clamp": POSE_SIZE}, is_seated, steps=SEATED_STEPS), self.force_limit()]
+        seated = Condition("success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=SEATED_STEPS)
+        return [seated, self.force_limit()]
 
     def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Moves the table, and the clamp in the tool, by (x, y)."""
@@ -154,11 +134,3 @@ class GridClamp(InsertionTask):
             arm_views={"the clamp": near, "the arm": ARM_VIEW},
             line_radius=0.0001,
         )
-
-
-def _force_cost(force: np.ndarray) -> float:
-    return -FORCE_WEIGHT * float(force @ force)
-
-
-def _distance_gained(pose: np.ndarray, last_pose: np.ndarray) -> float:
-    return SHAPING * float(last_pose[2] - pose[2])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
@@ -17,20 +16,19 @@ from guiderail.diagrams.observation import Observed
 from guiderail.diagrams.options import Numbers, Options, ResetOptions
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.narrow_passage_rewards import reward_terms
 from guiderail.diagrams.tasks.task import Choice, Task, register_task
 from guiderail.models.demonstrations import narrow_passage as demonstrations
 from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.objects.narrow_passage import NarrowPassage as World
-from guiderail.models.objects.narrow_passage import action_cost
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import SUCCESS, Condition
+from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
 IMAGE_SIZE = (144, 110)
 """Width and height of the policy's image (4.4.1, end)."""
 
-SUCCESS_REWARD = 200.0
 COMPONENTS = 20
 """Of the mixture: with 8 to 16 of them the passage is blurred."""
 
@@ -66,7 +64,7 @@ class NarrowPassage(Task):
     Reset = NarrowPassageReset
     rewards = ("sparse", "shaped")
     observations = ("state", "image")
-    defaults = {"guidance": "skgrl", "hold": 5}  # noqa: RUF012
+    defaults = {"guidance": "skgrl", "hold": 5}
     num_steps = demonstrations.NUM_STEPS
     clip = 1.0
 
@@ -99,19 +97,7 @@ class NarrowPassage(Task):
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of the way gone, the obstacle and the goal; of the way to the goal where the reward is shaped."""
-        world, two_poses = self._world, {"pose": 2, "last_pose": 2}
-
-        def progress(pose: np.ndarray, last_pose: np.ndarray) -> float:
-            return 100.0 * (math.dist(last_pose, world.goal) - math.dist(pose, world.goal))
-
-        terms = [
-            RewardTerm("action_cost", two_poses, lambda pose, last_pose: action_cost(pose - last_pose)),
-            RewardTerm("obstacle_cost", {"pose": 2}, world.obstacle_cost),
-            RewardTerm(
-                "terminal_reward", {"termination": 1}, lambda termination: SUCCESS_REWARD * (termination[0] == SUCCESS)
-            ),
-        ]
-        return [*terms, RewardTerm("progress", two_poses, progress)] if self.choice.reward == "shaped" else terms
+        return reward_terms(self.choice.reward, self._world)
 
     def conditions(self) -> list[Condition]:
         """At the goal; or pressed against a wall, or stopped before it by a filter, and getting nowhere."""

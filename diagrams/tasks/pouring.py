@@ -21,41 +21,21 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.pouring_conditions import conditions
 from guiderail.diagrams.tasks.pouring_rewards import reward_terms
+from guiderail.diagrams.tasks.pouring_template import SPARSE_INPUT_SPEED, make_skill
 from guiderail.diagrams.tasks.task import Choice, Task, Threshold, register_task
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, Ball
 from guiderail.models.pose_coordinates import transform_to_pose
-from guiderail.models.skills import Skill, load_skill
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
-LEASH = 0.05
-"""m: farther from its command than this the arm is waited for."""
-
-POSITION_SCALE = 5.0
-"""1/m: makes positions near the mug as large as angles in the observation."""
-
+LEASH = 0.05  # [m] farther from its command than this the arm is waited for
+POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in the observation
 # Where the thermos starts, in the frame of the mug's tip: inside the template's own workspace.
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
 START_HEIGHT = (0.08, 0.19)  # [m]
 MAX_MUG_OFFSET = 0.04  # [m] along x and y: as far as the arm reaches around the mug
-
-FULL_SPEED = 0.15  # [m/s] of a full input, along one axis
-FULL_TILT = 0.8  # [rad/s]
-# What is rewarded only once it is done is found only if random inputs sometimes do it.
-SPARSE_INPUT_SPEED = 1.7
-
-
-def make_skill(config: PouringConfig, input_speed: float = 1.0) -> Skill:
-    """The pouring template for this scene's vessels; `input_speed` times as fast as it is meant."""
-    return load_skill(
-        "pouring",
-        full_speed_m_per_s=input_speed * FULL_SPEED,
-        full_tilt_rad_per_s=input_speed * FULL_TILT,
-        mug_radius_m=config.mug.outer_radius,
-        thermos_radius_m=config.thermos.outer_radius,
-    )
 
 
 class PouringOptions(Options):
@@ -65,8 +45,7 @@ class PouringOptions(Options):
         None,
         ge=0.2,
         le=2.0,
-        description="how much faster than meant the template's inputs are; 1, and 1.7 for a sparse reward through the "
-        "template, unless given: then also let an action last longer, such as hold=40",
+        description="how much faster than meant the template's inputs are; 1, and 1.7 where sparse, unless given",
     )
     mug_inner_diameter: Number = Field(MUG.inner_diameter, description="of the mug that stands there [m]")
     mug_depth: Number = Field(MUG.depth, description="[m]")
@@ -96,8 +75,8 @@ class Pouring(Task):
     Reset = PouringReset
     options: PouringOptions
     rewards = ("shaped", "sparse", "hand_shaped")
-    defaults = {"guidance": "sct", "hold": 10}  # noqa: RUF012
-    learner = {"algorithm": "sac", "preset": "pouring"}  # noqa: RUF012
+    defaults = {"guidance": "sct", "hold": 10}
+    learner = {"algorithm": "sac", "preset": "pouring"}
     num_steps = 1500  # 150 decisions at 10 Hz, about as many as in the thesis
     clip = 10.0
     collision = Threshold("touched")

@@ -45,7 +45,7 @@ class Slot(Task):
     world_kind = "plane"
     Options = SlotOptions
     options: SlotOptions
-    defaults = {"guidance": "kgrl", "hold": 5}  # noqa: RUF012
+    defaults = {"guidance": "kgrl", "hold": 5}
     num_steps = NUM_STEPS
     clip = 1.0
 
