@@ -1,0 +1,143 @@
+"""A package with a task, guidance and a learner of its own, as a lab would install it; no file of guiderail knows it."""
+
+import json
+import os
+import site
+import subprocess
+import sys
+import sysconfig
+import venv
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent / "peglab"
+LINES = 170
+pytestmark = pytest.mark.xdist_group("peglab")
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A fresh environment with the package installed; what is heavy is borrowed from the one that runs this test."""
+    folder = tmp_path_factory.mktemp("lab")
+    environment = folder / "env"
+    venv.create(environment, with_pip=False, symlinks=True)
+    purelib = sysconfig.get_path("purelib", vars={"base": str(environment), "platbase": str(environment)})
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", purelib]
+    subprocess.run([*pip, str(PACKAGE)], check=True)
+    # The libraries, and guiderail with its entry points, as this interpreter has them.
+    borrowed = [sysconfig.get_path("purelib"), *site.getsitepackages(), *(p for p in sys.path if p.endswith("src"))]
+    Path(purelib, "borrowed.pth").write_text("\n".join(dict.fromkeys(borrowed)) + "\n")
+
+    def run(*arguments, code=0):
+        command = [str(environment / "bin" / "python"), *arguments]
+        variables = os.environ | {"OMP_NUM_THREADS": "1", "DRAKE_ALLOW_NETWORK": "meshcat:lcm"}
+        variables.pop("PYTHONPATH", None)
+        result = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True)
+        assert result.returncode == code, result.stdout + result.stderr
+        return result.stdout if code == 0 else result.stderr
+
+    run.folder = folder
+    return run
+
+
+def guiderail(lab, *arguments, code=0):
+    """The command, as it is installed."""
+    return lab("-c", "from guiderail.tools.command import main; main()", *arguments, code=code)
+
+
+@pytest.fixture(scope="module")
+def trained(lab):
+    guiderail(
+        lab, "train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "6",
+        "--env", "width=0.16", "--out", "run",
+    )  # fmt: skip
+    return lab.folder / "run"
+
+
+def test_it_is_small_enough_to_be_worth_it():
+    assert len((PACKAGE / "peglab.py").read_text().splitlines()) <= LINES
+
+
+def test_no_file_of_guiderail_knows_it():
+    root = Path(__file__).parents[2]
+    for folder in ("models", "systems", "diagrams", "tools", "src"):
+        assert not [path for path in (root / folder).rglob("*.py") if "peglab" in path.read_text()]
+
+
+def test_it_is_listed(lab):
+    there = json.loads(guiderail(lab, "list", "--json"))
+    assert "peglab/Slot" in there["tasks"]
+    assert "peglab_offset" in there["tasks"]["peglab/Slot"]["guidance"]
+    assert "peglab_hill_climbing" in there["learners"]
+    assert [option["name"] for option in there["tasks"]["peglab/Slot"]["options"]] == ["width"]
+
+
+def test_gymnasium_makes_it(lab):
+    code = (
+        "import gymnasium; env = gymnasium.make('guiderail.diagrams:peglab/Slot-v0', guidance='peglab_offset', "
+        "reach=0.02, width=0.2); env.reset(seed=0); print(env.step([1.0, 0.0])[4]['control_steps'])"
+    )
+    assert lab("-c", code).split() == ["5"]
+
+
+def test_a_wrong_option_gets_a_sentence(lab):
+    said = guiderail(lab, "train", "peglab/Slot", "--env", "width=3", "--out", "wrong", code=2)
+    assert "width must be at most 0.3" in said
+    said = guiderail(lab, "train", "peglab/Slot", "--guidance", "sct", "--out", "wrong", code=2)
+    assert "needs a shared control template, which peglab/Slot" in said
+
+
+def test_it_is_trained_resumed_and_evaluated(lab, trained):
+    guiderail(lab, "train", "--resume", "--episodes", "8", "--out", "run")
+    found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "5", "--json"))
+    assert found["episodes"] == 5
+    assert found["worst_violation"] <= 1e-9
+
+
+def test_it_is_replayed(lab, trained):
+    guiderail(lab, "replay", "run", "--html", "page.html")
+    assert "peglab/Slot" in (lab.folder / "page.html").read_text()
+
+
+def test_it_is_studied(lab, trained):
+    (lab.folder / "study.yaml").write_text(
+        """
+name: slot
+task: peglab/Slot
+learner: {algorithm: peglab_hill_climbing, episodes: 3}
+methods:
+  kgrl: {env: {guidance: kgrl}}
+  zero: {env: {guidance: kgrl}, policy: zero}
+seeds: [1]
+judged_on:
+  - {name: held_out, episodes: 3}
+"""
+    )
+    guiderail(lab, "study", "study.yaml", "--out", "study", "--json")
+    assert list((lab.folder / "study").glob("*.csv"))
+
+
+def test_what_it_learned_is_a_plain_diagram(lab, trained):
+    code = (
+        "from pathlib import Path; import numpy as np; from pydrake.systems.analysis import Simulator\n"
+        "from guiderail import make_skill; from guiderail.models.policy import Policy\n"
+        "skill = make_skill('peglab/Slot', Policy.load(Path('run')), guidance='kgrl', width=0.16)\n"
+        "simulator = Simulator(skill.diagram)\n"
+        "skill.randomize(simulator.get_mutable_context(), np.random.default_rng(0), {})\n"
+        "simulator.AdvanceTo(0.5); print(skill.diagram.GetOutputPort('pose').Eval(simulator.get_context())[1] > 0.2)"
+    )
+    assert lab("-c", code).split() == ["True"]
+
+
+def test_a_file_that_is_not_installed_serves_too(lab):
+    (lab.folder / "mine.py").write_text(
+        "from guiderail import register_task\nfrom guiderail.diagrams.tasks.narrow_passage import NarrowPassage\n\n"
+        "@register_task('mine/Passage')\nclass Mine(NarrowPassage):\n    num_steps = 40\n"
+    )
+    guiderail(
+        lab, "train", "mine/Passage", "--import", "mine.py", "--episodes", "2", "--guidance", "kgrl", "--preset", "quick",
+        "--out", "mine",
+    )  # fmt: skip
+    # The run remembers what it needs.
+    assert json.loads(guiderail(lab, "evaluate", "mine", "--episodes", "2", "--json"))["episodes"] == 2
