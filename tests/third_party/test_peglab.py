@@ -1,4 +1,4 @@
-"""A package with a task, guidance and a learner of its own, as a lab would install it; no file of guiderail knows it."""
+"""A package with a task, guidance and a learner of its own, as a lab would install it."""
 
 import json
 import os
@@ -136,8 +136,8 @@ def test_a_file_that_is_not_installed_serves_too(lab):
         "@register_task('mine/Passage')\nclass Mine(NarrowPassage):\n    num_steps = 40\n"
     )
     guiderail(
-        lab, "train", "mine/Passage", "--import", "mine.py", "--episodes", "2", "--guidance", "kgrl", "--preset", "quick",
-        "--out", "mine",
+        lab, "train", "mine/Passage", "--import", "mine.py", "--episodes", "2", "--guidance", "kgrl",
+        "--preset", "quick", "--out", "mine",
     )  # fmt: skip
     # The run remembers what it needs.
     assert json.loads(guiderail(lab, "evaluate", "mine", "--episodes", "2", "--json"))["episodes"] == 2

@@ -1,0 +1,51 @@
+"""How do I compose guidance of my own? From the systems, with the ports that all guidance has.
+
+This one is KGRL with a single action: a policy chooses how far to go along one direction, and nothing across it.
+"""
+
+import numpy as np
+from pydantic import Field
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
+
+from guiderail import Known, Options, make_env, register_guidance
+from guiderail.diagrams.guidance.guidance import Guidance
+from guiderail.diagrams.guidance.kgrl import KgrlGuidance
+
+
+class AlongOptions(Options):
+    """Of the guidance; `gymnasium.make` and `--env` take them."""
+
+    angle: float = Field(0.0, ge=-180, le=180, description="of the direction in the plane [degrees]")
+
+
+@register_guidance("kgrl_along", needs=(("demonstrations",),), label="KGRL along a line", options=AlongOptions)
+class KgrlAlong(Guidance):
+    """action (1,) → direction · action (2,) → KGRL."""
+
+    def __init__(self, known: Known):
+        super().__init__()
+        builder = DiagramBuilder()
+        angle = np.deg2rad(float(str(known.options["angle"])))
+        kgrl = builder.AddNamedSystem("kgrl", KgrlGuidance(known))
+        direction = MatrixGain(D=np.array([[np.cos(angle)], [np.sin(angle)]]))
+        builder.AddNamedSystem("direction", direction)
+        action = builder.AddNamedSystem("action", PassThrough(1))
+        held = builder.AddNamedSystem("held_action", ZeroOrderHold(known.period, 1))
+        for system in (direction, held):
+            builder.Connect(action.get_output_port(), system.get_input_port())
+        builder.Connect(direction.get_output_port(), kgrl.get_action_input_port())
+        builder.ExportInput(action.get_input_port(), "action")
+        builder.ExportInput(kgrl.get_pose_input_port(), "pose")
+        builder.ExportInput(kgrl.get_wrench_input_port(), "wrench")
+        builder.ExportOutput(held.get_output_port(), "held_action")
+        for name in ("desired_pose", "constraint_violation", "fallback"):
+            builder.ExportOutput(kgrl.GetOutputPort(name), name)
+        builder.BuildInto(self)
+
+
+env = make_env("NarrowPassage", guidance="kgrl_along", angle=30.0)
+env.reset(seed=0)
+for _ in range(10):
+    *_, info = env.step(np.array([1.0]))
+print("after", info["control_steps"], "control steps the worst commanded violation is", info["constraint_violation"])

@@ -1,0 +1,61 @@
+"""How do I make a task of my own? By declaring it; this one is another plane with another gap and another goal."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from pydrake.systems.framework import Context, Diagram
+
+import guiderail as gr
+from guiderail.diagrams.register import register_envs
+from guiderail.models.objects.narrow_passage import NarrowPassage
+
+WORLD = NarrowPassage(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=(0.28, 0.42))
+STEPS, PERIOD = 80, 0.02
+
+
+@gr.register_task("examples/WideGap")
+class WideGap(gr.Task):
+    """Through a wide gap to a goal beside the demonstrations."""
+
+    world_kind = "plane"
+    num_steps = STEPS
+    clip = 1.0
+
+    def world(self) -> NarrowPassage:
+        return WORLD
+
+    def reference(self) -> gr.ReferenceTrajectory:  # known: so kmp, residual, kgrl and skgrl can guide
+        means = np.column_stack([np.full(STEPS, 0.35), np.linspace(0.1, 0.9, STEPS)])
+        return gr.ReferenceTrajectory(PERIOD * np.arange(STEPS), means, np.tile(0.04**2 * np.eye(2), (STEPS, 1, 1)))
+
+    def constraints(self) -> gr.LinearConstraints:
+        return gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
+
+    def observed(self) -> Sequence[gr.Observed]:
+        return (gr.Observed("phase"), gr.Observed("pose", centre=0.5, scale=0.5))
+
+    def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
+        return [
+            gr.RewardTerm("nearness", {"pose": 2}, lambda pose: -float(np.linalg.norm(pose - np.array(WORLD.goal))))
+        ]
+
+    def conditions(self) -> list[gr.Condition]:
+        return [gr.Condition("success", {"pose": 2}, WORLD.at_goal)]
+
+    def reset(
+        self, station: gr.Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
+    ) -> dict[str, Any]:
+        station.set_pose(context, start := np.array(WORLD.start) + 0.005 * rng.standard_normal(2))
+        return {"start": start}
+
+
+register_envs()
+env = gymnasium.make("examples/WideGap-v0", guidance="skgrl", hold=5)
+print("starts at", env.reset(seed=1)[1]["start"].round(3), "and ends as", end="")
+over = False
+while not over:
+    _, _, terminated, truncated, info = env.step(np.array([0.8, 0.0], np.float32))
+    over = terminated or truncated
+print(f" '{info['termination']}', worst commanded violation {info['constraint_violation']:.3f} m")

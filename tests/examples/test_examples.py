@@ -1,0 +1,32 @@
+"""Every example runs as it stands, is short, and is understood by a type checker without being told any path."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FILES = sorted(EXAMPLES.glob("*.py"))
+LINES = 60
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
+def test_an_example_runs_from_anywhere(file, tmp_path):
+    environment = os.environ | {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run([sys.executable, str(file)], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip()
+    assert len(file.read_text().splitlines()) <= LINES
+
+
+def test_a_type_checker_resolves_them_without_path_settings(tmp_path):
+    configuration = tmp_path / "mypy.ini"
+    configuration.write_text("[mypy]\n[mypy-pydrake.*]\nfollow_imports = skip\nfollow_imports_for_stubs = True\n")
+    # The interpreter's own packages are where it looks: an editable install has to be enough.
+    command = [sys.executable, "-m", "mypy", "--config-file", str(configuration), *map(str, FILES)]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert "import-not-found" not in result.stdout, result.stdout
+    assert "import-untyped" not in result.stdout or "guiderail" not in result.stdout, result.stdout
+    assert result.returncode == 0, result.stdout
