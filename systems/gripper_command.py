@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from guiderail.models.errors import InputError
 
@@ -55,11 +63,11 @@ class GripperCommand(LeafSystem):
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
 
-    def get_position_input_port(self):
+    def get_position_input_port(self) -> InputPort:
         """Desired positions, (n,); optional."""
         return self._position_port
 
-    def get_desired_state_output_port(self):
+    def get_desired_state_output_port(self) -> OutputPort:
         """Desired positions and velocities, (2n,)."""
         return self._desired_state_port
 
