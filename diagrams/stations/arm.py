@@ -299,11 +299,11 @@ class ArmStation(Station):
         export_simulation_ports(builder, plant, self.scene_graph)
         builder.BuildInto(self)
 
-    def get_gripper_position_input_port(self):
+    def get_gripper_position_input_port(self) -> InputPort:
         """Where the gripper's actuated joints shall be, (n,); only of a station with a gripper."""
         return self.GetInputPort("gripper_position")
 
-    def get_gripper_state_output_port(self):
+    def get_gripper_state_output_port(self) -> OutputPort:
         """Positions and velocities of the gripper's actuated joints, (2n,); only of a station with a gripper."""
         return self.GetOutputPort("gripper_state")
 

@@ -1,0 +1,39 @@
+"""The pouring station with another arm: six joints under Cartesian position control."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.stations.pouring import MIDDLE_OF_POURING, PouringConfig, PouringStation
+from guiderail.models.errors import InputError
+
+UPRIGHT = np.array([-0.15, -0.20, 0.15, 0.0, 0.0, 0.0])
+TILTED = MIDDLE_OF_POURING + [0.0, 0.0, 0.0, 0.0, 0.0, -1.2]
+
+
+def test_an_arm_of_six_joints_tilts_the_thermos_over_the_mug():
+    """From where episodes start to a tilt at which it pours, along a straight line; the drives follow the command."""
+    station = PouringStation(PouringConfig(robot="ur5e"))
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    station.set_pose(context, UPRIGHT)
+    desired = station.GetInputPort("desired_pose").FixValue(context, UPRIGHT)
+    simulator.Initialize()
+    pose, balls = station.GetOutputPort("pose"), station.GetOutputPort("balls_in_thermos")
+    np.testing.assert_allclose(pose.Eval(context), UPRIGHT, atol=1e-9)
+    lags = []
+    for step in range(1, 401):
+        command = UPRIGHT + min(1.0, step / 300) * (TILTED - UPRIGHT)
+        desired.GetMutableData().set_value(command)
+        simulator.AdvanceTo(0.01 * step)
+        lags.append(np.abs(pose.Eval(context) - command)[:3].max())
+        assert station.GetOutputPort("saturation").Eval(context)[0] == 0.0
+        assert station.GetOutputPort("touched").Eval(context)[0] == 0.0
+    assert max(lags) < 0.008
+    np.testing.assert_allclose(pose.Eval(context), TILTED, atol=2e-3)
+    assert balls.Eval(context)[2] > 0.0  # a ball has left the thermos through its tip
+
+
+def test_refuses_an_arm_whose_data_do_not_say_how():
+    with pytest.raises(InputError, match="'panda' can't pour: its data have no drives or no level posture"):
+        PouringStation(PouringConfig(robot="panda"))
