@@ -13,6 +13,7 @@ from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.trace import Trace
 from guiderail.models.errors import InputError
 from guiderail.systems.episode_monitor import TERMINATIONS
+from guiderail.systems.policy_system import PolicyError
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
@@ -148,6 +149,8 @@ class GuidedEnv(DrakeGymEnv):
                 pose = self._pose_port.Eval(context)
                 if not np.isfinite(pose).all():
                     failure = "the measured pose is not finite"
+            except PolicyError:
+                raise  # a policy inside the diagram, and not the simulation
             except (RuntimeError, SystemExit) as error:
                 if not _SIMULATION_FAILURE.search(str(error)):
                     raise

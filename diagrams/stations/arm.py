@@ -14,6 +14,7 @@ from pydrake.systems.primitives import MatrixGain
 from guiderail.diagrams.options import Options
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
     PLANT_PERIOD,
     Impedance,
     Station,
@@ -177,7 +178,10 @@ def add_impedance_control(
     wrench: OutputPort,
     compensate_gravity: bool = True,
 ) -> OutputPort:
-    """Adds the controller of an arm whose joints are at `state`, and exports a station's ports; returns the torque."""
+    """Adds the controller of an arm whose joints are at `state`, and exports a station's ports; returns the torque.
+
+    Its watchdog checks commands once in `period` [s].
+    """
     controller = builder.AddNamedSystem(
         "controller",
         CartesianImpedanceController(
@@ -287,7 +291,7 @@ class ArmStation(Station):
             builder,
             self._known,
             impedance,
-            time_step,
+            CONTROL_PERIOD,
             state=plant.get_state_output_port(arm.model),
             wrench=wrench,
         )

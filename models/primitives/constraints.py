@@ -1,6 +1,7 @@
 """Linear inequality constraints g_{n,f}ᵀ ζ^O ≥ c_{n,f} on what a primitive commands (thesis, equation 4.5)."""
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import linprog
 
 from guiderail.models.errors import InputError
@@ -35,7 +36,7 @@ class LinearConstraints:
         self._refuse_contradictions()
 
     @classmethod
-    def box(cls, lower: np.ndarray, upper: np.ndarray) -> "LinearConstraints":
+    def box(cls, lower: ArrayLike, upper: ArrayLike) -> "LinearConstraints":
         """lower ≤ y ≤ upper, (O,) or (N, O) each; an infinite bound (at every step) is no constraint.
 
         Raises:
