@@ -12,6 +12,9 @@ MAY_IMPORT = {
     "diagrams": {"models", "systems", "diagrams"},
     "tools": {"models", "systems", "diagrams", "tools"},
 }
+# Inside tools: what a person works with never needs what was studied with it. The command is every entry point.
+RESEARCH = {"studies", "figures", "stress", "benchmarks"}
+ENTRY_POINTS = {"tools/command.py"}
 LEARNERS = ("stable_baselines3", "sb3_contrib", "torch")
 
 
@@ -21,7 +24,7 @@ def imports(path):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute here"
-            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 @pytest.mark.parametrize("folder", MAY_IMPORT)
@@ -42,3 +45,15 @@ def test_systems_know_no_task_and_no_robot():
         for name in imports(path):
             known = ("guiderail.models.robots", "guiderail.models.objects", "guiderail.models.demonstrations")
             assert not name.startswith(known), f"{path.relative_to(ROOT)} imports {name}"
+
+
+def test_product_needs_no_research():
+    rooms = {path.name for path in (ROOT / "tools").iterdir() if path.is_dir() and (path / "__init__.py").exists()}
+    assert rooms >= RESEARCH
+    for path in (ROOT / "tools").rglob("*.py"):
+        inside = path.relative_to(ROOT)
+        if inside.parts[1] in RESEARCH or inside.as_posix() in ENTRY_POINTS:
+            continue
+        for name in imports(path):
+            parts = name.split(".")
+            assert parts[:2] != ["guiderail", "tools"] or not RESEARCH & set(parts[2:3]), f"{inside} imports {name}"

@@ -42,7 +42,7 @@ def train(
     as_json: Json = False,
 ) -> None:
     """Train a policy; leaves a run folder."""
-    from guiderail.tools import training
+    from guiderail.tools.learning import configure as training
 
     given = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     summary = training.run(
@@ -67,7 +67,7 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Judge a run's deterministic policy on what training never drew, beside the demonstration alone."""
-    from guiderail.tools.evaluate import evaluate as evaluate_run
+    from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 
     _print(evaluate_run(run, episodes=episodes, seed=seed), as_json)
 
@@ -81,7 +81,7 @@ def replay(
     picture: Annotated[Path | None, typer.Option(help="What a camera sees of the episode, a .png to write.")] = None,
 ) -> None:
     """Write one self-contained page with the robot, the demonstrations, the executed paths and the constraint."""
-    from guiderail.tools.replay import write_replay
+    from guiderail.tools.viewing.replay import write_replay
 
     typer.echo(write_replay(run, html, seed=seed, station=station, picture=picture))
 
@@ -89,7 +89,7 @@ def replay(
 @app.command()
 def plot(run: Run) -> None:
     """Draw a run's learning curve into its folder."""
-    from guiderail.tools.plot import plot_run
+    from guiderail.tools.viewing.plot import plot_run
 
     typer.echo(plot_run(run))
 
@@ -103,7 +103,7 @@ def record(
     seed: Annotated[int, typer.Option(help="Of the first held-out initial condition.")] = 1_000_000,
 ) -> None:
     """Record what a policy does, as demonstrations that a primitive can learn from."""
-    from guiderail.tools.record import record as record_run
+    from guiderail.tools.recording.record import record as record_run
 
     typer.echo(record_run(run, out, episodes=episodes, signal=signal, seed=seed))
 
@@ -135,11 +135,11 @@ def study(
 ) -> None:
     """Train and evaluate several guidances or learners over seeds, or compare how smoothly one can explore."""
     if task == "smoothness":
-        from guiderail.tools.smoothness import smoothness
+        from guiderail.tools.studies.smoothness import smoothness
 
         _print(smoothness(out, episodes=4 if episodes is None else episodes), as_json)
         return
-    from guiderail.tools.study import study as run_study
+    from guiderail.tools.studies.study import study as run_study
 
     result = run_study(
         task,
@@ -179,7 +179,7 @@ def bench(
 
     if what not in ("primitive", "simulation"):
         raise InputError(f"there is no benchmark {what!r}: choose primitive or simulation")
-    import_module(f"guiderail.tools.bench_{what}").main(as_json)
+    import_module(f"guiderail.tools.benchmarks.{what}").main(as_json)
 
 
 @app.command()

@@ -9,13 +9,15 @@ import numpy as np
 from rich.console import Console
 
 from guiderail.models.errors import InputError
-from guiderail.tools.episodes import make_environment, run_episode, standing_still
-from guiderail.tools.figures.passage import avoided_from, draw_world
-from guiderail.tools.pictures import COLOURS, new_figure, save_figure
-from guiderail.tools.policy import Policy
-from guiderail.tools.progress import TOLERANCE
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.training import run
+from guiderail.models.policy import Policy
+from guiderail.tools.guidance import COLOURS
+from guiderail.tools.learning.configure import run
+from guiderail.tools.learning.progress import TOLERANCE
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.rollouts.rollout import run_episode, standing_still
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.passage import avoided_from, draw_world
+from guiderail.tools.viewing.style import new_figure, save_figure
 
 HELD_OUT = 10  # episodes that the result is judged on
 SEED = 1_000_000

@@ -4,8 +4,8 @@ import pytest
 
 from guiderail.tools.command import main
 from guiderail.tools.figures import FIGURES
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.train import train
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
 
 
 def call(capsys, *arguments):

@@ -10,14 +10,15 @@ from safetensors.numpy import load_file
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.check import check
-from guiderail.tools.episodes import make_environment, reset_held_out
-from guiderail.tools.evaluate import evaluate
-from guiderail.tools.record import record
-from guiderail.tools.replay import tube, write_replay
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.study import Job, run_jobs
-from guiderail.tools.train import train
-from guiderail.tools.training import configure
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.recording.record import record
+from guiderail.tools.rollouts.evaluate import evaluate
+from guiderail.tools.rollouts.rollout import reset_held_out
+from guiderail.tools.studies.study import Job, run_jobs
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.replay import tube, write_replay
 
 SETTINGS = {"units": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}
 

@@ -5,10 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.tools.episodes import make_environment, run_episode
 from guiderail.tools.figures import passage, runs
-from guiderail.tools.pictures import COLOURS, NAMES, legend, new_figure, save_figure
-from guiderail.tools.study import write_table
+from guiderail.tools.guidance import COLOURS, NAMES
+from guiderail.tools.rollouts.rollout import run_episode
+from guiderail.tools.studies.study import write_table
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.passage import draw_world
+from guiderail.tools.viewing.style import legend, new_figure, save_figure
 
 METHODS = ("residual", "safe_residual", "kgrl")
 EPISODES = 60
@@ -25,7 +28,7 @@ def figure_4_4(out: Path, seeds: int = 3, episodes: int = 10) -> dict[str, Any]:
     figure, (axes,) = new_figure(1, 3, (11, 5.2))
     rows: list[dict[str, Any]] = []
     for axis, kind in zip(axes, METHODS, strict=True):
-        passage.draw_world(axis)
+        draw_world(axis)
         axis.set_title(NAMES[kind])
         for hold in (passage.HOLD, 1):
             explored = _explore(kind, hold, seeds, episodes)

@@ -7,10 +7,12 @@ import numpy as np
 
 from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
 from guiderail.models.demonstrations import bnc_connector
-from guiderail.tools.episodes import make_environment, run_episode
 from guiderail.tools.figures import runs
-from guiderail.tools.pictures import COLOURS, NAMES, legend, new_figure, save_figure
-from guiderail.tools.study import write_table
+from guiderail.tools.guidance import COLOURS, NAMES
+from guiderail.tools.rollouts.rollout import run_episode
+from guiderail.tools.studies.study import write_table
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.style import legend, new_figure, save_figure
 
 TASK = "BncConnector"
 METHODS = ("kgrl", "skgrl")

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.tools.clamp_study import ALGORITHM, LEARNED, PRESET, TASK
 from guiderail.tools.figures import runs
-from guiderail.tools.pictures import draw_runs, legend, new_figure, save_figure
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.study import Job, run_jobs, write_table
-from guiderail.tools.training import configure
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.studies.clamp_study import ALGORITHM, LEARNED, PRESET, TASK
+from guiderail.tools.studies.study import Job, run_jobs, write_table
+from guiderail.tools.viewing.style import draw_runs, legend, new_figure, save_figure
 
 EPISODES, EVALUATIONS, WINDOW = 50, 25, 5
 METHODS = {"sct": ("with the cost of force", "#2ca02c"), "sct_no_force": ("without it", "#d62728")}

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.tools.figures import passage, runs
-from guiderail.tools.pictures import new_figure, save_figure
-from guiderail.tools.study import write_table
+from guiderail.tools.studies.study import write_table
+from guiderail.tools.viewing.style import new_figure, save_figure
 
 
 def figure_4_7(out: Path, seeds: int = 3, episodes: int = 30) -> dict[str, Any]:

@@ -5,8 +5,9 @@ from typing import Any
 
 from guiderail.tools.figures import passage, runs
 from guiderail.tools.figures.baselines import EPISODES
-from guiderail.tools.pictures import NAMES, legend, new_figure, save_figure
-from guiderail.tools.study import write_table
+from guiderail.tools.guidance import NAMES
+from guiderail.tools.studies.study import write_table
+from guiderail.tools.viewing.style import legend, new_figure, save_figure
 
 METHODS = ("kgrl", "skgrl")
 STEADY = "steady"

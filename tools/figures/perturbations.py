@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.objects.narrow_passage import NarrowPassage
-from guiderail.tools.episodes import EpisodeRecord, make_environment
-from guiderail.tools.figures.passage import TASK, draw_world
-from guiderail.tools.pictures import new_figure, save_figure
-from guiderail.tools.study import write_table
+from guiderail.tools.figures.passage import TASK
+from guiderail.tools.rollouts.rollout import EpisodeRecord
+from guiderail.tools.studies.study import write_table
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.passage import draw_world
+from guiderail.tools.viewing.style import new_figure, save_figure
 
 # Where the robot is when it is pushed (y, m), and by how much in x (m). The last of each kind leads into the zone.
 PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10), (0.20, 0.15), (0.78, 0.20))

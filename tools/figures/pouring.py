@@ -12,10 +12,10 @@ from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring import make_skill
 from guiderail.diagrams.tasks.pouring_rewards import APPROACH, NEAR, NEAR_BONUS, TERMINAL, TILT
 from guiderail.models.skills.drawing import draw, state_lines
-from guiderail.tools.pictures import draw_runs, legend, new_figure, save_figure
-from guiderail.tools.pouring_study import FIRST_SEED, METHODS, job, training_row
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.study import Job, run_jobs, write_table
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.studies.pouring_study import FIRST_SEED, METHODS, job, training_row
+from guiderail.tools.studies.study import Job, run_jobs, write_table
+from guiderail.tools.viewing.style import draw_runs, legend, new_figure, save_figure
 
 COLOURS = {"rl_sparse": "#d62728", "rl_shaped": "#e6a700", "rl_sct_sparse": "#1f77b4", "rl_sct_shaped": "#2ca02c"}
 ENDINGS = ("success", "spill", "collision")

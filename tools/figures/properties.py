@@ -10,8 +10,8 @@ from guiderail.models.primitives import Demonstrations, LcNsKmp, LinearConstrain
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.models.primitives.least_norm import solve_least_norm
 from guiderail.models.primitives.mixture import fit_mixture
-from guiderail.tools.pictures import new_figure, save_figure
-from guiderail.tools.study import write_table
+from guiderail.tools.studies.study import write_table
+from guiderail.tools.viewing.style import new_figure, save_figure
 
 DURATION, STEPS, COMPONENTS = 6.0, 200, 8
 MODULATED_AT = 3.2  # s, as in the thesis

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from guiderail.tools.pictures import COLOURS, NAMES, draw_runs
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.study import Job, run_jobs
-from guiderail.tools.training import configure
+from guiderail.tools.guidance import COLOURS, NAMES
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.studies.study import Job, run_jobs
+from guiderail.tools.viewing.style import draw_runs
 
 
 def train_all(

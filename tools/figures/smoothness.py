@@ -12,10 +12,13 @@ from guiderail.diagrams.tasks.narrow_passage import make_skill
 from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.models.primitives import LcNsKmp
 from guiderail.models.primitives.gains import rms_gains
-from guiderail.tools.episodes import make_environment, run_episode
-from guiderail.tools.figures.passage import TASK, draw_world
-from guiderail.tools.pictures import COLOURS, NAMES, new_figure, save_figure
-from guiderail.tools.study import write_table
+from guiderail.tools.figures.passage import TASK
+from guiderail.tools.guidance import COLOURS, NAMES
+from guiderail.tools.rollouts.rollout import run_episode
+from guiderail.tools.studies.study import write_table
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.passage import draw_world
+from guiderail.tools.viewing.style import new_figure, save_figure
 
 VARIANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # ρ, m²
 SHOWN = 1e-6  # ρ of the thesis

@@ -16,9 +16,9 @@ from guiderail.diagrams.tasks.bnc_connector import (
 )
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.models.errors import InputError
-from guiderail.tools.bnc_rule import reactive_rule
-from guiderail.tools.episodes import standing_still
-from guiderail.tools.judging import total, trials, worst
+from guiderail.tools.rollouts.judging import total, trials, worst
+from guiderail.tools.rollouts.rollout import standing_still
+from guiderail.tools.studies.bnc_rule import reactive_rule
 
 
 def play(env, policy, *, seed=None, options=None):

@@ -6,8 +6,8 @@ import pytest
 from guiderail.diagrams.tasks.bnc_connector import make_env
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
 from guiderail.models.errors import InputError
-from guiderail.tools.bnc_rule import reactive_rule
-from guiderail.tools.judging import total, trials
+from guiderail.tools.rollouts.judging import total, trials
+from guiderail.tools.studies.bnc_rule import reactive_rule
 
 
 def drawn(uncertain, count, seed=0):

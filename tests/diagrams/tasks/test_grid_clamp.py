@@ -19,8 +19,8 @@ from guiderail.diagrams.tasks.grid_clamp import (
 )
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.models.errors import InputError
-from guiderail.tools.clamp_rule import STIFFNESS, searching_rule, straight_descent
-from guiderail.tools.judging import total, trials, worst
+from guiderail.tools.rollouts.judging import total, trials, worst
+from guiderail.tools.studies.clamp_rule import STIFFNESS, searching_rule, straight_descent
 
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -70,7 +70,7 @@ def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
 
 
 def test_the_straight_descent_mostly_fails_where_the_offset_is_drawn(env):
-    """Pushed with 12 N for the whole 10 s. `python -m guiderail.tools.clamp_rule --trials 50` asks more often."""
+    """Pushed with 12 N for the whole 10 s."""
     rows = trials(env, straight_descent, 3, seed=1)
     assert total(rows, "success") == 0
     assert worst(rows, "peak_force") < 1.2 * LEASH * STIFFNESS

@@ -1,0 +1,146 @@
+"""`guiderail train`: what was typed becomes a checked configuration, and a run becomes a folder with its pictures."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.defaults import DEFAULTS, OWN_DEFAULTS
+from guiderail.tools.learning.presets import resolve_preset
+from guiderail.tools.learning.progress import TrainingProgress
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, converged_after, installed_versions
+from guiderail.tools.learning.train import train
+from guiderail.tools.tasks import check_environment
+
+
+def configure(
+    task: str,
+    environment: Mapping[str, Any],
+    *,
+    algorithm: str = DEFAULTS["algorithm"],
+    preset: str = DEFAULTS["preset"],
+    settings: Mapping[str, Any] | None = None,
+    episodes: int = DEFAULTS["episodes"],
+    seed: int = DEFAULTS["seed"],
+) -> RunConfig:
+    """A checked configuration with everything resolved.
+
+    Raises:
+        InputError: for an unknown name or a number out of range.
+    """
+    if episodes < 1:
+        raise InputError(f"a run needs at least one episode, not {episodes}")
+    if not 0 <= seed < 2**31:
+        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
+    learner = resolve_preset(preset, algorithm, settings)
+    resolved = check_environment(task, {"guidance": DEFAULTS["guidance"], **environment})
+    return RunConfig(task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions())
+
+
+def run(
+    task: str | None,
+    out: Path | None,
+    *,
+    environment: Mapping[str, Any],
+    algorithm: str | None = None,
+    preset: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    resume: bool = False,
+    report: Callable[[dict[str, Any]], None] | None = None,
+) -> dict[str, Any]:
+    """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
+
+    A run that goes on keeps its configuration; only more episodes may be asked for.
+
+    Returns:
+        What happened, in a few numbers.
+    """
+    if out is None:
+        raise InputError("where should the run go? name a folder with --out RUN")
+    folder = RunFolder(out)
+    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
+    given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
+    if resume:
+        config = _continued(folder, task, environment, given, settings)
+    elif task is None:
+        raise InputError("what should be learned? name a task, such as guiderail train NarrowPassage --out RUN")
+    else:
+        folder.refuse_existing()
+        environment, given = with_defaults(task, environment, given)
+        config = configure(task, environment, settings=settings, **given)
+    with TrainingProgress(config.episodes, name=config.task) as progress:
+        rows = train(folder, config, resume=resume, report=report or progress.update)
+    return summarise(out, rows) | finish(out)
+
+
+def with_defaults(
+    task: str, environment: Mapping[str, Any], given: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What was asked for, and for the rest what this task was measured with.
+
+    Args:
+        task: its name.
+        environment: arguments of the environment.
+        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them.
+    """
+    own = dict(OWN_DEFAULTS.get(task, {}))
+    guidance = own.pop("guidance", DEFAULTS["guidance"])
+    learner = {} if given.keys() & {"algorithm", "preset"} else own
+    return {"guidance": guidance, **environment}, {**learner, **given}
+
+
+def finish(out: Path) -> dict[str, str]:
+    """Adds the pictures to a run that has its numbers; what cannot be drawn on this machine is said, not raised."""
+    from guiderail.tools.viewing.plot import plot_run
+    from guiderail.tools.viewing.replay import write_replay
+
+    drawn = {"curve": str(plot_run(out))}
+    try:
+        drawn["replay"] = str(write_replay(out))
+    except InputError as error:
+        drawn["replay"] = f"none: {error}"
+    return drawn
+
+
+def summarise(out: Path, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """What a finished run says about itself; every number is in `episodes.csv`."""
+    last = rows[-10:]
+    return {
+        "run": str(out),
+        "episodes": len(rows),
+        "converged_after": converged_after(bool(row["success"]) for row in rows),
+        "success_rate": sum(row["success"] for row in rows) / len(rows),
+        "success_rate_last_10": sum(row["success"] for row in last) / len(last),
+        "return_last_10": sum(row["return"] for row in last) / len(last),
+        "worst_violation": max(row["worst_violation"] for row in rows),
+        "peak_force": max(row["peak_force"] for row in rows),
+        "collisions": sum(row["collisions"] for row in rows),
+        "wall_time": sum(row["wall_time"] for row in rows),
+    }
+
+
+def _continued(
+    folder: RunFolder,
+    task: str | None,
+    environment: Mapping[str, Any],
+    given: Mapping[str, Any],
+    settings: Mapping[str, Any] | None,
+) -> RunConfig:
+    """The configuration of the run that goes on; refuses what would make it another run."""
+    config = folder.config()
+    stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
+    stored |= config.environment
+    wanted = {**environment, **given} | ({} if task is None else {"task": task})
+    for key, value in wanted.items():
+        if key != "episodes" and stored.get(key) != value:
+            raise InputError(
+                f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train anew"
+            )
+    kept = {key: value for key, value in asdict(config.learner).items() if key != "algorithm"}
+    learner = resolve_preset(config.preset, config.learner.algorithm, kept | dict(settings or {}))
+    if learner != config.learner:
+        raise InputError(f"the run in {folder.path} has other learner settings: leave --set out, or train anew")
+    return replace(config, episodes=max(config.episodes, given.get("episodes", 0)))
