@@ -5,16 +5,32 @@ from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium
+import yaml
 from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
 from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
 
 
 def known_tasks() -> list[str]:
     """The tasks that there are."""
     return sorted(spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")
+
+
+def task_options(task: str) -> dict[str, Any]:
+    """What a task's environment takes, with its defaults; `inspect.Parameter.empty` where it has none.
+
+    Raises:
+        InputError: for an unknown task.
+    """
+    if task not in known_tasks():
+        raise InputError(f"there is no task {task!r}: {did_you_mean(task, known_tasks())}")
+    entry = gymnasium.spec(f"guiderail/{task}-v0").entry_point
+    creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
+    taken = inspect.signature(creator).parameters.items()
+    return {name: parameter.default for name, parameter in taken if name not in ("self", "render_mode")}
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -23,16 +39,42 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     Raises:
         InputError: for an unknown task, or an argument that it does not take.
     """
-    if task not in known_tasks():
-        raise InputError(f"there is no task {task!r}: choose one of {', '.join(known_tasks())}")
-    entry = gymnasium.spec(f"guiderail/{task}-v0").entry_point
-    creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
-    taken = {k: v for k, v in inspect.signature(creator).parameters.items() if k not in ("self", "render_mode")}
-    unknown = sorted(set(arguments) - set(taken))
-    if unknown:
-        raise InputError(f"{task} has no argument {unknown[0]}: it takes {', '.join(taken)}")
-    defaults = {key: parameter.default for key, parameter in taken.items()}
-    return {k: arguments.get(k, v) for k, v in defaults.items() if k in arguments or v is not inspect.Parameter.empty}
+    options = task_options(task)
+    for name, value in arguments.items():
+        if name not in options:
+            raise InputError(f"{task} has no option {name!r}: {did_you_mean(name, options)}")
+        if not _is_like(value, options[name]):
+            raise InputError(f"{task}'s {name} cannot be {value!r}: give a value such as {options[name]!r}")
+    given = {name: arguments.get(name, default) for name, default in options.items()}
+    return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
+
+
+def _is_like(value: Any, default: Any) -> bool:
+    """Whether a value has the type of a default, as far as that says anything."""
+    if default is None or default is inspect.Parameter.empty:
+        return True
+    if isinstance(default, float):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(default, tuple):
+        return isinstance(value, tuple | list)
+    return isinstance(value, type(default)) and isinstance(value, bool) == isinstance(default, bool)
+
+
+def as_value(text: str) -> Any:
+    """A typed value: what YAML reads, and 1e-8 too, which YAML takes for a word."""
+    try:
+        return _numbers(yaml.safe_load(text))
+    except yaml.YAMLError:
+        return text
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_numbers(one) for one in value)
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
@@ -47,9 +89,3 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
     threadpool_limits(1)
     arguments = check_environment(task, arguments)
     return gymnasium.make(f"guiderail/{task}-v0", disable_env_checker=True, render_mode=render_mode, **arguments)
-
-
-def most_decisions(env: gymnasium.Env) -> int:
-    """The most decisions that an episode can take."""
-    base = cast(Any, env.unwrapped)
-    return -(-base.task.num_steps // base.hold)

@@ -5,12 +5,6 @@ regimes: constraints slack, grazed now and then, and active at almost every step
 K + ħΣ inverted, the dual of equation 4.20 assembled over the whole window and given to its solver, PIQP (to DAQP where
 PIQP is not installed). Difference is the largest one to that step, in scales of the outputs, and nearly all of it is
 the dense step's own error: the tests compare both with extended precision, where the history's covariance is small.
-
-What did not help: warm-starting DAQP from the last multipliers (a cold start takes 4 to 16 iterations of half a
-microsecond each, and a warm one would make an episode depend on the one before); one QP row per side of a box (twice
-the rows, 4 µs more a step than one row with two bounds); keeping every row of the window for `Prediction.trajectory`
-(380 kB a step instead of 93, no faster); normal equations instead of QR (0.3 ms less to factor a step, but accurate to
-1e-4 only where ρ is 1e-8).
 """
 
 import gc
@@ -22,6 +16,7 @@ import numpy as np
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
 from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.least_norm import SOLVERS
+from guiderail.tools.benchmarks import told
 
 #: O, F, H, P: planar, connector, and something larger than either.
 SIZES = ((2, 1, 40, 10), (6, 4, 40, 10), (6, 12, 100, 20))
@@ -244,7 +239,7 @@ def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
 def measure(steps: int = STEPS) -> dict:
     """Everything the benchmark reports, by size."""
     report = {}
-    for size in SIZES:
+    for size in told(SIZES, "primitive, O F H P"):
         name = "O{} F{} H{} P{}".format(*size)
         report[name] = {
             "predict": _predict(size, steps),
@@ -255,15 +250,8 @@ def measure(steps: int = STEPS) -> dict:
     return report
 
 
-def main(as_json: bool = False, steps: int = STEPS) -> dict:
-    """Measures and, unless it is for a program, prints the tables."""
-    report = measure(steps)
-    if not as_json:
-        _print(report)
-    return report
-
-
-def _print(report: dict) -> None:
+def show(report: dict) -> None:
+    """Prints the tables."""
     from rich.console import Console
     from rich.table import Table
 

@@ -6,10 +6,10 @@ share is the time in callbacks of systems written in Python, with what they call
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.recorder import Recorder
 from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.tools.benchmarks import told
 
 # Outermost callbacks only: one that is called within another would count twice.
 CALLBACKS: tuple[tuple[type, str], ...] = (
@@ -127,9 +128,10 @@ def env_seconds(guidance: str = "kgrl") -> float:
 
 def measure() -> dict[str, Any]:
     """All of it, as a program may read it."""
-    results: dict[str, Any] = {name: real_time_factor(name) for name in REQUIRED_FACTOR}
-    results["grid_clamp"] = real_time_factor("rails", "GridClamp")
-    results["env_seconds_per_400_steps"] = env_seconds()
+    measurements: dict[str, Callable[[], Any]] = {name: partial(real_time_factor, name) for name in REQUIRED_FACTOR}
+    measurements["grid_clamp"] = partial(real_time_factor, "rails", "GridClamp")
+    measurements["env_seconds_per_400_steps"] = env_seconds
+    results: dict[str, Any] = {name: measurements[name]() for name in told(measurements, "simulation")}
     results["fast_enough"] = (
         results["grid_clamp"]["real_time_factor"] >= REQUIRED_CLAMP_FACTOR
         and all(results[name]["real_time_factor"] >= factor for name, factor in REQUIRED_FACTOR.items())
@@ -138,12 +140,8 @@ def measure() -> dict[str, Any]:
     return results
 
 
-def main(as_json: bool = False) -> dict[str, Any]:
-    """Measures, prints, and returns what was measured."""
-    results = measure()
-    if as_json:
-        print(json.dumps(results, indent=2))
-        return results
+def show(results: dict[str, Any]) -> None:
+    """Prints what was measured."""
     for name, factor in (REQUIRED_FACTOR | {"grid_clamp": REQUIRED_CLAMP_FACTOR}).items():
         row = results[name]
         print(
@@ -152,8 +150,3 @@ def main(as_json: bool = False) -> dict[str, Any]:
         )
     seconds = results["env_seconds_per_400_steps"]
     print(f"env         {seconds:4.2f} s for 400 control steps (at most {REQUIRED_SECONDS:.0f})")
-    return results
-
-
-if __name__ == "__main__":
-    main()

@@ -1,17 +1,26 @@
 """`guiderail train`: what was typed becomes a checked configuration, and a run becomes a folder with its pictures."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+
+import pandas as pd
 
 from guiderail.models.errors import InputError
 from guiderail.tools.learning.defaults import DEFAULTS, OWN_DEFAULTS
 from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.learning.progress import TrainingProgress
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, converged_after, installed_versions
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.learning.train import train
+from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.tasks import check_environment
+
+# What a finished run says about itself.
+SUMMARY = (
+    "episodes", "converged_after", "success_rate", "success_rate_last_10", "mean_return_last_10",
+    "worst_violation", "peak_force", "collisions", "wall_time",
+)  # fmt: skip
 
 
 def configure(
@@ -49,7 +58,6 @@ def run(
     episodes: int | None = None,
     seed: int | None = None,
     resume: bool = False,
-    report: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
 
@@ -72,8 +80,8 @@ def run(
         environment, given = with_defaults(task, environment, given)
         config = configure(task, environment, settings=settings, **given)
     with TrainingProgress(config.episodes, name=config.task) as progress:
-        rows = train(folder, config, resume=resume, report=report or progress.update)
-    return summarise(out, rows) | finish(out)
+        rows = train(folder, config, resume=resume, report=progress.update)
+    return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
 
 
 def with_defaults(
@@ -95,31 +103,15 @@ def with_defaults(
 def finish(out: Path) -> dict[str, str]:
     """Adds the pictures to a run that has its numbers; what cannot be drawn on this machine is said, not raised."""
     from guiderail.tools.viewing.plot import plot_run
-    from guiderail.tools.viewing.replay import write_replay
+    from guiderail.tools.viewing.replay import default_page, write_page
+    from guiderail.tools.viewing.shown import Shown
 
-    drawn = {"curve": str(plot_run(out))}
+    curve = str(plot_run(out))
     try:
-        drawn["replay"] = str(write_replay(out))
+        write_page(page := default_page(out, {}), Shown.of_run(out))
+        return {"curve": curve, "replay": str(page)}
     except InputError as error:
-        drawn["replay"] = f"none: {error}"
-    return drawn
-
-
-def summarise(out: Path, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """What a finished run says about itself; every number is in `episodes.csv`."""
-    last = rows[-10:]
-    return {
-        "run": str(out),
-        "episodes": len(rows),
-        "converged_after": converged_after(bool(row["success"]) for row in rows),
-        "success_rate": sum(row["success"] for row in rows) / len(rows),
-        "success_rate_last_10": sum(row["success"] for row in last) / len(last),
-        "return_last_10": sum(row["return"] for row in last) / len(last),
-        "worst_violation": max(row["worst_violation"] for row in rows),
-        "peak_force": max(row["peak_force"] for row in rows),
-        "collisions": sum(row["collisions"] for row in rows),
-        "wall_time": sum(row["wall_time"] for row in rows),
-    }
+        return {"curve": curve, "replay": f"none: {error}"}
 
 
 def _continued(
@@ -139,8 +131,8 @@ def _continued(
             raise InputError(
                 f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train anew"
             )
-    kept = {key: value for key, value in asdict(config.learner).items() if key != "algorithm"}
-    learner = resolve_preset(config.preset, config.learner.algorithm, kept | dict(settings or {}))
+    stored_learner = {key: value for key, value in asdict(config.learner).items() if key != "algorithm"}
+    learner = resolve_preset(config.preset, config.learner.algorithm, stored_learner | dict(settings or {}))
     if learner != config.learner:
         raise InputError(f"the run in {folder.path} has other learner settings: leave --set out, or train anew")
     return replace(config, episodes=max(config.episodes, given.get("episodes", 0)))

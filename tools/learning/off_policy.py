@@ -1,10 +1,13 @@
-"""The learners: Stable-Baselines3's SAC and TQC with the settings of the thesis and with a robust one.
+"""Off-policy learners: any algorithm with Stable-Baselines3's interface, told when to act, remember and learn.
 
 Only the networks, the replay buffer and the gradient step are Stable-Baselines3's. Acting and deciding when to train
-are here, so that everything that a run depends on has a name and can be written to a checkpoint.
+are here, so that everything that a run depends on has a name and can be written to a checkpoint. An algorithm more is
+one file: a subclass of `OffPolicyLearner` that names it, registered by `register_learner` or by an entry point of the
+group `guiderail.learners`.
 """
 
 import copy
+import inspect
 import random
 from collections.abc import Mapping
 from typing import Any
@@ -13,6 +16,8 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.preprocessing import is_image_space
@@ -20,9 +25,13 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.task import Symmetry
+from guiderail.models.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
-from guiderail.tools.learning.checkpoint_selection import Proving
-from guiderail.tools.learning.presets import ALGORITHMS, Preset, decision_discount
+from guiderail.tools.learning import older
+from guiderail.tools.learning.checkpoint_selection import CheckpointSelection
+from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.presets import Preset, decision_discount
+from guiderail.tools.rollouts.rollout import Decision
 
 IMAGE_POOL = 5  # pixels; 110×144×3 becomes 22×28×3
 
@@ -60,10 +69,19 @@ class NormalizedReLU(torch.nn.Module):
 
 
 def policy_of(actor: Any, description: Mapping[str, Any]) -> Policy:
-    """The policy of a Stable-Baselines3 actor: linear layers, what rectifies between them, and a tanh at the end."""
-    layers = [*actor.latent_pi, actor.mu]
-    linear = [layer for layer in layers if isinstance(layer, torch.nn.Linear)]
-    activations = {getattr(layer, "kind", "relu") for layer in actor.latent_pi if layer not in linear}
+    """The policy of a Stable-Baselines3 actor: linear layers, what rectifies between them, and a tanh at the end.
+
+    Raises:
+        InputError: for an actor with other layers.
+    """
+    layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
+    linear, between = layers[::2], layers[1::2]
+    activations = {"relu" if isinstance(layer, torch.nn.ReLU) else getattr(layer, "kind", None) for layer in between}
+    if not all(isinstance(layer, torch.nn.Linear) for layer in linear) or len(activations) != 1 or None in activations:
+        raise InputError(
+            f"an actor of {', '.join(type(layer).__name__ for layer in layers)} can't be exported: use linear layers "
+            "with one kind of rectifier between them"
+        )
     space = actor.action_space
     return Policy(
         [(m.weight.detach().numpy().copy(), m.bias.detach().numpy().copy()) for m in linear],
@@ -79,8 +97,14 @@ def policy_of(actor: Any, description: Mapping[str, Any]) -> Policy:
     )
 
 
-class Learner:
-    """An off-policy algorithm of Stable-Baselines3 that is told when to act, to remember and to learn."""
+class OffPolicyLearner(Learner):
+    """An off-policy algorithm of Stable-Baselines3 that is told when to act, to remember and to learn.
+
+    Attributes:
+        algorithm: the class; a subclass names it.
+    """
+
+    algorithm: type
 
     def __init__(
         self,
@@ -97,7 +121,7 @@ class Learner:
             preset: how to learn.
             env: for its spaces only.
             hold: control steps that an action lasts.
-            seed: of the networks, and of everything drawn in training.
+            seed: of the networks, and of everything random in training.
             decisions: the most that this run can take, so that the replay buffer asks for no more memory than it uses.
             symmetry: of the task, where it has one; used if the preset says so.
         """
@@ -110,19 +134,19 @@ class Learner:
             networks |= {"features_extractor_class": PooledImage, "features_extractor_kwargs": {"pool": IMAGE_POOL}}
         self.preset = preset
         self.decisions = 0
-        self.model = ALGORITHMS[preset.algorithm](
-            "MlpPolicy",
-            env,
-            learning_rate=preset.learning_rate,
-            buffer_size=min(preset.buffer_size, decisions + 1),
-            batch_size=preset.batch_size,
-            tau=preset.soft_update,
-            gamma=decision_discount(preset, hold),
-            ent_coef=preset.entropy if preset.entropy.startswith("auto") else float(preset.entropy),
-            policy_kwargs=networks,
-            seed=seed,
-            device="cpu",
-        )
+        arguments = {
+            "learning_rate": preset.learning_rate,
+            "buffer_size": min(preset.buffer_size, decisions + 1),
+            "batch_size": preset.batch_size,
+            "tau": preset.soft_update,
+            "gamma": decision_discount(preset, hold),
+            "ent_coef": preset.entropy if preset.entropy.startswith("auto") else float(preset.entropy),
+            "policy_kwargs": networks,
+            "seed": seed,
+            "device": "cpu",
+        }
+        taken = inspect.signature(self.algorithm).parameters  # not every algorithm has an entropy
+        self.model = self.algorithm("MlpPolicy", env, **{k: v for k, v in arguments.items() if k in taken})
         self.model.replay_buffer = NStepReplayBuffer(
             self._sides * self.model.buffer_size,
             self.model.observation_space,
@@ -135,76 +159,83 @@ class Learner:
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.random = np.random.default_rng(seed)
         self.averaged = copy.deepcopy(self.model.actor) if preset.averaging else None
-        self.proving = Proving(preset.proven_by) if preset.proven_by else None
+        self.selection = CheckpointSelection(preset.selection_window) if preset.selection_window else None
         self.episodes = 0
-        self._practises = False
-        self._row = 0  # practising episodes in a row that succeeded
-        self._steady: np.ndarray | None = None
-        self._burst = 0  # decisions for which it still goes on
-        self._burst_action: np.ndarray | None = None
+        self._greedy = False  # whether this episode does not explore
+        self._greedy_successes = 0  # in a row
+        self._constant: np.ndarray | None = None  # the action of this episode, where it has only one
+        self._repeats = 0  # decisions for which an extended action still goes on
+        self._extended: np.ndarray | None = None
 
     def has_begun(self) -> bool:
-        """Whether enough is known to learn from; until then actions are drawn uniformly."""
+        """Whether enough is known to learn from; until then actions are uniformly random."""
         return self.decisions >= self.preset.learning_starts
 
     def begin(self) -> None:
         """Begins an episode, and decides how it explores."""
         self.episodes += 1
-        share = self.preset.practise
-        self._steady = self._uniform() if self.episodes <= self.preset.steady_episodes else None
+        share = self.preset.greedy_share
+        self._constant = self._uniform() if self.episodes <= self.preset.constant_episodes else None
         due = int(self.episodes * share) > int((self.episodes - 1) * share)
-        self._practises = due and self._steady is None and self.has_begun()
-        self._burst = 0
-        if self.proving is not None and self._practises:
-            self.proving.begin(self.actor(), self._row)
+        self._greedy = due and self._constant is None and self.has_begun()
+        self._repeats = 0
+        if self.selection is not None and self._greedy:
+            self.selection.begin(self.actor(), self._greedy_successes)
 
-    def finish(self, success: bool) -> None:
+    def see(self, decision: Decision) -> None:
+        """Remembers a decision, and learns if it is time to."""
+        self.remember(decision)
+        self.learn()
+
+    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Ends an episode."""
-        if self._practises:
-            self._row = self._row + 1 if success else 0
-            if self.proving is not None:
-                self.proving.finish(success)
+        if self._greedy:
+            self._greedy_successes = self._greedy_successes + 1 if row["success"] else 0
+            if self.selection is not None:
+                self.selection.finish(bool(row["success"]))
+        return {}
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """An exploring action: uniform until learning starts, then drawn from the policy.
-
-        White actions blur what an action is worth: on the connector they find the hole by wiggling, whatever the policy
-        wants. Episodes that keep to one action, or to the policy's mean, say what that action or that mean is worth.
-        """
-        if self._steady is not None:
-            return self._steady
+        """Uniform until learning starts; then sampled from the policy, or in a greedy episode its mean."""
+        if self._constant is not None:
+            return self._constant
         if not self.has_begun():
             return self._uniform()
-        if not self._practises:
-            burst = self._kept_for_a_while()
-            return burst if burst is not None else self.model.predict(observation, deterministic=False)[0]
+        if not self._greedy:
+            extended = self._temporally_extended()
+            return self.explore(observation) if extended is None else extended
         with torch.no_grad():
             return self.actor()._predict(self.model.policy.obs_to_tensor(observation)[0], deterministic=True)[0].numpy()
 
-    def _kept_for_a_while(self) -> np.ndarray | None:
+    def explore(self, observation: np.ndarray) -> np.ndarray:
+        """An exploring action of the policy; one that is deterministic needs noise from its subclass."""
+        return self.model.predict(observation, deterministic=False)[0]
+
+    def _temporally_extended(self) -> np.ndarray | None:
         """Now and then one uniform action for several decisions; None in between.
 
-        The temporally extended exploration of Dabney, Ostrovski and Barreto (2021): it leaves where a policy has
-        settled, such as above all contact, and it says what going on in one direction is worth.
+        The εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations: it leaves where a
+        policy has settled, such as above all contact, and it says what going on in one direction is worth.
         """
-        if self._burst == 0:
-            known = 0 < self.preset.bursts_until <= self._row
-            if known or not self.preset.bursts or self.random.random() >= self.preset.bursts:
+        if self._repeats == 0:
+            known = 0 < self.preset.ez_greedy_until <= self._greedy_successes
+            if known or not self.preset.ez_greedy or self.random.random() >= self.preset.ez_greedy:
                 return None
-            self._burst = int(self.random.integers(1, self.preset.longest_burst + 1))
-            self._burst_action = self._uniform()
-        self._burst -= 1
-        return self._burst_action
+            self._repeats = int(self.random.integers(1, self.preset.ez_greedy_longest + 1))
+            self._extended = self._uniform()
+        self._repeats -= 1
+        return self._extended
 
     def _uniform(self) -> np.ndarray:
         space = self.model.action_space
         assert isinstance(space, spaces.Box)
         return self.random.uniform(space.low, space.high).astype(space.dtype)
 
-    def remember(self, observation, action, reward: float, following, terminated: bool, truncated: bool) -> None:
-        """Takes one decision and what followed into the replay buffer. A time limit is not an end of the task."""
-        infos = [{"TimeLimit.truncated": truncated and not terminated}]
-        action = self.model.policy.scale_action(np.asarray(action)[None])
+    def remember(self, one: Decision) -> None:
+        """Takes a decision into the replay buffer. A time limit is not an end of the task."""
+        infos = [{"TimeLimit.truncated": one.truncated and not one.terminated}]
+        observation, following = one.observation, one.following
+        action = self.model.policy.scale_action(np.asarray(one.action)[None])
         if np.ndim(observation) == 3:  # an image; Stable-Baselines3 keeps channels first
             observation, following = np.moveaxis(observation, -1, 0), np.moveaxis(following, -1, 0)
         seen, did, then = [observation], [action[0]], [following]
@@ -217,8 +248,8 @@ class Learner:
             np.array(seen),
             np.array(then),
             np.array(did),
-            np.full(self._sides, reward),
-            np.full(self._sides, terminated or truncated),
+            np.full(self._sides, one.reward),
+            np.full(self._sides, one.is_last),
             infos * self._sides,
         )
         self.decisions += 1
@@ -235,17 +266,17 @@ class Learner:
                     mean.lerp_(value, follow)
 
     def actor(self) -> Any:
-        """The network whose mean action is practised: the averaged one where there is one."""
+        """The network whose mean is the greedy action: the averaged one where there is one."""
         return self.model.actor if self.averaged is None else self.averaged
 
     def result(self) -> Any:
-        """What a run leaves: the actor that proved itself, or the last one where none had the time to."""
-        weights = None if self.proving is None else self.proving.result()
+        """What a run leaves: the selected actor, or the last one where none was."""
+        weights = None if self.selection is None else self.selection.result()
         if weights is None:
             return self.actor()
-        proven = copy.deepcopy(self.actor())
-        proven.load_state_dict(weights)
-        return proven
+        selected = copy.deepcopy(self.actor())
+        selected.load_state_dict(weights)
+        return selected
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
         """What a run leaves, as NumPy evaluates it; `description` is what else is known of it."""
@@ -261,7 +292,7 @@ class Learner:
 
     def _optimizers(self) -> dict[str, torch.optim.Optimizer]:
         optimizers = {"actor": self.model.actor.optimizer, "critic": self.model.critic.optimizer}
-        entropy = self.model.ent_coef_optimizer
+        entropy = getattr(self.model, "ent_coef_optimizer", None)
         return optimizers if entropy is None else optimizers | {"entropy": entropy}
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -272,12 +303,12 @@ class Learner:
         for name, optimizer in self._optimizers().items():
             for index, moments in optimizer.state_dict()["state"].items():
                 arrays |= {f"optimizer/{name}/{index}/{key}": value.numpy() for key, value in moments.items()}
-        if self.model.log_ent_coef is not None:
-            arrays["log_ent_coef"] = self.model.log_ent_coef.detach().numpy()
-        proving: dict[str, Any] = {}
-        if self.proving is not None:
-            actors, proving = self.proving.state()
-            arrays |= {f"proving/{key}": value.numpy() for key, value in actors.items()}
+        if self._entropy() is not None:
+            arrays["log_ent_coef"] = self._entropy().detach().numpy()
+        selection: dict[str, Any] = {}
+        if self.selection is not None:
+            actors, selection = self.selection.state()
+            arrays |= {f"selection/{key}": value.numpy() for key, value in actors.items()}
         buffer = self.model.replay_buffer
         arrays |= {f"buffer/{k}": getattr(buffer, k)[: buffer.size()] for k in self._buffer_names()}
         arrays["random/torch"] = torch.get_rng_state().numpy()
@@ -286,8 +317,8 @@ class Learner:
         return arrays, {
             "decisions": self.decisions,
             "episodes": self.episodes,
-            "row": self._row,
-            "proving": proving,
+            "greedy_successes": self._greedy_successes,
+            "selection": selection,
             "updates": self.model._n_updates,
             "buffer": [buffer.pos, buffer.full],
             "numpy": [kind, *rest],
@@ -297,6 +328,7 @@ class Learner:
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Becomes what it was when `state` was called. KeyError, ValueError or RuntimeError where it does not fit."""
+        arrays, values = older.checkpoint(arrays, values)
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
         for name, module in self._modules().items():
             module.load_state_dict({k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(name + "/")})
@@ -307,9 +339,9 @@ class Learner:
                     _, _, index, moment = key.split("/")
                     moments.setdefault(int(index), {})[moment] = value
             optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-        if self.model.log_ent_coef is not None:
+        if self._entropy() is not None:
             with torch.no_grad():
-                self.model.log_ent_coef.copy_(tensors["log_ent_coef"])
+                self._entropy().copy_(tensors["log_ent_coef"])
         buffer = self.model.replay_buffer
         for key in self._buffer_names():
             stored = getattr(buffer, key)
@@ -317,10 +349,10 @@ class Learner:
         buffer.pos, buffer.full = values["buffer"]
         self.decisions, self.model._n_updates = values["decisions"], values["updates"]
         self.episodes = values["episodes"]
-        self._row = values.get("row", values["proving"].get("row", 0))  # where older checkpoints have it, if at all
-        if self.proving is not None:
-            actors = {key.removeprefix("proving/"): v for key, v in tensors.items() if key.startswith("proving/")}
-            self.proving.restore(actors, values["proving"])
+        self._greedy_successes = values["greedy_successes"]
+        if self.selection is not None:
+            actors = {key.removeprefix("selection/"): v for key, v in tensors.items() if key.startswith("selection/")}
+            self.selection.restore(actors, values["selection"])
         torch.set_rng_state(tensors["random/torch"])
         kind, *rest = values["numpy"]
         np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002
@@ -328,6 +360,22 @@ class Learner:
         random.setstate((version, tuple(state), gauss))
         self.random.bit_generator.state = values["own"]
 
+    def _entropy(self) -> Any:
+        """The logarithm of the entropy's coefficient where it is learned."""
+        return getattr(self.model, "log_ent_coef", None)
+
     @staticmethod
     def _buffer_names() -> tuple[str, ...]:
         return ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+class SacLearner(OffPolicyLearner):
+    """Soft actor-critic (Haarnoja et al., 2018)."""
+
+    algorithm = SAC
+
+
+class TqcLearner(OffPolicyLearner):
+    """Truncated quantile critics (Kuznetsov et al., 2020)."""
+
+    algorithm = TQC

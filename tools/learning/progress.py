@@ -8,7 +8,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-TOLERANCE = 1e-9  # what a primitive keeps its bounds to; below it there is only rounding
+from guiderail.tools.rollouts.metrics import TOLERANCE
+
 WINDOW = 10  # episodes that success and return are averaged over
 
 

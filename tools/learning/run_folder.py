@@ -1,19 +1,23 @@
 """What a run leaves behind: one folder, readable without the program that wrote it."""
 
-import csv
-import io
 import platform
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import pandas as pd
 import yaml
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.presets import Preset, resolve_preset
+from guiderail.tools.learning import older
+from guiderail.tools.learning.presets import Preset
+from guiderail.tools.tables import read_table, table_text
+from guiderail.tools.tasks import check_environment
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
 
@@ -26,8 +30,8 @@ class RunConfig:
     environment: dict[str, Any]  # arguments of gymnasium.make
     learner: Preset
     preset: str  # the learner's settings started from it
-    episodes: int
-    seed: int
+    episodes: Annotated[int, Field(ge=1)]
+    seed: Annotated[int, Field(ge=0)]
     versions: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -81,6 +85,8 @@ class RunFolder:
             InputError: if task, environment, learner, seed or one of `also` differs.
         """
         found = self.config()
+        # An option that a run is older than had its default then.
+        found = replace(found, environment=as_arguments(check_environment(found.task, found.environment)))
         for key in ("task", "environment", "learner", "seed", *also):
             if getattr(found, key) != getattr(wanted, key):
                 raise InputError(f"{self.path} holds a run with another {key}: name another folder with --out")
@@ -103,30 +109,20 @@ class RunFolder:
             )
         try:
             values = yaml.safe_load(file.read_text(encoding="utf-8"))
-            learner = dict(values["learner"])
             # A setting that did not exist yet was off, as its default is, whatever the preset has become since.
-            settings = {key: value for key, value in (asdict(Preset()) | learner).items() if key != "algorithm"}
-            config = RunConfig(
-                task=str(values["task"]),
-                environment=as_arguments(values["environment"]),
-                learner=resolve_preset(values["preset"], learner["algorithm"], settings),
-                preset=values["preset"],
-                episodes=int(values["episodes"]),
-                seed=int(values["seed"]),
-                versions=dict(values["versions"]),
-            )
+            values["learner"] = Preset(**(asdict(Preset()) | older.settings(values["learner"])))
+            values["environment"] = as_arguments(values["environment"])
+            config = RunConfig(**values)
         except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{file} is damaged or of another version: restore it, or train anew") from error
-        if config.episodes < 1 or config.seed < 0:
-            raise InputError(f"{file} asks for {config.episodes} episodes with seed {config.seed}: restore it")
         return config
 
     def write_episodes(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replaces `episodes.csv`. Numbers are written so that reading them gives the same number."""
         write_atomically(self.path / "episodes.csv", table_text(rows).encode())
 
-    def episodes(self) -> list[dict[str, Any]]:
-        """The rows of `episodes.csv`, numbers as numbers.
+    def episodes(self) -> pd.DataFrame:
+        """The table `episodes.csv`.
 
         Raises:
             InputError: if the file is missing or no such table.
@@ -137,57 +133,3 @@ class RunFolder:
 def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:
     """An environment's arguments as they are passed: YAML knows lists only, arguments are tuples."""
     return {key: tuple(value) if isinstance(value, list) else value for key, value in dict(environment).items()}
-
-
-def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows as CSV; the first row names the columns."""
-    text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({key: _written(value) for key, value in row.items()} for row in rows)
-    return text.getvalue()
-
-
-def read_table(path: Path) -> list[dict[str, Any]]:
-    """The rows of a CSV file, with what looks like a number as a number.
-
-    Raises:
-        InputError: if the file is missing or is no table.
-    """
-    if not path.is_file():
-        raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
-    try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-        if any(None in row or None in row.values() for row in rows):
-            raise ValueError("rows of unequal length")
-        return [{key: _read(value) for key, value in row.items()} for row in rows]
-    except (csv.Error, ValueError) as error:
-        raise InputError(f"{path} is not a table of episodes: restore it, or train anew") from error
-
-
-def _written(value: Any) -> Any:
-    """A cell: an exact number, nothing for what is unknown."""
-    if isinstance(value, bool):
-        return int(value)
-    return "" if value is None else repr(float(value)) if isinstance(value, float) else value
-
-
-def _read(cell: str) -> Any:
-    """What a cell says."""
-    for kind in (int, float):
-        try:
-            return kind(cell)
-        except ValueError:
-            continue
-    return cell
-
-
-def converged_after(successes: Iterable[bool], in_a_row: int = 10) -> int | None:
-    """How many episodes it took until the following ten all succeeded (the thesis's figure 3.8); None if never."""
-    run = 0
-    for index, success in enumerate(successes):
-        run = run + 1 if success else 0
-        if run == in_a_row:
-            return index + 1 - in_a_row
-    return None

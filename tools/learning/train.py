@@ -9,10 +9,11 @@ import torch
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.off_policy import Learner
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, table_text
-from guiderail.tools.rollouts.rollout import EpisodeRecord
-from guiderail.tools.tasks import make_environment, most_decisions
+from guiderail.tools.learning.learner import LEARNERS, Learner
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.rollouts.rollout import rollout
+from guiderail.tools.tables import table_text
+from guiderail.tools.tasks import make_environment
 
 # Checkpoints cost at most this part of the time: small ones are written after every episode, a large one now and then.
 CHECKPOINT_SHARE = 0.05
@@ -40,10 +41,13 @@ def train(
     """
     torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
     env = make_environment(config.task, config.environment)
-    decisions = config.episodes * most_decisions(env)
-    symmetry = cast(Any, env.unwrapped).task.symmetry
-    learner = Learner(config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=symmetry)
-    env.reset(seed=config.seed)  # what is hidden and constant in a run is drawn here
+    task = cast(Any, env.unwrapped).task
+    decisions = config.episodes * -(-task.num_steps // config.hold)  # the most that the run can take
+    make_learner = LEARNERS.get(config.learner.algorithm)
+    learner = make_learner(
+        config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=task.symmetry
+    )
+    env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
     if resume:
         rows = _resume(folder, learner, env)
         folder.write_config(config)
@@ -54,21 +58,10 @@ def train(
     spent_training, spent_saving = 0.0, 0.0
     for episode in range(len(rows), config.episodes):
         started = time.perf_counter()
-        observation, _ = env.reset()
-        learner.begin()
-        record = EpisodeRecord(env)
-        finished = False
-        while not finished:
-            action = learner.act(observation)
-            following, reward, terminated, truncated, info = env.step(action)
-            record.add(float(reward), info)
-            learner.remember(observation, action, float(reward), following, terminated, truncated)
-            learner.learn()
-            observation, finished = following, terminated or truncated
-        learner.finish(bool(info["is_success"]))
+        row = rollout(env, learner.act, learner, index=episode)
         if learner.has_diverged():
             raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
-        row = record.row(episode) | {"wall_time": time.perf_counter() - started}
+        row["wall_time"] = time.perf_counter() - started
         if rows and rows[0].keys() != row.keys():
             raise InputError(
                 f"the run in {folder.path} was begun by another version of guiderail, whose episodes have other "
@@ -91,8 +84,8 @@ def train(
 def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any) -> None:
     """The checkpoint first: it holds the table too, and whoever is killed between the two loses nothing."""
     arrays, values = learner.state()
-    drawn = env.unwrapped.np_random.bit_generator.state
-    save_checkpoint(folder.checkpoint, arrays, {"rows": rows, "learner": values, "environment": drawn})
+    generator = env.unwrapped.np_random.bit_generator.state
+    save_checkpoint(folder.checkpoint, arrays, {"rows": rows, "learner": values, "environment": generator})
     folder.write_episodes(rows)
 
 

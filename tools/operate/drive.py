@@ -1,46 +1,47 @@
-"""Pour yourself: the diagram that a policy learns on, driven through a browser.
+"""`guiderail drive`: the diagram that a policy learns on, with a person in the policy's place."""
 
-    python -m guiderail.tools.operate.drive
+from __future__ import annotations
 
-Open the address that is printed. A gamepad's left stick moves the thermos, its right stick lifts it; without one, the
-sliders do, or the keys A and D, S and W, F and R. Ctrl-C ends.
-"""
+from collections.abc import Mapping
+from typing import Any, cast
 
-from collections.abc import Callable
+import gymnasium
 
-import numpy as np
-
-from guiderail.diagrams.tasks.pouring import make_env
+from guiderail.models.errors import InputError
 from guiderail.systems.meshcat_device import MeshcatDevice
+from guiderail.tools.rollouts.rollout import Act, Decision, EnvObserver, rollout
+from guiderail.tools.tasks import make_environment
 
-AXES = ((0, 1.0), (1, -1.0), (3, -1.0))
-KEYS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"))
+# For each input the gamepad's axis with its sign, and the keys that lower and raise it.
+AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0), (4, 1.0), (5, 1.0))
+KEYS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"), ("KeyJ", "KeyL"), ("KeyK", "KeyI"), ("KeyH", "KeyY"))
 
 
-def drive(env, driver: Callable[[np.ndarray], np.ndarray], episodes: int) -> list[str]:
+class Live(EnvObserver):
+    """Shows every decision while it happens."""
+
+    def see(self, decision: Decision) -> None:
+        """Shows it."""
+        self.env.render()
+
+
+def drive(env: gymnasium.Env, driver: Act, episodes: int) -> list[str]:
     """Runs episodes with whoever drives; returns how they ended. A policy is a driver, and so is a person's device."""
-    endings = []
-    for _ in range(episodes):
-        observation, info = env.reset()
-        over = False
-        while not over:
-            observation, _, terminated, truncated, info = env.step(driver(observation))
-            env.render()
-            over = terminated or truncated
-        endings.append(info["termination"])
-    return endings
+    return [rollout(env, driver, Live(env), index=i)["termination"] for i in range(episodes)]
 
 
-def main() -> None:
-    """Until somebody has had enough."""
-    env = make_env(render_mode="human")
-    meshcat = env.task.meshcat
-    assert meshcat is not None
-    device = MeshcatDevice(meshcat, AXES, KEYS, env.task.control_period)
-    print(f"drive at {meshcat.web_url()}")
+def drive_by_hand(task: str, environment: Mapping[str, Any]) -> None:
+    """Opens a browser view and follows its gamepad, sliders and keys, episode after episode, until it is interrupted.
+
+    Raises:
+        InputError: for a task or an argument that there isn't, or an action of more numbers than a device has.
+    """
+    env = make_environment(task, environment, render_mode="human")
+    base, size = cast(Any, env.unwrapped), int(env.action_space.shape[0])  # type: ignore[index]
+    if size > len(AXES):
+        raise InputError(f"an action of {task} has {size} numbers and a device {len(AXES)}: choose another --guidance")
+    device = MeshcatDevice(base.task.meshcat, AXES[:size], KEYS[:size], base.task.control_period)
+    print(f"Drive at {base.task.meshcat.web_url()} with a gamepad, the sliders, or the keys:")
+    print(", ".join(f"{lower[-1]} and {higher[-1]}" for lower, higher in KEYS[:size]) + ". Ctrl-C ends.", flush=True)
     while True:
-        print(*drive(env, lambda observation: device.read(), episodes=1))
-
-
-if __name__ == "__main__":
-    main()
+        print(*drive(env, lambda observation: device.read(), episodes=1), flush=True)

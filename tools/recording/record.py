@@ -9,7 +9,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.rollouts.rollout import run_episode
+from guiderail.tools.rollouts.rollout import rollout
 from guiderail.tools.tasks import make_environment
 
 SIGNALS = ("commanded", "measured")
@@ -44,7 +44,7 @@ def record(run: Path, out: Path, *, episodes: int = 5, signal: str = "commanded"
     env.reset(seed=config.seed)
     times, outputs = [], []
     for index in range(4 * episodes):
-        row = run_episode(env, policy, held_out_seed=seed + index)
+        row = rollout(env, policy, seed=seed + index, held_out=True)
         trace = cast(Any, env.unwrapped).trace
         if row["success"]:
             outputs.append(getattr(trace, signal).copy())

@@ -1,84 +1,162 @@
-"""Environments by name, and what an episode in one comes to: a row of numbers that the safety ledger backs."""
+"""The loop of an episode: the same one for training, evaluation, replays, films, studies, stress and driving."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, cast
+from dataclasses import dataclass
+from typing import Any
 
 import gymnasium
 import numpy as np
 
-from guiderail.diagrams.trace import mean_jerk
 from guiderail.models.errors import InputError
+from guiderail.tools.rollouts.metrics import Episode, episode_row
 
+Act = Callable[[np.ndarray], np.ndarray]
 START_DEVIATION = 0.01  # m, of a held-out start from the usual one
-# What the safety ledger counts.
-COUNTS = ("collisions", "collision_steps", "saturations", "fallbacks")
 
 
-class EpisodeRecord:
-    """Takes in the decisions of one episode, and tells what it came to.
+@dataclass(frozen=True)
+class Decision:
+    """A decision of an episode and what followed; `info` is the environment's."""
 
-    Everything it says comes from the safety ledger and the trace, which know every control step and not only the last
-    of a hold. (An episode in which the simulation failed has no ledger; then it is what was seen until there.)
+    observation: np.ndarray
+    action: np.ndarray
+    reward: float
+    following: np.ndarray
+    terminated: bool
+    truncated: bool
+    info: Mapping[str, Any]
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the episode is over."""
+        return self.terminated or self.truncated
+
+
+class Observer:
+    """Watches an episode: a learner, a camera, a witness."""
+
+    def begin(self) -> None:
+        """Called after the environment was reset."""
+
+    def see(self, decision: Decision) -> None:
+        """Called after every decision."""
+
+    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Called with the episode's row; what it returns are further columns."""
+        return {}
+
+
+class EnvObserver(Observer):
+    """One that also looks at what an environment's step doesn't return.
+
+    Attributes:
+        env: the environment.
+        base: the same without its wrappers.
     """
 
     def __init__(self, env: gymnasium.Env):
         """
         Args:
-            env: just reset.
+            env: the environment.
         """
-        self._env = cast(Any, env.unwrapped)
-        self._terms: dict[str, float] = dict.fromkeys(self._env.task.reward_terms, 0.0)
-        self._return = 0.0
-        self._violation = self._measured = -np.inf
-        self._last: dict[str, Any] = {}
+        self.env: Any = env
+        self.base: Any = env.unwrapped
 
-    def add(self, reward: float, info: Mapping[str, Any]) -> None:
-        """Takes in what a step of the environment returned."""
-        self._return += float(reward)
-        self._violation = max(self._violation, info["constraint_violation"])
-        self._measured = max(self._measured, info["measured_violation"])
+
+def rollout(
+    env: gymnasium.Env,
+    act: Act,
+    *observers: Observer,
+    index: int = 0,
+    seed: int | None = None,
+    held_out: bool = False,
+    options: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Runs one episode and returns its row; the environment's trace is still that episode's afterwards.
+
+    Args:
+        env: the environment.
+        act: the policy; one that is an observer too is told of the episode.
+        observers: who watches.
+        index: the row's number.
+        seed: of the reset; unless given, the next conditions that training would meet.
+        held_out: whether the conditions are ones that training never meets; then the seed decides them.
+        options: of the reset.
+    """
+    observation = (
+        reset_held_out(env, seed or 0, **(options or {}))
+        if held_out
+        else env.reset(seed=seed, options=None if options is None else dict(options))[0]
+    )
+    tally = _Tally(env)
+    watching = (tally, *([act] if isinstance(act, Observer) and act not in observers else []), *observers)
+    for observer in watching:
+        observer.begin()
+    over = False
+    while not over:
+        action = act(observation)
+        following, reward, terminated, truncated, info = env.step(action)
+        decision = Decision(observation, action, float(reward), following, terminated, truncated, info)
+        for observer in watching:
+            observer.see(decision)
+        observation, over = following, decision.is_last
+    row = tally.row(index)
+    for observer in watching:
+        row |= observer.end(row)
+    return row
+
+
+class Paths(EnvObserver):
+    """Adds the poses that were commanded and measured, (n, O) each, to an episode's row."""
+
+    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """`commanded` and `measured`."""
+        trace = self.base.trace
+        return {"commanded": trace.commanded.copy(), "measured": trace.measured.copy()}
+
+
+class _Tally(EnvObserver):
+    """Adds up what the trace and the ledger don't hold. (Where the simulation failed there is no ledger: then what was
+    seen until there takes its place.)
+    """
+
+    def begin(self) -> None:
+        self._terms: dict[str, float] = dict.fromkeys(self.base.task.reward_terms, 0.0)
+        self._total, self._worst = 0.0, {"worst_commanded_violation": -np.inf, "worst_measured_violation": -np.inf}
+        self._last: Mapping[str, Any] = {}
+
+    def see(self, decision: Decision) -> None:
+        self._total += decision.reward
+        self._last = decision.info
+        for name, key in zip(self._worst, ("constraint_violation", "measured_violation"), strict=True):
+            self._worst[name] = max(self._worst[name], decision.info[key])
         for name in self._terms:
-            self._terms[name] += float(info[name])
-        self._last = dict(info)
+            self._terms[name] += float(decision.info[name])
 
-    def row(self, episode: int) -> dict[str, Any]:
-        """The episode's numbers, in a fixed order."""
-        trace, ledger = self._env.trace, self._last.get("ledger", {})
+    def row(self, index: int) -> dict[str, Any]:
+        """The episode's row."""
+        trace = self.base.trace
         force = np.asarray(trace.force)
-        jerk = {
-            f"jerk_{which}_{part}": value
-            for which, poses in (("commanded", trace.commanded), ("measured", trace.measured))
-            for part, value in split_jerk(poses, trace.period).items()
-        }
-        return {
-            "episode": episode,
-            "return": self._return,
-            "success": int(self._last["is_success"]),
-            "termination": "simulation_failure" if "simulation_failure" in self._last else self._last["termination"],
-            "steps": len(trace),
-            "peak_force": float(ledger.get("peak_force", force.max(initial=0.0))),
-            "mean_force": float(ledger.get("mean_force", force.mean() if len(force) else 0.0)),
-            "mean_squared_force": float(np.mean(force**2)) if len(force) else 0.0,
-            **jerk,
-            "worst_violation": float(ledger.get("worst_commanded_violation", self._violation)),
-            "worst_measured_violation": float(ledger.get("worst_measured_violation", self._measured)),
-            **{name: int(ledger.get(name, 0)) for name in COUNTS},
-            **{f"reward_{name}": value for name, value in self._terms.items()},
-        }
-
-
-def split_jerk(poses: np.ndarray, period: float) -> dict[str, float]:
-    """Mean jerk of positions and, in a pose of six numbers, of rotations [1/s³ of their units]."""
-    poses = np.array(poses)
-    angular = mean_jerk(poses[:, 3:], period) if poses.shape[1] == 6 else 0.0
-    return {"linear": mean_jerk(poses[:, :3], period), "angular": angular}
+        seen = {"peak_force": force.max(initial=0.0), "mean_force": force.mean() if len(force) else 0.0, **self._worst}
+        failed = "simulation_failure" in self._last
+        return episode_row(
+            Episode(
+                index=index,
+                trace=trace,
+                ledger={**seen, **self._last.get("ledger", {})},
+                total=self._total,
+                terms=self._terms,
+                success=bool(self._last["is_success"]),
+                termination="simulation_failure" if failed else self._last["termination"],
+            )
+        )
 
 
 def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
-    """Starts an episode with conditions that training never drew; `options` are further ones of the reset.
+    """Starts an episode with conditions that training never meets; `options` are further ones of the reset.
 
-    A task draws them by its reset option `held_out`, or at least by the seed, which is none of training's. One in which
-    every episode starts from the same place is started a little beside it instead.
+    A task samples them by its reset option `held_out`, or at least by the seed, which is none of training's. One in
+    which every episode starts from the same place is started a little beside it instead.
     """
     try:
         return env.reset(seed=seed, options={"held_out": True} | options)[0]
@@ -86,41 +164,8 @@ def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
         if "held_out" not in str(error):
             raise
     usual = env.reset(seed=seed + 1)[1].get("start")
-    observation, drawn = env.reset(seed=seed)
-    if usual is None or not np.array_equal(usual, drawn["start"]):
+    observation, info = env.reset(seed=seed)
+    if usual is None or not np.array_equal(usual, info["start"]):
         return observation
-    beside = START_DEVIATION * np.random.default_rng(seed).standard_normal(len(drawn["start"]))
-    return env.reset(seed=seed, options={"start": np.asarray(drawn["start"]) + beside})[0]
-
-
-def run_episode(
-    env: gymnasium.Env,
-    act: Callable[[np.ndarray], np.ndarray],
-    *,
-    held_out_seed: int | None = None,
-    episode: int = 0,
-    **options: Any,
-) -> dict[str, Any]:
-    """Runs one episode and returns its row; the environment's trace is still that episode's afterwards.
-
-    Args:
-        env: the environment.
-        act: the policy.
-        held_out_seed: draws conditions that training never drew; without it, the next ones that training would draw.
-        episode: the row's number.
-        options: further ones of a held-out reset.
-    """
-    observation = env.reset()[0] if held_out_seed is None else reset_held_out(env, held_out_seed, **options)
-    record = EpisodeRecord(env)
-    finished = False
-    while not finished:
-        observation, reward, terminated, truncated, info = env.step(act(observation))
-        record.add(float(reward), info)
-        finished = terminated or truncated
-    return record.row(episode)
-
-
-def standing_still(env: gymnasium.Env) -> Callable[[np.ndarray], np.ndarray]:
-    """The policy before it learned anything: the action of zero, which leaves guidance to itself."""
-    shape = env.action_space.shape or ()
-    return lambda observation: np.zeros(shape, np.float32)
+    beside = START_DEVIATION * np.random.default_rng(seed).standard_normal(len(info["start"]))
+    return env.reset(seed=seed, options={"start": np.asarray(info["start"]) + beside})[0]

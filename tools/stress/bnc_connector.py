@@ -1,27 +1,21 @@
 """Tries to make the connector fail: random, held and saturated actions, of all six outputs as well as of x and y.
 
-    python -m guiderail.tools.stress.bnc_connector --episodes 1000 --out stress_bnc.csv
-
-Every control step is a decision. Exits with 1 if the simulation failed, anything was not finite, a prediction failed,
-KGRL or sKGRL commanded a violation, or the plug went through the jack. Residual learning is among it for the physics:
-nothing keeps it within the constraints.
+Residual learning is among it for the physics: nothing keeps it within the constraints.
 """
 
 from __future__ import annotations
 
 import itertools
-import sys
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
-from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.bnc_connector import MM, make_env
+from guiderail.diagrams.tasks.bnc_connector import MM
 from guiderail.models.objects.bnc_interference import interference
-from guiderail.tools.stress.campaign import Case, Witness, run
+from guiderail.tools.rollouts.rollout import Decision, EnvObserver
+from guiderail.tools.stress.campaign import Campaign, Case
 
 EXPLORED = {"x, y": (0, 1), "all six": (0, 1, 2, 3, 4, 5)}
 STANDING = 5  # control steps that make the difference between an impact and a plug that stands within the jack
@@ -35,27 +29,22 @@ LIMITS = {
 }
 
 
-class Penetration(Witness):
+class Penetration(EnvObserver):
     """How deep jack and plug are within each other at the end of each control step [mm]."""
 
-    def __init__(self, env: GuidedEnv):
-        """
-        Args:
-            env: just reset.
-        """
-        self._context = env.simulator.get_context()
-        station = env.task.diagram.GetSubsystemByName("station")
-        assert isinstance(station, Station)
-        self._plant, self._dimensions = station.plant, BncWorkcell().dimensions
+    def begin(self) -> None:
+        """Nothing was measured yet."""
+        self._context = self.base.simulator.get_context()
+        self._plant = self.base.task.diagram.GetSubsystemByName("station").plant
         self._depths: list[tuple[float, float]] = []
 
-    def look(self) -> None:
+    def see(self, decision: Decision) -> None:
         """Measures."""
         plant_context = self._plant.GetMyContextFromRoot(self._context)
         X_JP = self._plant.GetFrameByName("plug").CalcPose(plant_context, self._plant.GetFrameByName("jack"))
-        self._depths.append(interference(self._dimensions, X_JP.rotation().matrix(), X_JP.translation()))
+        self._depths.append(interference(_D, X_JP.rotation().matrix(), X_JP.translation()))
 
-    def report(self) -> dict[str, float]:
+    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """How deep lugs and barrel were in the plug, and what either didn't come out of for `STANDING` steps."""
         depths = np.array(self._depths) / MM
         windows = np.lib.stride_tricks.sliding_window_view(depths.max(axis=1), min(STANDING, len(depths)))
@@ -66,32 +55,21 @@ class Penetration(Witness):
         }
 
 
-def cases(station: str = "rails") -> list[Case]:
+def campaign() -> Campaign:
     """Guidance, uncertainty and explored outputs, everything with everything; each episode is a run of its own."""
     kinds = itertools.product(("kgrl", "skgrl", "residual"), ("calibration", "disc"), EXPLORED)
-    return [
+    cases = [
         Case(
             name=f"{guidance}, {uncertainty}, {outputs}",
-            make=partial(
-                make_env,
-                guidance=guidance,
-                uncertainty=uncertainty,
-                explored=EXPLORED[outputs],
-                hold=1,
-                station=station,
-            ),
+            environment={
+                "guidance": guidance,
+                "uncertainty": uncertainty,
+                "explored": EXPLORED[outputs],
+                "hold": 1,
+            },
             constrained=guidance != "residual",
             options={"new_run": True},
-            witness=Penetration,
         )
         for guidance, uncertainty, outputs in kinds
     ]
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """The command line."""
-    return run(str(__doc__).splitlines()[0], cases(), arguments, LIMITS)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return Campaign("BncConnector", cases, LIMITS, witness=Penetration)

@@ -7,15 +7,15 @@ generator of its own, so that what they stir up differs in its shape alone.
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import colorednoise
 import numpy as np
 from scipy import signal
 
 from guiderail.models.errors import InputError
+from guiderail.tools.rollouts.rollout import Act
 
 RMS = 1.0 / np.sqrt(3.0)
 FEATURES = 64  # of gSDE: as wide as a small policy's last layer
-
-Actions = Callable[[np.ndarray], np.ndarray]
 
 
 def white(rng: np.random.Generator, steps: int, size: int, hold: int = 1) -> np.ndarray:
@@ -25,12 +25,7 @@ def white(rng: np.random.Generator, steps: int, size: int, hold: int = 1) -> np.
 
 def pink(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
     """Coloured noise with a power of 1/f (Eberhard et al., 2023), for a whole episode at once."""
-    frequencies = np.fft.rfftfreq(steps)
-    amplitude = np.concatenate([[0.0], frequencies[1:] ** -0.5])
-    spectrum = amplitude[:, None] * (
-        rng.normal(size=(len(amplitude), size)) + 1j * rng.normal(size=(len(amplitude), size))
-    )
-    return np.fft.irfft(spectrum, steps, axis=0)
+    return colorednoise.powerlaw_psd_gaussian(1.0, (size, steps), random_state=rng).T
 
 
 def ornstein_uhlenbeck(rng: np.random.Generator, steps: int, size: int, correlation: float = 15.0) -> np.ndarray:
@@ -50,13 +45,13 @@ def _filtered(rng: np.random.Generator, steps: int, size: int, numerator: Any, d
     return signal.lfilter(numerator, denominator, rng.normal(size=(lead + steps, size)), axis=0)[lead:]
 
 
-def drawn(
+def open_loop(
     make: Callable[..., np.ndarray], rng: np.random.Generator, steps: int, size: int, **arguments: Any
-) -> Actions:
-    """Actions drawn for an episode in advance; they do not look at what is observed.
+) -> Act:
+    """Actions made for an episode in advance; they do not look at what is observed.
 
     Raises:
-        InputError: if there is nothing to draw.
+        InputError: if there is nothing to make.
     """
     if steps < 1 or size < 1:
         raise InputError(f"an exploration needs at least one step and one action, not {steps} and {size}")
@@ -64,8 +59,8 @@ def drawn(
     return lambda observation: next(sequence)
 
 
-def state_dependent(rng: np.random.Generator, size: int, interval: int) -> Actions:
-    """gSDE (Raffin et al., 2022): noise that is linear in features of the state, drawn anew every `interval` steps.
+def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: int) -> Act:
+    """gSDE (Raffin et al., 2022): noise that is linear in features of the state, sampled anew every `interval` steps.
 
     The features are those of an untrained network: rectified, not learned.
     """

@@ -1,4 +1,4 @@
-"""`guiderail study smoothness`: what exploring does to the motion, all ways at the same exploration RMS.
+"""The study `smoothness`: what exploring does to the motion, all ways at the same exploration RMS.
 
 Each method explores the connector's skill with random actions, in free space (the jack is somewhere else) and on the
 connector: KGRL and sKGRL through their null space, everything else as a residual on the demonstrations. One table, one
@@ -7,10 +7,12 @@ picture. A command's jerk has two parts: the demonstrations' own, and what explo
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
@@ -23,21 +25,21 @@ from guiderail.diagrams.tasks.bnc_connector import (
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.models.smoothness import log_dimensionless_jerk, spectral_arc_length
-from guiderail.tools.files import write_atomically
-from guiderail.tools.guidance import COLOURS
-from guiderail.tools.learning.run_folder import read_table, table_text
-from guiderail.tools.rollouts.rollout import EpisodeRecord, split_jerk
+from guiderail.tools.guidance import colour
+from guiderail.tools.rollouts.evaluate import cached
+from guiderail.tools.rollouts.metrics import jerk, summary
+from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.studies.exploration import (
     RMS,
-    Actions,
-    drawn,
     low_pass,
+    open_loop,
     ornstein_uhlenbeck,
     pink,
     state_dependent,
     white,
 )
-from guiderail.tools.studies.study import write_table
+from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import make_environment
 from guiderail.tools.viewing.style import new_figure, save_figure
 
@@ -49,7 +51,7 @@ ELSEWHERE = (0.3, 0.3)  # m: where the jack is while the robot moves in free spa
 ALONE = "demonstration alone"
 OUTPUTS = {"all": (0, 1, 2, 3, 4, 5), "xy": (0, 1)}
 
-Explore = Callable[[np.random.Generator, int, int], Actions]
+Explore = Callable[[np.random.Generator, int, int], Act]
 
 
 @dataclass(frozen=True)
@@ -59,42 +61,27 @@ class Method:
     name: str
     guidance: str
     explore: Explore
-    hold: int = 1  # of the actions' drawing; the environment itself takes one at every control step
+    hold: int = 1  # decisions that an action lasts; the environment itself takes one at every control step
     environment: dict[str, Any] = field(default_factory=dict)
-
-
-def _white(hold: int = 1) -> Explore:
-    return lambda rng, steps, size: drawn(white, rng, steps, size, hold=hold)
 
 
 def methods() -> list[Method]:
     """Everything that is compared."""
+    white_of = {n: partial(open_loop, white, hold=n) for n in (1, HOLD, SLOW)}
     listed = [Method(ALONE, "kmp", lambda rng, steps, size: lambda observation: np.zeros(size))]
-    listed.append(Method("KGRL", "kgrl", _white()))
+    listed.append(Method("KGRL", "kgrl", white_of[1]))
     for history, variance in ((10, 1e-8), (10, 1e-10), (10, 1e-11), (10, 1e-12), (2, 1e-11), (20, 1e-11)):
         settings = {"history": history, "history_variance": variance}
-        listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", _white(), 1, settings))
+        listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", white_of[1], 1, settings))
     usual = {"history": 10, "history_variance": HISTORY_VARIANCE}
-    listed.append(Method("sKGRL adaptive", "skgrl", _white(), 1, usual | {"adaptive_history": True}))
-    listed.append(Method(f"KGRL repeat {HOLD}", "kgrl", _white(HOLD), HOLD))
-    listed += [Method(f"sKGRL repeat {n}", "skgrl", _white(n), n, usual) for n in (HOLD, SLOW)]
-    listed.append(Method("residual white", "residual", _white()))
-    listed += [Method(f"residual repeat {n}", "residual", _white(n)) for n in (HOLD,)]
-    listed += [Method(f"residual gSDE {n}", "residual", _state_dependent(n)) for n in (1, 8, 64)]
-    listed.append(Method("residual pink", "residual", lambda rng, steps, size: drawn(pink, rng, steps, size)))
-    listed.append(
-        Method("residual OU", "residual", lambda rng, steps, size: drawn(ornstein_uhlenbeck, rng, steps, size))
-    )
-    listed += [Method(f"residual low-pass {f:g} Hz", "residual", _low_pass(f)) for f in (2.0, 1.0, 0.5)]
-    return listed
-
-
-def _state_dependent(interval: int) -> Explore:
-    return lambda rng, steps, size: state_dependent(rng, size, interval)
-
-
-def _low_pass(cutoff: float) -> Explore:
-    return lambda rng, steps, size: drawn(low_pass, rng, steps, size, cutoff=cutoff)
+    listed.append(Method("sKGRL adaptive", "skgrl", white_of[1], 1, usual | {"adaptive_history": True}))
+    listed.append(Method(f"KGRL repeat {HOLD}", "kgrl", white_of[HOLD], HOLD))
+    listed += [Method(f"sKGRL repeat {n}", "skgrl", white_of[n], n, usual) for n in (HOLD, SLOW)]
+    residual: dict[str, Explore] = {"white": white_of[1], f"repeat {HOLD}": white_of[HOLD]}
+    residual |= {f"gSDE {n}": partial(state_dependent, interval=n) for n in (1, 8, 64)}
+    residual |= {"pink": partial(open_loop, pink), "OU": partial(open_loop, ornstein_uhlenbeck)}
+    residual |= {f"low-pass {f:g} Hz": partial(open_loop, low_pass, cutoff=f) for f in (2.0, 1.0, 0.5)}
+    return [*listed, *(Method(f"residual {name}", "residual", explore) for name, explore in residual.items())]
 
 
 def smoothness(
@@ -123,10 +110,9 @@ def smoothness(
         # A method that is measured already is not measured again: the benchmark goes on where it was interrupted.
         words = [method.name, outputs, f"{kappa:g}", str(episodes), str(seed)]
         file = out / "methods" / ("-".join(words).replace(" ", "_") + ".csv")
-        if not file.exists():
-            measured = measure(method, OUTPUTS[outputs], quiet, episodes=episodes, kappa=kappa, seed=seed)
-            write_atomically(file, table_text(measured).encode())
-        rows += read_table(file)
+        how: dict[str, Any] = {"episodes": episodes, "kappa": kappa, "seed": seed}
+        found = cached(file, lambda: pd.DataFrame(measure(method, OUTPUTS[outputs], quiet, **how)))  # noqa: B023
+        rows += found.to_dict("records")
     for row in rows:  # against white actions through KGRL, at the same place
         kgrl = next(one for one in rows if one["method"] == "KGRL" and one["place"] == row["place"])
         for part in ("linear", "angular"):
@@ -142,7 +128,7 @@ def smoothness(
 def quiet_commands() -> np.ndarray:
     """The commands of the demonstrations alone, (N, 6)."""
     env: Any = make_environment(TASK, {"guidance": "kmp", "hold": 1, "uncertainty": "known"})
-    _episode(env, lambda observation: np.zeros(env.action_space.shape), {"offset": ELSEWHERE}, seed=0)
+    rollout(env, still(env), seed=0, options={"offset": ELSEWHERE})
     commands = env.unwrapped.trace.commanded.copy()
     env.close()
     return commands
@@ -172,13 +158,13 @@ def measure(
             rng = np.random.default_rng([seed, index])
             act = method.explore(rng, len(quiet), len(explored))
             options = {"offset": ELSEWHERE} if place == "free" else {"held_out": True}
-            seen.append(_episode(env, act, options, seed=seed + index))
+            seen.append(rollout(env, act, seed=seed + index, options=options))
             trace = env.unwrapped.trace
             deviated = trace.commanded - quiet[: len(trace)]
-            added.append(split_jerk(deviated, trace.period))
+            added.append(jerk(deviated, trace.period))
             moved.append(deviated[:, list(explored)] / unit)
             smooth.append(_shape(trace))
-        rows.append(_row(method, place, seen, np.concatenate(moved), smooth, added))
+        rows.append(_row(method, place, pd.DataFrame(seen), np.concatenate(moved), smooth, added))
     env.close()
     return rows
 
@@ -204,16 +190,6 @@ def _strength(method: Method, explored: tuple[int, ...], kappa: float) -> dict[s
     return {"kappa": kappa / float(np.sqrt(np.mean(reached**2)))}
 
 
-def _episode(env: Any, act: Actions, options: dict[str, Any], seed: int) -> dict[str, Any]:
-    observation, _ = env.reset(seed=seed, options=options)
-    record, finished = EpisodeRecord(env), False
-    while not finished:
-        observation, reward, terminated, truncated, info = env.step(act(observation))
-        record.add(float(reward), info)
-        finished = terminated or truncated
-    return record.row(seed)
-
-
 def _shape(trace: Any) -> dict[str, float]:
     shape = {}
     for which, poses in (("commanded", trace.commanded), ("measured", trace.measured)):
@@ -226,7 +202,7 @@ def _shape(trace: Any) -> dict[str, float]:
 def _row(
     method: Method,
     place: str,
-    seen: list[dict[str, Any]],
+    seen: pd.DataFrame,
     moved: np.ndarray,
     smooth: list[dict[str, float]],
     added: list[dict[str, float]],
@@ -237,21 +213,18 @@ def _row(
         "place": place,
         "episodes": len(seen),
         "rms_in_deviations": float(np.sqrt(np.mean(moved**2))),
-        **{kind: float(np.mean([row[kind] for row in seen])) for kind in kinds},
+        **{kind: float(np.mean(seen[kind])) for kind in kinds},
         **{f"jerk_added_{part}": float(np.mean([one[part] for one in added])) for part in added[0]},
         **{key: float(np.mean([one[key] for one in smooth])) for key in smooth[0]},
-        "peak_force": float(np.max([row["peak_force"] for row in seen])),
-        "mean_force": float(np.mean([row["mean_force"] for row in seen])),
-        "success": float(np.mean([row["success"] for row in seen])),  # none in free space
-        "collisions": int(sum(row["termination"] == "collision" for row in seen)),
-        "worst_violation": float(np.max([row["worst_violation"] for row in seen])),
+        # In free space nothing succeeds.
+        **summary(seen, ("peak_force", "mean_force", "success_rate", "ended_in_collision", "worst_violation")),
     }
 
 
 def _claims(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """sKGRL against KGRL with actions kept as long, and against every other way to explore, with how often it locks."""
     free = {row["method"]: row for row in rows if row["place"] == "free"}
-    success = {row["method"]: row["success"] for row in rows if row["place"] == "connector"}
+    success = {row["method"]: row["success_rate"] for row in rows if row["place"] == "connector"}
     others = {name: row for name, row in free.items() if name.startswith("residual")}
     kgrl = free[f"KGRL repeat {HOLD}"]
     claims: dict[str, Any] = {}
@@ -282,13 +255,13 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> Path:
     free = [row for row in rows if row["place"] == "free"][::-1]
     contact = [row for row in rows if row["place"] == "connector"][::-1]
     height = np.arange(len(free))
-    kinds = {ALONE: "0.6", "residual": COLOURS["residual"], "sKGRL": COLOURS["skgrl"], "KGRL": COLOURS["kgrl"]}
+    kinds = {ALONE: "0.6", "residual": colour("residual"), "sKGRL": colour("skgrl"), "KGRL": colour("kgrl")}
     colours = [next(colour for name, colour in kinds.items() if row["method"].startswith(name)) for row in free]
     for axis, part, unit in zip(axes[0], ("linear", "angular"), ("m/s³", "rad/s³"), strict=False):
         axis.barh(height + 0.2, [row[f"jerk_commanded_{part}"] for row in free], 0.4, color=colours)
         axis.barh(height - 0.2, [row[f"jerk_measured_{part}"] for row in free], 0.4, color=colours, alpha=0.4)
         axis.set(xscale="log", xlabel=f"{part} jerk in free space [{unit}]", title="commanded, measured (pale)")
-    axes[0, 2].barh(height, [row["success"] for row in contact], 0.7, color=colours)
+    axes[0, 2].barh(height, [row["success_rate"] for row in contact], 0.7, color=colours)
     axes[0, 2].set(xlabel="success on the connector, exploring")
     axes[0, 3].barh(height, [row["peak_force"] for row in contact], 0.7, color=colours)
     axes[0, 3].set(xlabel="peak force on the connector [N]")

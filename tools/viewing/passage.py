@@ -1,9 +1,5 @@
 """The narrow passage on paper: its walls, its zone, what stands in the way, and what was demonstrated."""
 
-from collections.abc import Sequence
-from typing import Any
-
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
@@ -24,16 +20,3 @@ def draw_world(axis: Axes, demonstrations: bool = True) -> None:
         for path in narrow_passage.load().outputs:
             axis.plot(*path.T, color="0.75", linewidth=0.6)
     axis.set(xlim=(0.1, 0.8), ylim=(0.0, 1.02), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-
-
-def avoided_from(rows: Sequence[dict[str, Any]], cost: float = -1.0, in_a_row: int = 5) -> int | None:
-    """The first training episode from which the obstacle cost stays small for five in a row; None if it never does.
-
-    An episode along the mean path costs about a hundred; one that keeps its distance costs nothing. A policy that
-    explores brushes the margin now and then, hence not zero.
-    """
-    good = np.array([row["reward_obstacle_cost"] > cost for row in rows])
-    for start in range(len(good) - in_a_row + 1):
-        if good[start : start + in_a_row].all():
-            return start + 1
-    return None

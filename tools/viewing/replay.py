@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from html import escape
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import jinja2
 import numpy as np
 
 from guiderail.models.errors import InputError
-from guiderail.models.policy import Policy
 from guiderail.tools.files import write_atomically
-from guiderail.tools.guidance import DEMONSTRATED
-from guiderail.tools.learning.progress import TOLERANCE
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.rollouts.rollout import run_episode, standing_still
+from guiderail.tools.guidance import is_demonstrated
+from guiderail.tools.rollouts.metrics import TOLERANCE
+from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.tasks import make_environment
-from guiderail.tools.viewing.film import Shown, outcome, write_film
 from guiderail.tools.viewing.scenes import Camera, scene
+from guiderail.tools.viewing.shown import Shown, outcome
+
+TEMPLATE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+CAPTION = jinja2.Template(TEMPLATE, autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
 FRAMES_PER_SECOND = 32.0
 SEEN_THROUGH = 0.35  # opacity of everything but paths, for who asks for it
@@ -44,44 +46,10 @@ LEGEND = (
 )
 
 
-def write_replay(
-    run: Path,
-    html: Path | None = None,
-    *,
-    seed: int = 1_000_000,
-    station: str | None = None,
-    picture: Path | None = None,
-) -> Path:
-    """Replays a run's deterministic policy on held-out initial conditions, and writes it as a page.
-
-    Args:
-        run: the run's folder.
-        html: the page; `replay.html` in the run unless given, `replay-<station>.html` for another station. It is
-            replaced.
-        seed: of the episode shown.
-        station: where the policy acts, for tasks that have several; where it learned unless given.
-        picture: if given, what the task's camera sees of the same episode is written there.
-
-    Raises:
-        InputError: if there is no trained run, its task cannot be shown, or it has no such station.
-    """
-    folder = RunFolder(run)
-    config, policy = folder.config(), Policy.load(folder.path)
-    name = "replay.html" if station is None else f"replay-{station}.html"
-    episode = Shown(
-        task=config.task,
-        environment=config.environment | ({} if station is None else {"station": station}),
-        act=policy,
-        acting="after learning",
-        title=config.learner.algorithm.upper(),
-        run_seed=config.seed,
-        seed=seed,
-    )
-    html = folder.path / name if html is None else html
-    if picture is not None:
-        write_film(picture, episode)
-    write_page(html, episode)
-    return html
+def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
+    """Where the page of a run goes, with other arguments of its environment; of no run, the current folder."""
+    name = f"replay-{environment['station']}.html" if "station" in environment else "replay.html"
+    return run / name if run.is_dir() else Path(name)
 
 
 def write_page(html: Path, episode: Shown) -> dict[str, Any]:
@@ -103,15 +71,16 @@ def write_page(html: Path, episode: Shown) -> dict[str, Any]:
     lines: dict[str, list[np.ndarray]] = {"demonstrations": [shown.to_world(d) for d in shown.demonstrations]}
     lines["constraint"] = list(shown.constraint)
 
-    def path(act: Callable[[np.ndarray], np.ndarray], index: int) -> tuple[np.ndarray, dict[str, Any]]:
-        row = run_episode(env, act, held_out_seed=episode.seed + index)
+    def path(act: Act, index: int) -> tuple[np.ndarray, dict[str, Any]]:
+        row = rollout(env, act, seed=episode.seed + index, held_out=True)
         return shown.to_world(base.trace.measured.copy()), row
 
-    if episode.environment.get("guidance") in DEMONSTRATED:
-        lines["alone"] = [path(standing_still(env), 0)[0]]
-    lines["other_episodes"] = [path(episode.act, index)[0] for index in range(1, OTHER_PATHS + 1)]
+    if is_demonstrated(episode.environment.get("guidance")):
+        lines["alone"] = [path(still(env), 0)[0]]
+    policy = episode.policy(env)
+    lines["other_episodes"] = [path(policy, index)[0] for index in range(1, OTHER_PATHS + 1)]
     meshcat.StartRecording(frames_per_second=FRAMES_PER_SECOND)
-    executed, row = path(episode.act, 0)
+    executed, row = path(policy, 0)
     meshcat.StopRecording()
     meshcat.get_mutable_recording().set_repetitions(REPETITIONS)
     meshcat.PublishRecording()
@@ -159,39 +128,21 @@ def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray,
 
 def _with_caption(page: str, episode: Shown, row: dict[str, Any], drawn: set[str], views: Mapping[str, Camera]) -> str:
     """The page with a legend over it: what it shows, the numbers of the episode shown, and where to look from."""
-    entries = "".join(
-        f'<div><span style="color:rgb({",".join(str(round(255 * c)) for c in colour[:3])})">&#9644;</span> '
-        f"{escape(words.format(acting=episode.acting))}</div>"
-        for name, colour, words in LEGEND
-        if name in drawn
-    )
     violations = (
         f"{name} {'none' if row[key] <= TOLERANCE else format(row[key], '.1e')}"
         for name, key in (("commanded", "worst_violation"), ("measured", "worst_measured_violation"))
     )
-    numbers = f"{outcome(row)}, return {row['return']:.1f}, violations: {', '.join(violations)}"
-    caption = (
-        '<div style="position:fixed;left:12px;top:12px;padding:8px 12px;background:rgba(255,255,255,.88);'
-        'font:13px sans-serif;border-radius:6px;max-width:340px;z-index:10">'
-        f"<b>{escape(episode.heading)}</b>{entries}<div>{escape(numbers)}</div>{_buttons(views)}</div>"
+    caption = CAPTION.render(
+        heading=episode.heading,
+        legend=[
+            (",".join(str(round(255 * c)) for c in colour[:3]), words.format(acting=episode.acting))
+            for name, colour, words in LEGEND
+            if name in drawn
+        ],
+        numbers=f"{outcome(row)}, return {row['return']:.1f}, violations: {', '.join(violations)}",
+        # Meshcat's own camera lives in a frame whose y is up.
+        views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
+        seen_through=SEEN_THROUGH,
     )
     head, body, tail = page.rpartition("</body>")
     return f"{head}{caption}{body}{tail}" if body else page + caption
-
-
-def _buttons(views: Mapping[str, Camera]) -> str:
-    """A button that lets one see the paths within things, and one for each view."""
-    # Meshcat's own camera lives in a frame whose y is up. What is opaque is asked of whatever is on the page by then.
-    script = (
-        "<script>function look(eye, target) {"
-        "viewer.set_property(['Cameras', 'default', 'rotated', '<object>'], 'position', eye);"
-        "viewer.set_camera_target(target);}"
-        "function see(button) {var through = button.dataset.through != 'yes';"
-        "button.dataset.through = through ? 'yes' : 'no';"
-        f"viewer.set_property(['drake', 'visualizer'], 'modulated_opacity', through ? {SEEN_THROUGH} : 1);}}</script>"
-    )
-    looks = (
-        f'<button onclick="look({", ".join(str([x, z, -y]) for x, y, z in camera)})">{escape(name)}</button> '
-        for name, camera in views.items()
-    )
-    return f'<div>{"".join(looks)}<button onclick="see(this)">see through</button></div>{script}'

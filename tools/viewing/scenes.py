@@ -10,23 +10,15 @@ Camera = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 @dataclass(frozen=True)
 class Scene:
-    """How a task is drawn.
+    """How a task is drawn, in metres."""
 
-    Attributes:
-        to_world: takes poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
-        demonstrations: poses (N, O) of each demonstration.
-        constraint: corner points (k, 3) of each line that bounds what is allowed.
-        camera: where to look from, and where to look at, in the world [m].
-        arm_views: the same where a whole arm does it, by name; a page opens with the first and offers them all.
-        line_radius: how thick a path is drawn [m].
-    """
-
-    to_world: Callable[[np.ndarray], np.ndarray]
-    demonstrations: tuple[np.ndarray, ...] = ()
-    constraint: tuple[np.ndarray, ...] = ()
-    camera: Camera | None = None
+    to_world: Callable[[np.ndarray], np.ndarray]  # poses (n, O) of a trace or a demonstration to points (n, 3)
+    demonstrations: tuple[np.ndarray, ...] = ()  # poses (N, O) of each
+    constraint: tuple[np.ndarray, ...] = ()  # corner points (k, 3) of each line that bounds what is allowed
+    camera: Camera | None = None  # where to look from, and where to look at
+    # The same where a whole arm does it, by name; a page opens with the first and offers them all.
     arm_views: Mapping[str, Camera] = field(default_factory=dict)
-    line_radius: float = 0.0015
+    line_radius: float = 0.0015  # of a path
 
 
 def scene(task: str) -> Scene:
@@ -74,15 +66,12 @@ def _bnc_connector() -> Scene:
     def to_world(poses: np.ndarray) -> np.ndarray:
         return X_WT.multiply(np.asarray(poses)[:, :3].T).T
 
-    square = ALIGNMENT * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    rings = [np.column_stack([square, np.full(5, height)]) for height in (0.0, 0.015)]
-    edges = [np.array([[x, y, 0.0], [x, y, 0.015]]) for x, y in square[:4]]
     eye, target = to_world(np.array([[0.025, -0.035, 0.026], [0.0, 0.0, 0.012]]))
     near: Camera = (tuple(eye.tolist()), tuple(target.tolist()))
     return Scene(
         to_world=to_world,
         demonstrations=tuple(bnc_connector.load().outputs),
-        constraint=tuple(to_world(line) for ring in rings for line in _sides(ring)) + tuple(to_world(e) for e in edges),
+        constraint=tuple(map(to_world, _cuboid(ALIGNMENT, 0.0, 0.015))),
         camera=near,
         arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
         line_radius=0.0001,
@@ -98,16 +87,12 @@ def _grid_clamp() -> Scene:
     def to_world(poses: np.ndarray) -> np.ndarray:
         return X_WT.multiply(np.asarray(poses)[:, :3].T).T
 
-    # The cuboid, as high as the clamp begins.
-    square = 0.5 * parameters["width_m"] * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    low, high = -parameters["push_m"], 0.025
-    rings = [np.column_stack([square, np.full(5, height)]) for height in (low, high)]
-    edges = [np.array([[x, y, low], [x, y, high]]) for x, y in square[:4]]
+    cuboid = _cuboid(0.5 * parameters["width_m"], -parameters["push_m"], 0.025)  # as high as the clamp begins
     eye, target = to_world(np.array([[0.07, -0.1, 0.05], [0.0, 0.0, 0.008]]))
     near: Camera = (tuple(eye.tolist()), tuple(target.tolist()))
     return Scene(
         to_world=to_world,
-        constraint=tuple(to_world(line) for ring in rings for line in _sides(ring)) + tuple(to_world(e) for e in edges),
+        constraint=tuple(map(to_world, cuboid)),
         camera=near,
         arm_views={"the clamp": near, "the arm": ARM_VIEW},
         line_radius=0.0001,
@@ -126,9 +111,12 @@ def _pouring() -> Scene:
     return Scene(to_world, camera=(tuple(centre + [0.25, -0.5, 0.25]), tuple(centre)), line_radius=0.001)
 
 
-def _sides(corners: np.ndarray) -> list[np.ndarray]:
-    """The straight lines between corners (k, 3): a path that turns sharply is drawn side by side."""
-    return [corners[i : i + 2] for i in range(len(corners) - 1)]
+def _cuboid(half_width: float, low: float, high: float) -> list[np.ndarray]:
+    """The edges (2, 3) of a cuboid about the z axis: a path that turned sharply would be drawn as a twisted tube."""
+    corners = half_width * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    rings = [np.column_stack([corners, np.full(5, height)]) for height in (low, high)]
+    sides = [ring[i : i + 2] for ring in rings for i in range(4)]
+    return [*sides, *(np.array([[x, y, low], [x, y, high]]) for x, y in corners[:4])]
 
 
 SCENES: dict[str, Callable[[], Scene]] = {

@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from guiderail.tools.files import write_atomically
+from guiderail.tools.files import check_picture, write_atomically
 
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
@@ -23,19 +24,17 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figu
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 130) -> Path:
-    """Writes a PNG, whole."""
+    """Writes a picture, whole, in the format that its ending says."""
+    check_picture(path)
     content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=dpi)
+    figure.savefig(content, format=path.suffix[1:].lower(), dpi=dpi)
     write_atomically(path, content.getvalue())
     return path
 
 
 def rolling(values: Sequence[float] | np.ndarray, window: int = 10) -> np.ndarray:
     """The mean of the last `window` values, of fewer at the start."""
-    total = np.concatenate([[0.0], np.cumsum(np.asarray(values, float))])
-    ends = np.arange(1, len(total))
-    starts = np.maximum(ends - window, 0)
-    return (total[ends] - total[starts]) / (ends - starts)
+    return pd.Series(np.asarray(values, float)).rolling(window, min_periods=1).mean().to_numpy()
 
 
 def draw_runs(axis: Axes, runs: Sequence[Sequence[float]], *, colour: str, label: str, window: int = 10) -> None:

@@ -5,11 +5,14 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from stable_baselines3 import TD3
 
 from guiderail.diagrams.task import Symmetry
 from guiderail.models.errors import InputError
-from guiderail.tools.learning.off_policy import Learner, policy_of
+from guiderail.tools.learning.learner import LEARNERS, register_learner
+from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, policy_of
 from guiderail.tools.learning.presets import PRESETS, resolve_preset
+from guiderail.tools.rollouts.rollout import Decision
 
 
 class Spaces(gymnasium.Env):
@@ -17,14 +20,20 @@ class Spaces(gymnasium.Env):
     action_space = spaces.Box(-1, 1, (2,))
 
 
+SETTINGS = {"units": "8", "batch_size": 4, "learning_starts": 6, "train_every": 4, "gradient_steps": 2}
+
+
 @pytest.fixture
 def preset():
-    settings = {"units": "8", "batch_size": 4, "learning_starts": 6, "train_every": 4, "gradient_steps": 2}
-    return resolve_preset("robust", "tqc", settings)
+    return resolve_preset("robust", "tqc", SETTINGS)
 
 
 def make(preset, hold=1, seed=0):
-    return Learner(preset, Spaces(), hold=hold, seed=seed, decisions=50)
+    return LEARNERS.get(preset.algorithm)(preset, Spaces(), hold=hold, seed=seed, decisions=50)
+
+
+def decision(observation, action, reward, following, terminated=False, truncated=False):
+    return Decision(observation, action, reward, following, terminated, truncated, {})
 
 
 def live(learner, decisions, seed=0):
@@ -32,7 +41,7 @@ def live(learner, decisions, seed=0):
     random = np.random.default_rng(seed)
     for _ in range(decisions):
         observation, following = random.uniform(-1, 1, (2, 3)).astype(np.float32)
-        learner.remember(observation, learner.act(observation), random.normal(), following, False, False)
+        learner.remember(decision(observation, learner.act(observation), random.normal(), following))
         learner.learn()
 
 
@@ -96,7 +105,7 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
     learner = make(preset)
     seen = np.zeros(3, np.float32)
     for terminated, truncated in ((True, False), (False, True), (False, False)):
-        learner.remember(seen, np.zeros(2), 0.0, seen, terminated, truncated)
+        learner.remember(decision(seen, np.zeros(2), 0.0, seen, terminated, truncated))
     buffer = learner.model.replay_buffer
     bootstrapped = buffer.dones[:3, 0] * (1 - buffer.timeouts[:3, 0])
     np.testing.assert_array_equal(bootstrapped, [1, 0, 0])
@@ -104,10 +113,10 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
 
 def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
     half_turn = Symmetry((-1.0, -1.0, 1.0), (-1.0, 1.0))
-    learner = Learner(preset, Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
-    plain = Learner(replace(preset, symmetry=False), Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
+    learner = TqcLearner(preset, Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
+    plain = TqcLearner(replace(preset, symmetry=False), Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
     for one in (learner, plain):
-        one.remember(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True, False)
+        one.remember(decision(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True))
     buffer = learner.model.replay_buffer
     assert (buffer.size(), plain.model.replay_buffer.n_envs, learner.decisions) == (1, 1, 1)
     np.testing.assert_array_equal(buffer.observations[0], [[1, 2, 3], [-1, -2, 3]])
@@ -123,7 +132,7 @@ def test_returns_of_several_steps_stop_where_an_episode_does(preset):
     learner = make(replace(preset, n_steps=3, discount=0.5))
     zero = np.zeros(3, np.float32)
     for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
-        learner.remember(zero, np.zeros(2), reward, zero, terminated, False)
+        learner.remember(decision(zero, np.zeros(2), reward, zero, terminated))
     samples = learner.model.replay_buffer._get_samples(np.arange(4))
     np.testing.assert_allclose(samples.rewards[:, 0], [1 + 2 / 2, 2, 4 + 8 / 2 + 16 / 4, 8 + 16 / 2 + 32 / 4])
     np.testing.assert_array_equal(samples.dones[:, 0], [1, 1, 0, 0])
@@ -164,74 +173,76 @@ def acted(learner, episodes, decisions=4):
     return np.array(actions)
 
 
-def test_steady_episodes_keep_to_one_action_each(preset):
-    actions = acted(make(replace(preset, steady_episodes=3)), 4)
+def test_constant_episodes_keep_to_one_action_each(preset):
+    actions = acted(make(replace(preset, constant_episodes=3)), 4)
     assert (actions[:3] == actions[:3, :1]).all()
     assert len(np.unique(actions[:3, 0], axis=0)) == 3
     assert len(np.unique(actions[3], axis=0)) == 4
 
 
-def test_practising_episodes_do_what_the_policy_would(preset):
-    learner = make(replace(preset, steady_episodes=0, practise=0.5))
+def test_greedy_episodes_do_what_the_policy_would(preset):
+    learner = make(replace(preset, constant_episodes=0, greedy_share=0.5))
     live(learner, 20)
-    explored, practised = acted(learner, 2)
+    explored, greedy = acted(learner, 2)
     assert len(np.unique(explored, axis=0)) == 4
-    assert (practised == practised[0]).all()
+    assert (greedy == greedy[0]).all()
     policy = policy_of(learner.actor(), {"observation_shape": [3]})
-    np.testing.assert_allclose(practised[0], policy(np.ones(3, np.float32)), atol=1e-6)
+    np.testing.assert_allclose(greedy[0], policy(np.ones(3, np.float32)), atol=1e-6)
 
 
-def test_so_many_episodes_practise_as_asked_for(preset):
+def test_so_many_episodes_are_greedy_as_asked_for(preset):
     for share in (0.0, 0.25, 0.75, 1.0):
-        learner = make(replace(preset, steady_episodes=0, practise=share))
+        learner = make(replace(preset, constant_episodes=0, greedy_share=share))
         live(learner, 20)
-        practised = [len(np.unique(actions, axis=0)) == 1 for actions in acted(learner, 8)]
-        assert sum(practised) == 8 * share
+        greedy = [len(np.unique(actions, axis=0)) == 1 for actions in acted(learner, 8)]
+        assert sum(greedy) == 8 * share
 
 
-def test_nobody_practises_before_learning_has_begun(preset):
-    learner = make(replace(preset, steady_episodes=0, learning_starts=12, practise=1.0, proven_by=3))
+def test_no_episode_is_greedy_before_learning_has_begun(preset):
+    learner = make(replace(preset, constant_episodes=0, learning_starts=12, greedy_share=1.0, selection_window=3))
     for begun in (False, False, True, True):  # an episode has eight decisions: the second is still an exploring one
         learner.begin()
         assert learner.has_begun() is begun
         live(learner, 8)
-        learner.finish(True)
-    assert learner.state()[1]["row"] == 2
+        learner.end({"success": 1})
+    assert learner.state()[1]["greedy_successes"] == 2
 
 
-def test_exploring_keeps_one_action_for_a_while_now_and_then(preset):
-    settled = replace(preset, steady_episodes=0, learning_starts=1, bursts=0.2, longest_burst=5)
+def test_temporally_extended_actions_last_for_a_while_now_and_then(preset):
+    settled = replace(preset, constant_episodes=0, learning_starts=1, ez_greedy=0.2, ez_greedy_longest=5)
     learner = make(settled)
     live(learner, 20)
     exploring = acted(learner, 1, decisions=400)[0]
-    kept = (np.diff(exploring, axis=0) == 0.0).all(axis=1)
-    runs = [len(run) for run in "".join("k" if k else " " for k in kept).split()]
-    assert max(runs) == settled.longest_burst - 1  # an action that is kept for n decisions comes again n − 1 times
-    assert 0.2 < kept.mean() < 0.5  # 0.2 begin, and last 3 decisions on average: two of eight and a bit are the same
-    practises = make(replace(settled, practise=1.0))
-    live(practises, 20)
-    practising = acted(practises, 1, decisions=50)[0]
-    assert (practising == practising[0]).all()
+    repeated = (np.diff(exploring, axis=0) == 0.0).all(axis=1)
+    runs = [len(run) for run in "".join("r" if r else " " for r in repeated).split()]
+    assert max(runs) == settled.ez_greedy_longest - 1  # an action that lasts n decisions comes again n − 1 times
+    assert 0.2 < repeated.mean() < 0.5  # 0.2 begin and last 3 decisions on average: two of eight and a bit
+    greedy = make(replace(settled, greedy_share=1.0))
+    live(greedy, 20)
+    actions = acted(greedy, 1, decisions=50)[0]
+    assert (actions == actions[0]).all()
 
 
-def test_bursts_end_once_practice_succeeds_and_come_back_when_it_fails(preset):
-    settled = replace(preset, steady_episodes=0, learning_starts=1, practise=0.5, bursts=1.0, bursts_until=2)
+def test_extended_actions_end_once_greedy_episodes_succeed_and_come_back_when_they_fail(preset):
+    settled = replace(
+        preset, constant_episodes=0, learning_starts=1, greedy_share=0.5, ez_greedy=1.0, ez_greedy_until=2
+    )
     learner = make(settled)
     live(learner, 20)
-    for success, bursts in ((None, True), (True, True), (True, False), (True, False), (False, True)):
+    for success, extended in ((None, True), (True, True), (True, False), (True, False), (False, True)):
         if success is not None:
-            learner.finish(success)  # the practising episode
+            learner.end({"success": int(success)})  # the greedy episode
         again = make(settled, seed=9)
         again.restore(*learner.state())
         for one in (again, learner):
             exploring = acted(one, 1, decisions=30)[0]
-            assert bool((np.diff(exploring, axis=0) == 0.0).all(axis=1).any()) is bursts
-        learner.finish(False)  # an exploring episode proves nothing
+            assert bool((np.diff(exploring, axis=0) == 0.0).all(axis=1).any()) is extended
+        learner.end({"success": 0})  # an exploring episode counts for nothing
         learner.begin()
 
 
 def test_a_restored_learner_is_in_the_same_episode(preset):
-    first = make(replace(preset, steady_episodes=2, practise=0.5))
+    first = make(replace(preset, constant_episodes=2, greedy_share=0.5))
     live(first, 20)
     acted(first, 3)
     arrays, values = first.state()
@@ -242,33 +253,68 @@ def test_a_restored_learner_is_in_the_same_episode(preset):
     np.testing.assert_array_equal(acted(second, 3), expected)
 
 
-def test_the_result_is_the_actor_that_proved_itself_also_after_a_restart(preset):
-    first = make(replace(preset, steady_episodes=0, practise=1.0, proven_by=3, learning_starts=1))
-    practised = []
+def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
+    first = make(replace(preset, constant_episodes=0, greedy_share=1.0, selection_window=3, learning_starts=1))
+    greedy = []
     for episode, success in enumerate([True, True, True, False]):
         first.begin()
-        practised.append(first.actor().state_dict()["mu.weight"].clone())
+        greedy.append(first.actor().state_dict()["mu.weight"].clone())
         live(first, 8, seed=episode)
-        first.finish(success)
+        first.end({"success": int(success)})
     arrays, values = first.state()
     second = make(first.preset, seed=9)
     second.restore({key: value.copy() for key, value in arrays.items()}, values)
     for learner in (first, second):
-        torch.testing.assert_close(learner.result().state_dict()["mu.weight"], practised[2], rtol=0, atol=0)
-    assert not torch.equal(practised[2], first.actor().state_dict()["mu.weight"])
+        torch.testing.assert_close(learner.result().state_dict()["mu.weight"], greedy[2], rtol=0, atol=0)
+    assert not torch.equal(greedy[2], first.actor().state_dict()["mu.weight"])
 
 
 @pytest.mark.parametrize(
     "settings",
     [
-        {"steady_episodes": -1},
-        {"practise": 1.5},
-        {"proven_by": -1},
-        {"bursts": 1.5},
-        {"longest_burst": 0},
-        {"bursts_until": -1},
+        {"constant_episodes": -1},
+        {"greedy_share": 1.5},
+        {"selection_window": -1},
+        {"ez_greedy": 1.5},
+        {"ez_greedy_longest": 0},
+        {"ez_greedy_until": -1},
     ],
 )
 def test_episodes_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError):
         resolve_preset("robust", "tqc", settings)
+
+
+def test_a_setting_by_its_older_name_is_told_its_name():
+    with pytest.raises(InputError, match="'practise' is called 'greedy_share'"):
+        resolve_preset("robust", "tqc", {"practise": 0.5})
+
+
+def test_an_algorithm_more_is_one_class(monkeypatch):
+    """One that is deterministic and has no entropy, to be as unlike the others as it can be."""
+    monkeypatch.setattr(LEARNERS, "_entries", dict(LEARNERS._entries))
+
+    @register_learner("td3")
+    class Td3Learner(OffPolicyLearner):
+        algorithm = TD3
+
+        def explore(self, observation):
+            return np.clip(super().explore(observation) + 0.1 * self.random.standard_normal(2), -1, 1)
+
+    learner = make(resolve_preset("robust", "td3", SETTINGS))
+    live(learner, 24)
+    arrays, values = learner.state()
+    again = make(learner.preset, seed=9)
+    again.restore({key: value.copy() for key, value in arrays.items()}, values)
+    np.testing.assert_array_equal(weights(again), weights(learner))
+    policy, seen = learner.policy({"observation_shape": [3]}), np.full(3, 0.3, np.float32)
+    expected = learner.actor()._predict(torch.as_tensor(seen)[None]).detach().numpy()[0]
+    np.testing.assert_allclose(policy(seen), expected, atol=1e-6)
+    assert not np.array_equal(learner.explore(seen), learner.explore(seen))
+
+
+def test_a_network_that_a_policy_cannot_hold_is_refused(preset):
+    actor = make(preset).model.actor
+    actor.latent_pi[1] = torch.nn.GELU()
+    with pytest.raises(InputError, match="GELU"):
+        policy_of(actor, {"observation_shape": [3]})

@@ -7,7 +7,8 @@ from gymnasium import spaces
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.learning.off_policy import Learner, policy_of
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.off_policy import policy_of
 from guiderail.tools.learning.presets import resolve_preset
 
 
@@ -29,7 +30,7 @@ IMAGE = spaces.Box(0, 255, (22, 29, 3), np.uint8)
 def learner(request):
     algorithm, observation_space, layer_norm = request.param
     env = Spaces(observation_space, spaces.Box(np.array([-1, -2]), np.array([1, 3]), dtype=np.float32))
-    return Learner(
+    return LEARNERS.get(algorithm)(
         resolve_preset("robust", algorithm, {"units": "32,16", "layer_norm": layer_norm}),
         env,
         hold=1,

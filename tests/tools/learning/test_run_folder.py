@@ -1,11 +1,10 @@
-import math
 from dataclasses import replace
 
 import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.tools.learning.presets import PRESETS
-from guiderail.tools.learning.run_folder import RunFolder, converged_after, read_table, table_text
+from guiderail.tools.learning.run_folder import RunFolder
 
 
 def test_a_configuration_comes_back_as_it_was_written(bead_config, tmp_path):
@@ -26,34 +25,46 @@ def test_a_setting_that_a_run_is_older_than_is_off_whatever_its_preset_says_now(
     folder = RunFolder(tmp_path / "run")
     folder.create(replace(bead_config, preset="clamp", learner=PRESETS["clamp"]))
     file = tmp_path / "run" / "config.yaml"
-    lines = [line for line in file.read_text().splitlines() if "bursts_until" not in line]
+    lines = [line for line in file.read_text().splitlines() if "ez_greedy_until" not in line]
     file.write_text("\n".join(lines))
-    assert folder.config().learner == replace(PRESETS["clamp"], bursts_until=0)
+    assert folder.config().learner == replace(PRESETS["clamp"], ez_greedy_until=0)
 
 
-def test_numbers_come_back_exactly(tmp_path):
-    rows = [{"a": 0.1 + 0.2, "b": 3, "c": "blocked", "d": -math.inf}, {"a": 1e-300, "b": -1, "c": "", "d": 2.0}]
-    (tmp_path / "t.csv").write_text(table_text(rows))
-    assert read_table(tmp_path / "t.csv") == rows
+OLD_NAMES = {
+    "constant_episodes": "steady_episodes",
+    "greedy_share": "practise",
+    "ez_greedy": "bursts",
+    "ez_greedy_longest": "longest_burst",
+    "ez_greedy_until": "bursts_until",
+    "selection_window": "proven_by",
+}
 
 
-@pytest.mark.parametrize("text", ["a,b\n1\n", "a,b\n1,2,3\n"])
-def test_a_torn_table_is_refused(tmp_path, text):
-    (tmp_path / "t.csv").write_text(text)
-    with pytest.raises(InputError, match="not a table"):
-        read_table(tmp_path / "t.csv")
+def test_a_run_with_the_older_names_of_its_settings_is_read(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(replace(bead_config, preset="clamp", learner=PRESETS["clamp"]))
+    file = tmp_path / "run" / "config.yaml"
+    text = file.read_text()
+    for new, old in OLD_NAMES.items():
+        assert f"  {new}: " in text
+        text = text.replace(f"  {new}: ", f"  {old}: ")
+    file.write_text(text)
+    assert folder.config().learner == PRESETS["clamp"]
+
+
+def test_an_option_that_a_run_is_older_than_does_not_make_it_another(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    older = {key: value for key, value in bead_config.environment.items() if key != "observation"}
+    folder.create(replace(bead_config, environment=older))
+    folder.refuse_another(bead_config)
+    with pytest.raises(InputError, match="another environment"):
+        folder.refuse_another(replace(bead_config, environment=bead_config.environment | {"hold": 2}))
 
 
 def test_a_configuration_that_no_learner_can_use_is_refused(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    folder.create(replace(bead_config, learner=replace(bead_config.learner, batch_size=-3)))
+    folder.create(bead_config)
+    file = tmp_path / "run" / "config.yaml"
+    file.write_text(file.read_text().replace("batch_size: 16", "batch_size: -3"))
     with pytest.raises(InputError):
         folder.config()
-
-
-@pytest.mark.parametrize(
-    ("successes", "episode"),
-    [("1" * 10, 0), ("0" + "1" * 10, 1), ("1" * 9, None), ("1" * 9 + "0" + "1" * 12, 10), ("", None)],
-)
-def test_converged_is_the_episode_after_which_ten_in_a_row_succeed(successes, episode):
-    assert converged_after(s == "1" for s in successes) == episode

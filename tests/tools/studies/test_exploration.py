@@ -2,10 +2,18 @@ import numpy as np
 import pytest
 
 from guiderail.models.errors import InputError
-from guiderail.tools.studies.exploration import RMS, drawn, low_pass, ornstein_uhlenbeck, pink, state_dependent, white
+from guiderail.tools.studies.exploration import (
+    RMS,
+    low_pass,
+    open_loop,
+    ornstein_uhlenbeck,
+    pink,
+    state_dependent,
+    white,
+)
 
 STEPS, SIZE = 400, 2
-DRAWN = {
+MADE = {
     "white": (white, {}),
     "repeat": (white, {"hold": 7}),
     "pink": (pink, {}),
@@ -15,8 +23,8 @@ DRAWN = {
 
 
 def sequence(name, seed=0):
-    make, arguments = DRAWN[name]
-    act = drawn(make, np.random.default_rng(seed), STEPS, SIZE, **arguments)
+    make, arguments = MADE[name]
+    act = open_loop(make, np.random.default_rng(seed), STEPS, SIZE, **arguments)
     return np.array([act(np.zeros(3)) for _ in range(STEPS)])
 
 
@@ -24,7 +32,7 @@ def roughness(actions):
     return np.sqrt(np.mean(np.diff(actions, 3, axis=0) ** 2))
 
 
-@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("name", MADE)
 def test_all_have_the_same_rms_and_the_same_limits(name):
     actions = sequence(name)
     np.testing.assert_allclose(np.sqrt(np.mean(actions**2, axis=0)), RMS, rtol=1e-3)
@@ -52,8 +60,8 @@ def test_pink_noise_has_the_same_power_in_every_octave():
     assert max(octaves) < 1.2 * min(octaves)
 
 
-def test_state_dependent_noise_depends_on_the_state_and_is_drawn_anew():
-    act = state_dependent(np.random.default_rng(0), SIZE, interval=3)
+def test_state_dependent_noise_depends_on_the_state_and_is_chosen_anew():
+    act = state_dependent(np.random.default_rng(0), STEPS, SIZE, interval=3)
     states = [np.ones(5), np.ones(5), 2.0 * np.ones(5) - np.arange(5), np.ones(5)]
     first, again, elsewhere, anew = (act(state) for state in states)
     np.testing.assert_array_equal(first, again)
@@ -61,6 +69,6 @@ def test_state_dependent_noise_depends_on_the_state_and_is_drawn_anew():
     assert not np.allclose(first, anew)
 
 
-def test_nothing_to_draw_is_refused():
+def test_nothing_to_make_is_refused():
     with pytest.raises(InputError):
-        drawn(white, np.random.default_rng(0), 0, 2)
+        open_loop(white, np.random.default_rng(0), 0, 2)

@@ -68,11 +68,7 @@ def record(seeds: range) -> dict[str, np.ndarray]:
     }
 
 
-def main(path: Path = PATH) -> None:
+def main(folder: Path = PATH.parent) -> None:
     """Writes the file."""
     arrays: dict[str, Any] = record(range(100))
-    np.savez_compressed(path, **arrays)
-
-
-if __name__ == "__main__":
-    main()
+    np.savez_compressed(folder / PATH.name, **arrays)

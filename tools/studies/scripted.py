@@ -1,22 +1,42 @@
-"""What a grid-clamp policy has to beat, and that it can be beaten.
-
-Two policies without learning: the straight descent, and a hand-written rule that feels its way over the table in three
-lanes until the pegs drop. The first must mostly fail where table and clamp are not where they should be, the second
-must not: then there is something to learn, and it can be learned from what a policy sees.
-"""
+"""Rules written by hand: that a task can be done with what a policy sees, and what a learned one has to beat."""
 
 from __future__ import annotations
 
-import argparse
-import json
+from collections.abc import Callable
 
+import gymnasium
 import numpy as np
 
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.grid_clamp import CENTRE, MM, SCALE, make_env, make_skill
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, POSE_CENTRE, POSE_SCALE
+from guiderail.diagrams.tasks.grid_clamp import CENTRE, SCALE, make_skill
+from guiderail.diagrams.tasks.pouring_inputs import person
+from guiderail.models.errors import InputError
+from guiderail.models.objects.bnc_motion import MM, RIM
 from guiderail.models.objects.grid_clamp import GridClampDimensions
-from guiderail.tools.rollouts.judging import total, trials, worst
+from guiderail.models.registry import did_you_mean
+from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
+from guiderail.tools.rollouts.rollout import Act
 
+# The connector: where the demonstrations search the rim, the rule moves against the contact torque.
+GAIN = 1.5  # of the action per scaled contact torque
+# While the demonstrations search the rim, control steps.
+SEARCH = (60, 185)
+ON_RIM = (RIM - 1.2 * MM - POSE_CENTRE[2]) / POSE_SCALE[2]  # scaled height from which the plug isn't in yet
+PUSHING = 0.2  # scaled force along z from which the plug counts as standing on something
+# Where [time, pose, wrench] lie in an observation.
+TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y = 0, 3, 9, 10, 11
+
+
+def reactive_rule(observation: np.ndarray) -> np.ndarray:
+    """Moves in x and y against the torque, which says on which side of its mouth the plug stands; (2,)."""
+    step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
+    if not (SEARCH[0] < step < SEARCH[1] and observation[Z] > ON_RIM and observation[FORCE_Z] > PUSHING):
+        return np.zeros(2)
+    return np.clip(GAIN * np.array([-observation[TORQUE_Y], observation[TORQUE_X]]), -1.0, 1.0)
+
+
+# The grid clamp: the rule feels its way over the table in three lanes until the pegs drop.
 _D = GridClampDimensions()
 ON_TABLE = _D.peg_length  # height of the pegs' tips while they stand on the table [m]
 NEAR = 1.5 * MM  # above the table: from here on it comes down slowly, and searches
@@ -67,20 +87,34 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
     return np.array([0.0, 0.0, -1.0])
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Prints how many succeed, and with what force."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--trials", type=int, default=50)
-    parser.add_argument("--station", default="rails")
-    options = parser.parse_args(arguments)
-    for uncertainty in ("known", "calibration"):
-        env = make_env(uncertainty=uncertainty, station=options.station)
-        for policy in (straight_descent, searching_rule):
-            rows = trials(env, policy, options.trials)
-            what = {"uncertainty": uncertainty, "policy": policy.__name__, "trials": options.trials}
-            came = {"successes": total(rows, "success"), "peak_force": worst(rows, "peak_force")}
-            print(json.dumps(what | came), flush=True)
+RULES: dict[str, dict[str, Act]] = {
+    "BncConnector": {"reactive_rule": reactive_rule},
+    "GridClamp": {"searching_rule": searching_rule, "straight_descent": straight_descent},
+    "Pouring": {"person": person},
+}
 
 
-if __name__ == "__main__":
-    main()
+def find_rule(task: str, name: str) -> Act:
+    """A task's rule by its name; "rule" is the first one.
+
+    Raises:
+        InputError: if there is no such rule.
+    """
+    rules = RULES.get(task, {})
+    if name == "rule" and rules:
+        return next(iter(rules.values()))
+    if name not in rules:
+        raise InputError(f"{task} has no policy {name!r}: {did_you_mean(name, [*rules, *NULL_POLICIES])}")
+    return rules[name]
+
+
+def untrained(task: str, name: str, seed: int = 0) -> Callable[[gymnasium.Env], Act]:
+    """A null policy or a task's rule by its name: what acts, for an environment.
+
+    Raises:
+        InputError: if there is neither.
+    """
+    if name in NULL_POLICIES:
+        return lambda env: NullPolicy(NULL_POLICIES[name], env, seed)
+    rule = find_rule(task, name)
+    return lambda env: rule
