@@ -15,6 +15,9 @@ MAY_IMPORT = {
     "diagrams": {"models", "systems", "diagrams"},
     "tools": {"models", "systems", "diagrams", "tools"},
 }
+# Inside tools: what a person works with never needs what was studied with it. The command is every entry point.
+RESEARCH = {"studies", "figures", "stress", "benchmarks"}
+ENTRY_POINTS = {"tools/command.py"}
 LEARNERS = ("stable_baselines3", "sb3_contrib", "torch")
 
 
@@ -24,7 +27,7 @@ def imports(path):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute here"
-            yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 @pytest.mark.parametrize("folder", MAY_IMPORT)
@@ -54,3 +57,15 @@ def test_no_robot_is_known_by_name_outside_its_own_file():
         for path in (ROOT / folder).rglob("*.py"):
             named = words.search(path.read_text())
             assert named is None or path.name == "hardware.py", f"{path.relative_to(ROOT)} names {named}"
+
+
+def test_product_needs_no_research():
+    rooms = {path.name for path in (ROOT / "tools").iterdir() if path.is_dir() and (path / "__init__.py").exists()}
+    assert rooms >= RESEARCH
+    for path in (ROOT / "tools").rglob("*.py"):
+        inside = path.relative_to(ROOT)
+        if inside.parts[1] in RESEARCH or inside.as_posix() in ENTRY_POINTS:
+            continue
+        for name in imports(path):
+            parts = name.split(".")
+            assert parts[:2] != ["guiderail", "tools"] or not RESEARCH & set(parts[2:3]), f"{inside} imports {name}"

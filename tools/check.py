@@ -6,34 +6,47 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.errors import InputError
-from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+from guiderail.tools.files import check_picture
+from guiderail.tools.recording.reader import ENDINGS, load_demonstrations
 
-DEMONSTRATIONS = (".npz", ".csv")
 SKILLS = (".yaml", ".yml")
 
 
 def check(file: Path, draw: Path | None = None) -> dict[str, Any]:
-    """Reads a file as what its ending says it is; `draw` is where a skill's state machine is drawn.
+    """Reads a file as what its ending says it is; `draw` is where demonstrations or a state machine are drawn.
 
     Raises:
         InputError: if it is neither, or what it holds makes no sense.
     """
-    if not file.is_file():
-        raise InputError(f"there is no file {file}: name demonstrations (.npz, .csv) or a skill (.yaml)")
-    if file.suffix in DEMONSTRATIONS:
-        return check_demonstrations(file)
+    if not file.exists():
+        raise InputError(f"there is no file {file}: name demonstrations (.npz, .csv, a folder) or a skill (.yaml)")
+    if file.suffix in ENDINGS or file.is_dir():
+        return check_demonstrations(file, draw)
     if file.suffix in SKILLS:
         return check_skill(file, draw)
     raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv, a skill is .yaml")
 
 
-def check_demonstrations(file: Path) -> dict[str, Any]:
-    """What a file of demonstrations holds: how many, how long, and how far they agree with each other."""
-    demonstrations = Demonstrations.load(file)
+def check_demonstrations(file: Path, draw: Path | None = None) -> dict[str, Any]:
+    """What a file of demonstrations holds: how many, how long, and how far they agree with each other.
+
+    Args:
+        file: the file, or a folder of files.
+        draw: where they are drawn, with their mean, covariance and bounds.
+
+    Raises:
+        InputError: if they make no sense, or cannot be drawn.
+    """
+    if draw is not None:
+        check_picture(draw)
+    demonstrations = load_demonstrations(file)
     common = demonstrations.resampled()
     outputs = np.stack(common.outputs)
     spread = outputs.std(axis=0) if len(outputs) > 1 else np.zeros(outputs.shape[1:])
     durations = [float(t[-1] - t[0]) for t in demonstrations.times]
+    if draw is not None:
+        draw_demonstrations(common, draw)
     return {
         "file": str(file),
         "demonstrations": demonstrations.num_demonstrations,
@@ -45,7 +58,28 @@ def check_demonstrations(file: Path) -> dict[str, Any]:
         "highest": outputs.max(axis=(0, 1)).round(6).tolist(),
         "tightest": spread.min(axis=0).round(6).tolist(),
         "widest": spread.max(axis=0).round(6).tolist(),
-    }
+    } | ({} if draw is None else {"picture": str(draw)})
+
+
+def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
+    """Draws demonstrations on one clock: each, the reference's mean with two standard deviations, and their bounds."""
+    from guiderail.tools.viewing.style import new_figure, save_figure
+
+    outputs = np.stack(common.outputs)
+    # What agrees exactly would leave a covariance singular.
+    floor = 1e-3 * np.maximum(np.ptp(outputs, axis=(0, 1)), 1e-9)
+    reference = ReferenceTrajectory.from_demonstrations(common, floor=floor)
+    figure, axes = new_figure(len(common.names), 1, (8.0, 2.2 * len(common.names)))
+    for o, (axis, name) in enumerate(zip(axes[:, 0], common.names, strict=True)):
+        axis.plot(common.times[0], outputs[..., o].T, color="0.6", linewidth=0.8)
+        mean, wide = reference.means[:, o], 2 * reference.standard_deviations[:, o]
+        axis.fill_between(reference.times, mean - wide, mean + wide, color="tab:blue", alpha=0.25, linewidth=0)
+        axis.plot(reference.times, mean, color="tab:blue")
+        for bound in (outputs[..., o].min(), outputs[..., o].max()):
+            axis.axhline(bound, color="firebrick", linewidth=0.8, linestyle="--")
+        axis.set(ylabel=name, xlabel="time" if o + 1 == len(common.names) else "")
+    axes[0, 0].set_title("demonstrations, mean and two standard deviations, lowest and highest", fontsize=9)
+    save_figure(figure, picture)
 
 
 def check_skill(file: Path, draw: Path | None = None) -> dict[str, Any]:

@@ -4,191 +4,437 @@ import json
 import math
 import os
 import sys
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
 from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
 
 # Tools are imported where they are called: PyTorch and Drake take seconds, and `guiderail --help` should not.
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, for a program to read.")]
-Run = Annotated[Path, typer.Argument(help="A folder that guiderail train made.")]
+
+
+def _known(module: str, name: str) -> Callable[[], list[str]]:
+    """Looks up what can be chosen when somebody asks for it."""
+
+    def names() -> list[str]:
+        found = getattr(import_module(f"guiderail.tools.{module}"), name)
+        return list(found() if callable(found) else found)
+
+    return names
+
+
+# What a word in braces in a help text stands for, and what a shell completes.
+CHOICES: dict[str, Callable[[], list[str]]] = {
+    "tasks": _known("tasks", "known_tasks"),
+    "guidance": _known("guidance", "guidance_names"),
+    "stations": _known("listing", "station_names"),
+    "robots": _known("listing", "robot_names"),
+    "algorithms": _known("learning.learner", "learner_names"),
+    "presets": _known("learning.presets", "PRESETS"),
+    "studies": _known("studies.declaration", "shipped_studies"),
+    "figures": _known("figures", "FIGURES"),
+    "stressed": _known("stress", "STRESSED"),
+    "benchmarks": _known("benchmarks", "BENCHMARKS"),
+    "generated": _known("recording.generate", "GENERATED"),
+    "pictures": _known("files", "PICTURES"),
+    "listed": lambda: [*LISTED, *CHOICES["tasks"]()],
+}
+
+
+class Command(typer.core.TyperCommand):
+    """A command whose help names the choices that there are by then."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Fills the choices in."""
+        for parameter in self.params:
+            words = getattr(parameter, "help", None) or ""
+            for name, names in CHOICES.items():
+                if f"{{{name}}}" in words:
+                    words = words.replace(f"{{{name}}}", ", ".join(names()))
+            parameter.help = words  # type: ignore[attr-defined]
+        super().format_options(ctx, formatter)
+
+
+app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def command(example: str, name: str | None = None) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Registers a command with an example of it."""
+    return app.command(name, cls=Command, epilog=f"Example: guiderail {example}")
+
+
+def _complete(name: str | None) -> Callable[[str], list[str]] | None:
+    if name is None:
+        return None
+    return lambda incomplete: [choice for choice in CHOICES[name]() if choice.startswith(incomplete)]
+
+
+def _opt(words: str, *names: str, of: str | None = None, **more: Any) -> Any:
+    """An option with its help; `of` is what a shell completes it with."""
+    return typer.Option(*names, help=words, autocompletion=_complete(of), **more)
+
+
+def _arg(words: str, metavar: str, of: str | None = None) -> Any:
+    """An argument with its help."""
+    return typer.Argument(help=words, metavar=metavar, autocompletion=_complete(of))
+
+
+Json = Annotated[bool, _opt("Print one JSON object, for a program to read.", "--json")]
+Run = Annotated[Path, _arg("The folder of a run that guiderail train made.", "RUN")]
+Shown = Annotated[str, _arg("The folder of a run; or a task, for --policy: {tasks}.", "RUN or TASK")]
+Seed = Annotated[int, _opt("The seed of the held-out initial conditions.")]
+ENV_HELP = (
+    "An option of the environment, such as station=arm or explored=[0,1,2]; give it as often as you like. "
+    "guiderail list TASK names them all."
+)
+Env = Annotated[list[str] | None, _opt(ENV_HELP, "--env", metavar="key=value")]
+IMPORT_HELP = "A module or a file (.py) that registers a task, guidance, a station or a learner; the run remembers it."
+Imports = Annotated[list[str] | None, _opt(IMPORT_HELP, "--import", metavar="MODULE")]
+PolicyName = Annotated[str, _opt("Who acts in a task: rule, or zero, white or constant actions.", "--policy")]
+Guidance = Annotated[str | None, _opt("What guides: {guidance}.  [default: the task's]", of="guidance")]
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        import guiderail
+
+        typer.echo(f"guiderail {guiderail.__version__}")
+        raise typer.Exit
 
 
 @app.callback()
-def _guiderail() -> None:
+def _guiderail(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
     """Reinforcement learning of contact tasks that breaks nothing."""
 
 
-@app.command()
+@command("train NarrowPassage --guidance skgrl --episodes 60 --out runs/passage")
 def train(
-    task: Annotated[str | None, typer.Argument(help="What is learned, such as NarrowPassage.")] = None,
-    out: Annotated[Path | None, typer.Option(help="The run's folder; it must not exist, unless with --resume.")] = None,
-    guidance: Annotated[str | None, typer.Option(help="What guides the policy.  [default: skgrl or sct]")] = None,
-    algorithm: Annotated[str | None, typer.Option(help="tqc or sac.  [default: the task's]")] = None,
-    episodes: Annotated[int | None, typer.Option(help="How many in all.  [default: 60]")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of everything random.  [default: 0]")] = None,
-    preset: Annotated[str | None, typer.Option(help="The learner's settings.  [default: the task's]")] = None,
-    setting: Annotated[list[str] | None, typer.Option("--set", help="One setting, such as batch_size=128.")] = None,
-    hold: Annotated[int | None, typer.Option(help="Control steps that an action lasts.")] = None,
-    reward: Annotated[
-        str | None, typer.Option(help="sparse or shaped; Pouring also has hand_shaped, GridClamp no_force.")
+    task: Annotated[str | None, _arg("What is learned: {tasks}.", "TASK", "tasks")] = None,
+    out: Annotated[Path | None, _opt("The run's folder; it must not exist, unless with --resume.")] = None,
+    guidance: Guidance = None,
+    algorithm: Annotated[str | None, _opt("The learner: {algorithms}.  [default: the task's]", of="algorithms")] = None,
+    episodes: Annotated[int | None, _opt("How many in all.  [default: 60]")] = None,
+    seed: Annotated[int | None, _opt("The seed of everything random.  [default: 0]")] = None,
+    preset: Annotated[
+        str | None, _opt("The learner's settings: {presets}.  [default: the task's]", of="presets")
     ] = None,
-    observation: Annotated[str | None, typer.Option(help="state or image.")] = None,
-    uncertainty: Annotated[str | None, typer.Option(help="calibration or disc, for the connector.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
+    setting: Annotated[
+        list[str] | None, _opt("One setting of the learner, such as batch_size=128.", "--set", metavar="name=value")
+    ] = None,
+    env: Env = None,
+    hold: Annotated[int | None, _opt("How many control steps an action lasts.")] = None,
+    reward: Annotated[str | None, _opt("sparse or shaped; Pouring: hand_shaped too, GridClamp: no_force.")] = None,
+    observation: Annotated[str | None, _opt("state or image.")] = None,
+    uncertainty: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
+    station: Annotated[str | None, _opt("rails or arm, where a task has both.")] = None,
+    resume: Annotated[bool, _opt("Go on with the run in --out.", "--resume")] = False,
+    imports: Imports = None,
     as_json: Json = False,
 ) -> None:
-    """Train a policy; leaves a run folder."""
-    from guiderail.tools import training
+    """Train a policy and leave a run folder.
 
-    given = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
-    summary = training.run(
+    The folder holds the configuration, a table with a row for every episode, a checkpoint, the policy, a learning
+    curve and a replay. A run that was stopped goes on with --resume to the result it would have had.
+    """
+    from guiderail.tools.learning import configure
+
+    words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
+    words |= {"uncertainty": uncertainty, "station": station}
+    summary = configure.run(
         task,
         out,
-        environment={k: v for k, v in (given | {"uncertainty": uncertainty}).items() if v is not None},
+        environment={k: v for k, v in words.items() if v is not None} | _environment(env),
         algorithm=algorithm,
         preset=preset,
-        settings=_settings(setting or []),
+        settings=_pairs(setting, "--set", "batch_size=128"),
         episodes=episodes,
         seed=seed,
         resume=resume,
+        imports=imports or (),
     )
     _print(summary, as_json)
 
 
-@app.command()
+@command("evaluate runs/passage --episodes 100 --json")
 def evaluate(
     run: Run,
-    episodes: Annotated[int, typer.Option(help="How many, each with held-out initial conditions.")] = 100,
-    seed: Annotated[int, typer.Option(help="Of the held-out initial conditions.")] = 1_000_000,
+    episodes: Annotated[int, _opt("How many, each with held-out initial conditions.")] = 100,
+    seed: Seed = 1_000_000,
+    env: Env = None,
     as_json: Json = False,
 ) -> None:
-    """Judge a run's deterministic policy on what training never drew, beside the demonstration alone."""
-    from guiderail.tools.evaluate import evaluate as evaluate_run
+    """Evaluate a run's policy on what training never met.
 
-    _print(evaluate_run(run, episodes=episodes, seed=seed), as_json)
+    It acts deterministically, and the demonstration alone meets the same episodes.
+    """
+    from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
+
+    _print(evaluate_run(run, episodes=episodes, seed=seed, environment=_environment(env)), as_json)
 
 
-@app.command()
+@command("replay runs/passage --html replay.html")
 def replay(
-    run: Run,
-    html: Annotated[Path | None, typer.Option(help="The page to write.  [default: replay.html in the run]")] = None,
-    seed: Annotated[int, typer.Option(help="Of the held-out initial condition shown.")] = 1_000_000,
-    station: Annotated[str | None, typer.Option(help="Where the policy acts: rails or arm, for the connector.")] = None,
-    picture: Annotated[Path | None, typer.Option(help="What a camera sees of the episode, a .png to write.")] = None,
+    shown: Shown,
+    html: Annotated[Path | None, _opt("The page to write.  [default: replay.html in the run]")] = None,
+    seed: Seed = 1_000_000,
+    env: Env = None,
+    station: Annotated[str | None, _opt("Where the policy acts: rails or arm.")] = None,
+    picture: Annotated[Path | None, _opt("Also write what a camera sees of the episode: a file {pictures}.")] = None,
+    policy: PolicyName = "rule",
 ) -> None:
-    """Write one self-contained page with the robot, the demonstrations, the executed paths and the constraint."""
-    from guiderail.tools.replay import write_replay
+    """Show an episode as a page that any browser opens.
 
-    typer.echo(write_replay(run, html, seed=seed, station=station, picture=picture))
+    It holds the robot in motion, the demonstrations, the executed paths and the constraint, and needs nothing else.
+    """
+    from guiderail.tools.files import check_picture
+    from guiderail.tools.viewing.film import write_film
+    from guiderail.tools.viewing.replay import default_page, write_page
+
+    environment = _environment(env) | ({} if station is None else {"station": station})
+    episode = _episode(shown, policy, environment, seed)
+    page = default_page(Path(shown), environment) if html is None else html
+    if picture is not None:
+        check_picture(picture)
+        write_film(picture, episode)
+    write_page(page, episode)
+    typer.echo(page)
 
 
-@app.command()
+@command("film runs/passage --out episode.jpg")
+def film(
+    shown: Shown,
+    out: Annotated[Path, _opt("The picture to write: a file {pictures}.")],
+    seed: Seed = 1_000_000,
+    env: Env = None,
+    policy: PolicyName = "rule",
+) -> None:
+    """Draw six moments of an episode, as a camera sees them."""
+    from guiderail.tools.viewing.film import write_film
+    from guiderail.tools.viewing.shown import outcome
+
+    typer.echo(f"{out}: {outcome(write_film(out, _episode(shown, policy, _environment(env), seed)))}")
+
+
+@command("plot runs/passage")
 def plot(run: Run) -> None:
     """Draw a run's learning curve into its folder."""
-    from guiderail.tools.plot import plot_run
+    from guiderail.tools.viewing.plot import plot_run
 
     typer.echo(plot_run(run))
 
 
-@app.command()
+@command("record runs/passage --out demonstrations.npz --episodes 5")
 def record(
     run: Run,
-    out: Annotated[Path, typer.Option(help="The demonstrations' file, .npz or .csv.")],
-    episodes: Annotated[int, typer.Option(help="How many demonstrations.")] = 5,
-    signal: Annotated[str, typer.Option(help="commanded or measured poses.")] = "commanded",
-    seed: Annotated[int, typer.Option(help="Of the first held-out initial condition.")] = 1_000_000,
+    out: Annotated[Path, _opt("The demonstrations' file, .npz or .csv.")],
+    episodes: Annotated[int, _opt("How many demonstrations.")] = 5,
+    signal: Annotated[str, _opt("commanded or measured poses.")] = "commanded",
+    seed: Seed = 1_000_000,
 ) -> None:
-    """Record what a policy does, as demonstrations that a primitive can learn from."""
-    from guiderail.tools.record import record as record_run
+    """Record what a policy does as demonstrations for a primitive."""
+    from guiderail.tools.recording.record import record as record_run
 
     typer.echo(record_run(run, out, episodes=episodes, signal=signal, seed=seed))
 
 
-@app.command()
+@command("check demonstrations.csv --draw demonstrations.png")
 def check(
-    file: Annotated[Path, typer.Argument(help="Demonstrations (.npz, .csv) or a skill (.yaml).")],
-    draw: Annotated[Path | None, typer.Option(help="Draw a skill's state machine (.png, .svg, .pdf, .dot).")] = None,
+    file: Annotated[Path, _arg("Demonstrations (.npz, .csv or a folder of them), or a skill (.yaml).", "FILE")],
+    draw: Annotated[
+        Path | None, _opt("Draw the demonstrations, or a skill's state machine (.png, .svg, .pdf; a skill also .dot).")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check a file of demonstrations or a skill before anything is learned from it."""
+    """Check demonstrations or a skill before they are used."""
     from guiderail.tools.check import check as check_file
 
     _print(check_file(file, draw), as_json)
 
 
-@app.command()
+@command("study connector --out studies --methods skgrl,kgrl --seeds 30,31")
 def study(
-    task: Annotated[str, typer.Argument(help="What is learned; or smoothness, which compares ways to explore.")],
-    out: Annotated[Path, typer.Option(help="The folder of the study; finished runs in it are kept.")],
-    guidance: Annotated[str, typer.Option(help="One or several, separated by commas.")] = "residual,kgrl,skgrl",
-    algorithm: Annotated[str, typer.Option(help="One or several, separated by commas.")] = "tqc",
-    seeds: Annotated[int, typer.Option(help="Runs of each.")] = 3,
-    episodes: Annotated[int | None, typer.Option(help="Of each run.  [default: 60; smoothness: 4]")] = None,
-    preset: Annotated[str, typer.Option(help="The learner's settings.")] = "robust",
-    hold: Annotated[int | None, typer.Option(help="Control steps that an action lasts.")] = None,
-    evaluations: Annotated[int, typer.Option(help="Held-out episodes of each run.")] = 20,
+    file: Annotated[str, _arg("A YAML file, or one of {studies}.", "FILE", "studies")],
+    out: Annotated[Path, _opt("The folder of the study; what is finished in it is used again.")],
+    methods: Annotated[str | None, _opt("Some of its methods, separated by commas.")] = None,
+    seeds: Annotated[str | None, _opt("Other seeds, separated by commas.")] = None,
+    processes: Annotated[int, _opt("How many runs go side by side.")] = 2,
     as_json: Json = False,
 ) -> None:
-    """Train and evaluate several guidances or learners over seeds, or compare how smoothly one can explore."""
-    if task == "smoothness":
-        from guiderail.tools.smoothness import smoothness
+    """Train and judge methods over seeds, as a YAML file says.
 
-        _print(smoothness(out, episodes=4 if episodes is None else episodes), as_json)
+    It leaves a table with a row for each method, seed, mark and what was judged on. A study that was stopped goes on
+    where it was with the same command.
+    """
+    from guiderail.tools.studies import declaration
+    from guiderail.tools.studies.smoothness import smoothness
+    from guiderail.tools.studies.study import study_command
+
+    declared = declaration.load_study(file)
+    if isinstance(declared, declaration.Smoothness):
+        _print(smoothness(out, **declared.model_dump(exclude={"program", "name"})), as_json)
         return
-    from guiderail.tools.study import study as run_study
-
-    result = run_study(
-        task,
-        out,
-        guidance=guidance.split(","),
-        algorithms=algorithm.split(","),
-        seeds=seeds,
-        episodes=60 if episodes is None else episodes,
-        preset=preset,
-        hold=hold,
-        evaluations=evaluations,
-    )
-    _print(result, as_json)
+    try:
+        numbers = None if seeds is None else [int(number) for number in seeds.split(",")]
+    except ValueError:
+        raise InputError(f"--seeds takes whole numbers separated by commas, such as 0,1,2, not {seeds!r}") from None
+    chosen = declared.only(None if methods is None else methods.split(","), numbers)
+    _print(study_command(chosen, out, processes), as_json)
 
 
-@app.command()
+@command("reproduce 5.6 --seeds 3")
 def reproduce(
-    figure: Annotated[str, typer.Argument(help="A figure of the thesis, such as 5.6, or 'table 3.3'.")],
-    seeds: Annotated[int, typer.Option(help="Runs of each method.")] = 3,
-    episodes: Annotated[int | None, typer.Option(help="Of each run.  [default: the figure's own]")] = None,
-    out: Annotated[Path, typer.Option(help="The folder; finished runs in it are used again.")] = Path("reproductions"),
+    figure: Annotated[str, _arg("A figure of the thesis: {figures}.", "FIGURE", "figures")],
+    seeds: Annotated[int, _opt("How many runs of each method.")] = 3,
+    episodes: Annotated[int | None, _opt("How many in each run.  [default: the figure's own]")] = None,
+    out: Annotated[Path, _opt("The folder; finished runs in it are used again.")] = Path("reproductions"),
     as_json: Json = False,
 ) -> None:
-    """Make a figure of the thesis anew: a picture, and a table with the numbers behind it."""
+    """Make a figure of the thesis anew.
+
+    It is a picture, and a table with the numbers behind it.
+    """
     from guiderail.tools.figures import reproduce as reproduce_figure
 
     _print(reproduce_figure(figure, seeds=seeds, episodes=episodes, out=out), as_json)
 
 
-@app.command()
+@command("bench primitive")
 def bench(
-    what: Annotated[str, typer.Argument(help="primitive or simulation.")],
+    what: Annotated[str, _arg("What is measured: {benchmarks}.", "WHAT", "benchmarks")],
     as_json: Json = False,
 ) -> None:
-    """Measure how fast the primitive or the simulation is on this machine."""
-    from importlib import import_module
+    """Measure how fast the primitive or the simulation is here.
 
-    if what not in ("primitive", "simulation"):
-        raise InputError(f"there is no benchmark {what!r}: choose primitive or simulation")
-    import_module(f"guiderail.tools.bench_{what}").main(as_json)
+    It takes a minute or two.
+    """
+    from guiderail.tools.benchmarks import run_benchmark
+
+    result, show = run_benchmark(what)
+    typer.echo(json.dumps(result)) if as_json else show(result)
 
 
-@app.command()
-def demo(
-    out: Annotated[Path, typer.Option(help="Where the run goes; an earlier demo there is replaced.")] = Path("demo"),
-    episodes: Annotated[int, typer.Option(help="How many to learn from.")] = 32,
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+@command("stress BncConnector --episodes 1000 --out stress.csv")
+def stress(
+    task: Annotated[str, _arg("The task: {stressed}.", "TASK", "stressed")],
+    episodes: Annotated[int | None, _opt("How many in all.  [default: 1000]")] = None,
+    steps: Annotated[int | None, _opt("Control steps in all, instead of --episodes.")] = None,
+    seed: Annotated[int, _opt("The seed of the first episode; each has its own.")] = 0,
+    out: Annotated[Path | None, _opt("A table (.csv); a campaign that was stopped goes on in it.")] = None,
+    env: Env = None,
 ) -> None:
-    """Watch sKGRL learn to avoid an obstacle in a narrow passage, in a minute or two."""
+    """Try to make a task fail by actions that no policy sends.
+
+    It prints what came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction
+    failed, constrained guidance commanded a violation, or a limit of the task's own was passed.
+    """
+    from guiderail.tools.stress.campaign import stress as stress_task
+
+    how: dict[str, Any] = {
+        "episodes": episodes,
+        "steps": steps,
+        "seed": seed,
+        "out": out,
+        "environment": _environment(env),
+    }
+    found = stress_task(task, say=_say, **how)
+    typer.echo(json.dumps(found, indent=2))
+    raise typer.Exit(1 if found["wrong"] else 0)
+
+
+@command("drive Pouring")
+def drive(
+    task: Annotated[str, _arg("The task: {tasks}.", "TASK", "tasks")],
+    guidance: Guidance = None,
+    env: Env = None,
+) -> None:
+    """Act in the policy's place, with a gamepad or the keyboard."""
+    from guiderail.tools.operate.drive import drive_by_hand
+
+    drive_by_hand(task, ({} if guidance is None else {"guidance": guidance}) | _environment(env))
+
+
+@command("serve-iiwa --seconds 60", "serve-iiwa")
+def serve_iiwa(
+    url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
+    seconds: Annotated[float, _opt("How long, in simulated time.")] = 3600.0,
+    patience: Annotated[float, _opt("How many seconds to wait for a command.")] = 5.0,
+) -> None:
+    """Simulate an iiwa at the other end of LCM.
+
+    It stands in front of a BNC jack; the command ends with 1 if commands stopped coming.
+    """
+    from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
+
+    raise typer.Exit(0 if serve(url, seconds, patience) else 1)
+
+
+@command("generate connector-demonstrations --out .")
+def generate(
+    what: Annotated[str, _arg("What: {generated}.", "WHAT", "generated")],
+    out: Annotated[Path | None, _opt("The folder.  [default: where guiderail has its own]")] = None,
+) -> None:
+    """Write the files anew that guiderail ships.
+
+    These are recorded demonstrations, and objects from their dimensions.
+    """
+    from guiderail.tools.recording.generate import generate as write
+
+    write(what, out)
+
+
+LISTED: dict[str, Callable[[], Any]] = {
+    **{name: CHOICES[name] for name in ("tasks", "guidance", "stations", "robots", "presets", "studies", "figures")},
+    "learners": CHOICES["algorithms"],
+}
+
+
+@command("list BncConnector", "list")
+def list_(
+    what: Annotated[str | None, _arg("One of {listed}, metrics; everything unless given.", "WHAT", "listed")] = None,
+    imports: Imports = None,
+    as_json: Json = False,
+) -> None:
+    """List what there is to choose from.
+
+    With a task it lists the options of its environment and of a reset, and with metrics what each number of a table
+    means. As JSON, without a word, it is everything: tasks, guidance, stations, robots and learners with their ports,
+    options and ranges.
+    """
+    from guiderail.tools import listing
+    from guiderail.tools.tasks import import_modules
+
+    import_modules(imports or ())
+    if what is None:
+        _print(listing.everything() if as_json else {name: names() for name, names in LISTED.items()}, as_json)
+    elif what == "metrics":
+        from guiderail.tools.rollouts.metrics import COLUMNS, STATISTICS
+
+        numbers = (*(("episode: ", m) for m in COLUMNS), *(("episodes: ", m) for m in STATISTICS.values()))
+        _print({of + m.name: m.words + (f" [{m.unit}]" if m.unit else "") for of, m in numbers}, as_json, "_")
+    elif what in LISTED:
+        _print({what: LISTED[what]()}, as_json)
+    elif what in CHOICES["tasks"]():
+        _print(listing.task(what) if as_json else listing.options_in_words(what), as_json, "_")
+    else:
+        raise InputError(f"there is no list of {what!r}: {did_you_mean(what, [*CHOICES['listed'](), 'metrics'])}")
+
+
+@command("demo --out demo")
+def demo(
+    out: Annotated[Path, _opt("Where the run goes; an earlier demo there is replaced.")] = Path("demo"),
+    episodes: Annotated[int, _opt("How many to learn from.")] = 32,
+    seed: Annotated[int, _opt("The seed of everything random.")] = 0,
+) -> None:
+    """Watch sKGRL learn to avoid an obstacle in a minute or two."""
     from guiderail.tools.demo import run_demo
 
     run_demo(out, episodes=episodes, seed=seed)
@@ -198,12 +444,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command and ends the process: 0 for success, 2 for what a person gave wrong, in one sentence."""
     # Matrices here are small: threads that wait for each other cost more than they give, and runs go side by side.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    arguments = sys.argv[1:] if arguments is None else arguments
     try:
         code = app(args=arguments, prog_name="guiderail", standalone_mode=False)
     except InputError as error:
         code = _refuse(str(error))
     except (KeyboardInterrupt, typer.Abort):
-        _say("stopped; a run goes on with guiderail train --resume --out RUN")
+        go_on = {"train": "; go on with --resume", "study": "; the same command goes on where it was"}
+        _say(f"stopped{go_on.get(arguments[0] if arguments else '', '')}")
         code = 130
     except BrokenPipeError:
         code = 1
@@ -219,9 +467,15 @@ def _usage_sentence(error: Any) -> str:
     message = " ".join(str(error.format_message()).split()).rstrip(".")
     message = message[:1].lower() + message[1:]
     context = getattr(error, "ctx", None)
-    if "command" in message and context is not None and hasattr(context.command, "list_commands"):
-        return f"{message.split('. ')[0]}: choose one of {', '.join(context.command.list_commands(context))}"
     path = context.command_path if context is not None else "guiderail"
+    if hasattr(error, "possibilities"):
+        known = [name for parameter in context.command.params for name in parameter.opts] if context else []
+        return f"there is no option {error.option_name}: {did_you_mean(error.option_name, known)}"
+    if "command" in message and context is not None and hasattr(context.command, "list_commands"):
+        names = context.command.list_commands(context)
+        typed = message.partition("'")[2].partition("'")[0]
+        known_words = did_you_mean(typed, names) if typed else f"choose one of {', '.join(names)}"
+        return f"{message.split('. ')[0]}: {known_words}"
     return f"{message}: see {path} --help"
 
 
@@ -231,25 +485,52 @@ def _refuse(sentence: str) -> int:
 
 
 def _say(sentence: str) -> None:
-    print(f"guiderail: {sentence}", file=sys.stderr)
+    print(f"guiderail: {sentence}", file=sys.stderr, flush=True)
 
 
-def _settings(pairs: list[str]) -> dict[str, str]:
+def _pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]:
     """`key=value` pairs as a dictionary."""
-    for pair in pairs:
+    for pair in given or []:
         if "=" not in pair:
-            raise InputError(f"--set takes name=value, such as batch_size=128, not {pair!r}")
-    return {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in pairs)}
+            raise InputError(f"{option} takes name=value, such as {example}, not {pair!r}")
+    return {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in given or [])}
 
 
-def _print(result: dict[str, Any], as_json: bool) -> None:
-    """A result for a program or for a person."""
+def _environment(given: list[str] | None) -> dict[str, Any]:
+    """Options of an environment, each value as YAML would read it."""
+    if not given:
+        return {}
+    from guiderail.tools.tasks import as_value
+
+    return {key: as_value(value) for key, value in _pairs(given, "--env", "station=arm").items()}
+
+
+def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int) -> Any:
+    """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
+    from guiderail.tools.viewing import shown as showing
+
+    if Path(shown).is_dir() or shown not in CHOICES["tasks"]():
+        return showing.Shown.of_run(Path(shown), environment, seed)
+    from guiderail.tools.studies.scripted import untrained
+
+    return showing.Shown(shown, environment, untrained(shown, policy), policy, "", seed=seed)
+
+
+def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
+    """A result for a program or for a person; what the demonstration came to stands beside it."""
     if as_json:
         # JSON knows no infinity: what is unbounded, such as the slack of no constraint at all, is null there.
         known = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
         typer.echo(json.dumps(known, allow_nan=False))
         return
+    from guiderail.tools.tables import cell
+
+    beside = "demonstration_"
     width = max(len(key) for key in result)
+    if any(beside + key in result for key in result):
+        typer.echo(f"{'':<{width}}  {'policy':<12}  demonstration alone")
     for key, value in result.items():
-        shown = "–" if value is None else f"{value:.4g}" if isinstance(value, float) else value
-        typer.echo(f"{key.replace('_', ' '):<{width}}  {shown}")
+        if key.startswith(beside):
+            continue
+        other = f"{cell(value):<12}  {cell(result[beside + key])}" if beside + key in result else cell(value)
+        typer.echo(f"{key if ' ' in key else key.replace('_', space):<{width}}  {other}")

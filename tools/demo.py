@@ -3,19 +3,22 @@
 import shutil
 import time
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 
 from guiderail.models.errors import InputError
-from guiderail.tools.episodes import make_environment, run_episode, standing_still
-from guiderail.tools.figures.passage import avoided_from, draw_world
-from guiderail.tools.pictures import COLOURS, new_figure, save_figure
-from guiderail.tools.policy import Policy
-from guiderail.tools.progress import TOLERANCE
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.training import run
+from guiderail.models.policy import Policy
+from guiderail.tools.guidance import colour
+from guiderail.tools.learning.configure import run
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.rollouts.metrics import TOLERANCE, avoids_obstacle_from
+from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.rollouts.rollout import Paths, rollout
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.passage import draw_world
+from guiderail.tools.viewing.style import new_figure, save_figure
 
 HELD_OUT = 10  # episodes that the result is judged on
 SEED = 1_000_000
@@ -41,15 +44,15 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     )
     _clear(out)
     summary = run("NarrowPassage", out, environment={"guidance": "skgrl"}, preset=PRESET, episodes=episodes, seed=seed)
-    before, after = _judge(out)
+    before, after = _evaluate(out)
     picture = _draw(out, before, after)
     rows = RunFolder(out).episodes()
-    avoided = avoided_from(rows)
-    violations = sum(row["worst_violation"] > TOLERANCE or row["worst_measured_violation"] > TOLERANCE for row in rows)
+    avoided = avoids_obstacle_from(rows)
+    violations = (rows[["worst_violation", "worst_measured_violation"]].max(axis=1) > TOLERANCE).sum()
     console.print(f"\nWhat came of it, in {time.perf_counter() - started:.0f} s:")
     for line in (
-        f"{sum(row['success'] for row in rows)} of {len(rows)} training episodes reached the goal, "
-        f"{violations} violated the constraint, {sum(row['collisions'] > 0 for row in rows)} touched a wall.",
+        f"{rows['success'].sum()} of {len(rows)} training episodes reached the goal, "
+        f"{violations} violated the constraint, {(rows['collisions'] > 0).sum()} touched a wall.",
         "It did not learn to keep clear of the obstacle: give it more --episodes."
         if avoided is None
         else f"From episode {avoided} on it kept clear of the obstacle while still exploring.",
@@ -83,46 +86,37 @@ def _clear(out: Path) -> None:
     shutil.rmtree(out)
 
 
-def _judge(out: Path) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Held-out episodes of the demonstration alone and of the policy: rows, each with its `path`."""
-    folder = RunFolder(out)
-    config = folder.config()
+def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Held-out episodes of the demonstration alone and of the policy: rows with paths."""
+    config = RunFolder(out).config()
     env = make_environment(config.task, config.environment)
     env.reset(seed=config.seed)
-    judged = []
-    for act in (standing_still(env), Policy.load(out)):
-        rows = []
-        for index in range(HELD_OUT):
-            row = run_episode(env, act, held_out_seed=SEED + index, episode=index)
-            rows.append(row | {"path": cast(Any, env.unwrapped).trace.measured.copy()})
-        judged.append(rows)
+    tables = [
+        pd.DataFrame([rollout(env, act, Paths(env), index=i, seed=SEED + i, held_out=True) for i in range(HELD_OUT)])
+        for act in (still(env), Policy.load(out))
+    ]
     env.close()
-    return judged[0], judged[1]
+    return tables[0], tables[1]
 
 
-def _outcome(rows: list[dict[str, Any]]) -> str:
-    success = np.mean([row["success"] for row in rows])
-    cost = np.mean([row["reward_obstacle_cost"] for row in rows])
-    return f"{success:.0%} reach the goal, obstacle cost {abs(cost):.1f}, return {_mean_return(rows):.1f}"
+def _outcome(rows: pd.DataFrame) -> str:
+    cost = abs(rows["reward_obstacle_cost"].mean())
+    return f"{rows['success'].mean():.0%} reach the goal, obstacle cost {cost:.1f}, return {rows['return'].mean():.1f}"
 
 
-def _mean_return(rows: list[dict[str, Any]]) -> float:
-    return float(np.mean([row["return"] for row in rows]))
-
-
-def _draw(out: Path, before: list[dict[str, Any]], after: list[dict[str, Any]]) -> Path:
+def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
     """The plane with the paths before and after, and the return over the episodes."""
     figure, ((plane, curve),) = new_figure(1, 2, (11, 5.2))
     draw_world(plane)
-    for index, row in enumerate(after):
-        plane.plot(*row["path"].T, color=COLOURS["skgrl"], linewidth=1.2, label="" if index else "after learning")
-    plane.plot(*before[0]["path"].T, color="black", linewidth=1.2, label="before learning")
+    for index, path in enumerate(after["measured"]):
+        plane.plot(*path.T, color=colour("skgrl"), linewidth=1.2, label="" if index else "after learning")
+    plane.plot(*before["measured"][0].T, color="black", linewidth=1.2, label="before learning")
     plane.legend(frameon=False, loc="upper left", fontsize=8)
     rows = RunFolder(out).episodes()
     episodes = np.arange(1, len(rows) + 1)
-    curve.plot(episodes, [row["return"] for row in rows], "o-", markersize=3, color=COLOURS["skgrl"], label="return")
-    curve.plot(episodes, [row["reward_obstacle_cost"] for row in rows], color="saddlebrown", label="obstacle cost")
-    curve.axhline(_mean_return(before), color="black", linewidth=0.8, linestyle=":", label="return before learning")
+    curve.plot(episodes, rows["return"], "o-", markersize=3, color=colour("skgrl"), label="return")
+    curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="obstacle cost")
+    curve.axhline(before["return"].mean(), color="black", linewidth=0.8, linestyle=":", label="return before learning")
     curve.set(xlabel="training episode")
     curve.legend(frameon=False, fontsize=8)
     return save_figure(figure, out / "picture.png")

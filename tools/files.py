@@ -1,9 +1,11 @@
-"""Files that are either complete or not there."""
+"""Files that are either complete or not there, and pictures that can be written."""
 
 import os
 from pathlib import Path
 
 from guiderail.models.errors import InputError
+
+PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -23,3 +25,13 @@ def write_atomically(path: Path, content: bytes) -> None:
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise InputError(f"{path} cannot be written ({error.strerror}): choose a folder with room to write") from error
+
+
+def check_picture(path: Path) -> None:
+    """Refuses a picture that cannot be written, before anything is run for it.
+
+    Raises:
+        InputError: for an ending that is none of `PICTURES`.
+    """
+    if path.suffix.lower() not in PICTURES:
+        raise InputError(f"{path} has the ending {path.suffix!r}: a picture is {', '.join(PICTURES)}")

@@ -7,7 +7,7 @@ from typing import Any
 from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
-from guiderail.diagrams.make import CommonOptions
+from guiderail.diagrams.make import CommonOptions, resolve
 from guiderail.diagrams.options import PrimitiveOptions, TemplateOptions, described
 from guiderail.diagrams.stations.registry import STATIONS, stations_for
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
@@ -15,12 +15,13 @@ from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.task import TASKS, environment_id
 from guiderail.models.robots.robot import end_effector_names, find_end_effector, find_robot, robot_names
 from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.tasks import task_options
 
 
-def listing() -> dict[str, Any]:
+def everything() -> dict[str, Any]:
     """Tasks, guidance, stations, robots and learners by name: what each is, its ports and its options."""
     return {
-        "tasks": {name: _task(name) for name in TASKS.names()},
+        "tasks": {name: task(name) for name in TASKS.names()},
         "guidance": {name: _guidance(name) for name in GUIDANCE.names()},
         "stations": {name: _station(name) for name in STATIONS.names()},
         "robots": {
@@ -36,20 +37,57 @@ def listing() -> dict[str, Any]:
     }
 
 
-def _task(name: str) -> dict[str, Any]:
-    task = TASKS.get(name)
+def task(name: str) -> dict[str, Any]:
+    """One task.
+
+    Raises:
+        InputError: if there is none of that name.
+    """
+    declared = TASKS.get(name)
     return {
-        "is": _first_line(task),
+        "is": _first_line(declared),
         "environment": environment_id(name),
-        "guidance": possible_guidance(task.knows()),
-        "stations": stations_for(task.world_kind),
-        "rewards": list(task.rewards),
-        "observations": list(task.observations),
-        "difficulties": list(task.difficulties),
-        "defaults": {**task.defaults, **task.learner},
-        "options": described(task.Options),
-        "reset_options": described(task.Reset),
+        "guidance": possible_guidance(declared.knows()),
+        "stations": stations_for(declared.world_kind),
+        "rewards": list(declared.rewards),
+        "observations": list(declared.observations),
+        "difficulties": list(declared.difficulties),
+        "defaults": {**declared.defaults, **declared.learner},
+        "options": described(declared.Options),
+        "reset_options": described(declared.Reset),
     }
+
+
+def options_in_words(name: str) -> dict[str, str]:
+    """The options of a task's environment, each with its default, its range and what it is.
+
+    Raises:
+        InputError: if there is no task of that name.
+    """
+    if name not in TASKS.names():
+        return {key: f"{value!r}" for key, value in task_options(name).items()}
+    resolved = resolve(name, {})
+    declared = TASKS.get(name)
+    choices = {
+        "guidance": possible_guidance(declared.knows()),
+        "station": stations_for(declared.world_kind),
+        "reward": declared.rewards,
+        "observation": declared.observations,
+        "difficulty": tuple(declared.difficulties),
+    }
+    words = {}
+    for model in resolved.models.values():
+        for row in described(type(model)):
+            allowed = row.get("choices") or choices.get(row["name"])
+            among = f"one of {', '.join(map(str, allowed))}; " if allowed else ""
+            words[row["name"]] = f"{row['description']}: {among}{resolved.values[row['name']]!r} unless given"
+    reset = {f"reset: {row['name']}": row["description"] for row in described(declared.Reset)}
+    return words | reset
+
+
+def station_names() -> list[str]:
+    """Of all stations."""
+    return STATIONS.names()
 
 
 def _guidance(name: str) -> dict[str, Any]:

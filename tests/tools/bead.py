@@ -13,14 +13,14 @@ from guiderail.models.errors import InputError
 class Bead(gymnasium.Env):
     metadata = {"render_modes": ["human"]}  # noqa: RUF012
 
-    def __init__(self, guidance="skgrl", reward="shaped", observation="state", hold=1, render_mode=None):
+    def __init__(self, guidance="skgrl", reward="shaped", observation="state", hold=1, wall=1.0, render_mode=None):
         if guidance not in ("kmp", "skgrl"):
             raise InputError(f"Bead has no guidance {guidance!r}: choose kmp or skgrl")
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
-        self.hold, self.render_mode = hold, render_mode
+        self.hold, self.wall, self.render_mode = hold, wall, render_mode
         self.task = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1, symmetry=None)
-        self.trace = Trace(12, 2, 0.1)
+        self.trace, self.length = Trace(250, 2, 0.1), 12
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -29,8 +29,11 @@ class Bead(gymnasium.Env):
         self.x = np.array([start, 0.0]) + 0.1 * self.np_random.standard_normal(2)
         return self._observation(), self._info("", 0.0)
 
+    def render(self):
+        return len(self.trace)
+
     def _observation(self):
-        return np.append(self.x, len(self.trace) / 12).astype(np.float32)
+        return np.append(self.x, len(self.trace) / self.length).astype(np.float32)
 
     def _info(self, termination, reward):
         info = {"is_success": termination == "success", "termination": termination, "goal_distance": reward}
@@ -40,11 +43,11 @@ class Bead(gymnasium.Env):
     def step(self, action):
         total = 0.0
         for _ in range(self.hold):
-            self.x = np.minimum(self.x + 0.1 * np.asarray(action, float), 1.0)
+            self.x = np.minimum(self.x + 0.1 * np.asarray(action, float), self.wall)
             reward = -float(np.linalg.norm(self.x - [0.5, 0.5]))
             self.trace.append(self.x, self.x, 1.0, reward)
             total += reward
-            if done := reward > -0.2 or len(self.trace) == 12:
+            if done := reward > -0.2 or len(self.trace) == self.length:
                 break
         termination = ("success" if reward > -0.2 else "time_limit") if done else ""
         info = self._info(termination, total)

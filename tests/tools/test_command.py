@@ -1,11 +1,15 @@
 import json
+import subprocess
+import sys
 
 import pytest
 
-from guiderail.tools.command import main
-from guiderail.tools.figures import FIGURES
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.train import train
+import guiderail
+from guiderail.models.objects import bnc_connector, grid_clamp
+from guiderail.tools.command import app, main
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.tasks import as_value
 
 
 def call(capsys, *arguments):
@@ -25,34 +29,52 @@ def trained(bead_config, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        ([], "choose one of train, evaluate"),
-        (["trian"], "choose one of train, evaluate"),
+        ([], "choose one of"),
+        (["trian"], "did you mean train?"),
+        (["xyz"], "choose one of"),
         (["train"], "--out"),
         (["train", "--out", "new"], "name a task"),
-        (["train", "Pooring", "--out", "new"], "NarrowPassage"),
+        (["train", "Pooring", "--out", "new"], "did you mean Pouring?"),
         (["train", "Bead", "--out", "new", "--guidance", "magic"], "kmp or skgrl"),
         (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "safe_residual, kgrl, skgrl"),
-        (["train", "Bead", "--out", "new", "--algorithm", "ppo"], "sac, tqc"),
-        (["train", "Bead", "--out", "new", "--preset", "best"], "robust"),
-        (["train", "Bead", "--out", "new", "--uncertainty", "disc"], "takes guidance"),
+        (["train", "Bead", "--out", "new", "--algorithm", "ppo"], "choose one of sac, tqc"),
+        (["train", "Bead", "--out", "new", "--preset", "robst"], "did you mean robust?"),
+        (["train", "Bead", "--out", "new", "--uncertainty", "disc"], "no option 'uncertainty'"),
         (["train", "Bead", "--out", "new", "--episodes", "0"], "at least one episode"),
         (["train", "Bead", "--out", "new", "--episodes", "many"], "see guiderail train --help"),
         (["train", "Bead", "--out", "new", "--seed", "-1"], "a seed is a whole number"),
         (["train", "Bead", "--out", "new", "--set", "batch_size"], "name=value"),
-        (["train", "Bead", "--out", "new", "--set", "batchsize=3"], "batch_size"),
-        (["train", "Bead", "--out", "new", "--set", "batch_size=0"], "at least 1"),
+        (["train", "Bead", "--out", "new", "--set", "batchsize=3"], "did you mean batch_size?"),
+        (["train", "Bead", "--out", "new", "--set", "batch_size=0"], "greater than or equal to 1"),
         (["train", "Bead", "--out", "new", "--set", "learning_rate=fast"], "give a value such as"),
         (["train", "--resume", "--out", "new"], "not a run"),
-        (["train", "Bead", "--fast"], "--fast"),
+        (["train", "Bead", "--fast"], "no option --fast"),
+        (["train", "Bead", "--epsiodes", "3"], "did you mean --episodes?"),
+        (["train", "Bead", "--out", "new", "--env", "hold"], "--env takes name=value"),
+        (["train", "Bead", "--out", "new", "--env", "hodl=2"], "did you mean hold?"),
+        (["train", "Bead", "--out", "new", "--env", "hold=two"], "give a value such as 1"),
+        (["train", "Bead", "--out", "new", "--env", "wall=[1, 2]"], "give a value such as 1.0"),
         (["evaluate", "new"], "not a run"),
         (["replay", "new"], "not a run"),
         (["plot", "new"], "not a run"),
         (["record", "new", "--out", "demos.npz"], "not a run"),
         (["check", "new.npz"], "no file"),
-        (["reproduce", "1.1"], ", ".join(FIGURES)),
+        (["check", "."], "no file .npz or .csv"),
+        (["reproduce", "1.1"], "no figure '1.1'"),
+        (["reproduce", "5.66"], "did you mean 5.6?"),
         (["reproduce", "5.6", "--seeds", "0"], "at least one seed"),
-        (["study", "Bead", "--out", "new", "--seeds", "0"], "at least one seed"),
-        (["bench", "everything"], "primitive or simulation"),
+        (["study", "conector", "--out", "new"], "did you mean connector?"),
+        (["study", "connector", "--out", "new", "--seeds", "1;2"], "whole numbers separated by commas"),
+        (["study", "connector", "--out", "new", "--methods", "skgrll"], "did you mean skgrl?"),
+        (["bench", "primitve"], "did you mean primitive?"),
+        (["stress", "BncConector"], "did you mean BncConnector?"),
+        (["stress", "Pouring", "--episodes", "0"], "at least one episode"),
+        (["drive", "Puring"], "did you mean Pouring?"),
+        (["film", "new", "--out", "film.png"], "not a run"),
+        (["film", "Bead", "--policy", "rul", "--out", "film.png"], "no policy 'rul'"),
+        (["generate", "objects"], "nothing called 'objects'"),
+        (["generate", "clamp-objects", "--out", "none"], "make it first"),
+        (["list", "metrix"], "did you mean metrics?"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
@@ -115,11 +137,99 @@ def test_a_damaged_policy_is_refused(capsys, trained):
     assert "damaged" in err
 
 
-def test_help_needs_neither_pytorch_nor_drake():
-    import subprocess
-    import sys
+COMMANDS = [info.name or info.callback.__name__ for info in app.registered_commands]
 
-    code = "import sys; from guiderail.tools.command import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_help_has_an_example_that_can_be_typed_and_starts_nothing(command, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = call(capsys, command, "--help")
+    assert (code, err) == (0, "")
+    assert "{" not in out.partition("Arguments:")[2]
+    example = " ".join(out.partition("Example: ")[2].split())
+    assert example.startswith(f"guiderail {command}")
+    options = {word for word in example.split() if word.startswith("--")}
+    assert options <= set(out.partition("Example: ")[0].split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_the_choices(capsys):
+    for command, words in (
+        ("train", ("NarrowPassage", "skgrl", "tqc", "robust")),
+        ("study", ("connector_disc", "smoothness")),
+        ("reproduce", ("table 3.3", "5.10")),
+        ("bench", ("primitive", "simulation")),
+        ("stress", ("BncConnector", "Pouring")),
+        ("film", (".jpg",)),
+        ("generate", ("clamp-objects",)),
+    ):
+        out = call(capsys, command, "--help")[1]
+        assert all(word in out for word in words), command
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["study", "--help"], ["list"], ["--version"]])
+def test_help_needs_neither_pytorch_nor_drake(arguments):
+    code = f"import sys; from guiderail.tools.command import main\ntry: main({arguments})\nexcept SystemExit: pass\n"
     check = code + "assert not {'torch', 'pydrake', 'stable_baselines3', 'matplotlib'} & set(sys.modules)"
     result = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
+
+
+def test_a_shell_completes_commands_and_choices(monkeypatch, capsys):
+    for words, expected in (("guiderail tra", "train"), ("guiderail train Nar", "NarrowPassage")):
+        monkeypatch.setenv("_GUIDERAIL_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+        assert call(capsys)[1].split() == [expected]
+
+
+def test_the_version_is_the_packages(capsys):
+    assert call(capsys, "--version")[1] == f"guiderail {guiderail.__version__}\n"
+
+
+def test_any_option_of_an_environment_can_be_trained_with(capsys, tmp_path):
+    options = ["--env", "hold=3", "--env", "wall=0.75", "--episodes", 1, "--set", "units=8"]
+    assert call(capsys, "train", "Bead", "--out", tmp_path / "run", *options)[0] == 0
+    environment = RunFolder(tmp_path / "run").config().environment
+    assert (environment["hold"], environment["wall"]) == (3, 0.75)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e-8", 1e-8), ("[0, 1]", (0, 1)), ("[1e3, 2]", (1000.0, 2)), ("true", True), ("arm", "arm"), ("null", None)],
+)
+def test_values_are_read_as_what_they_are(text, value):
+    read = as_value(text)
+    assert (read, type(read)) == (value, type(value))
+
+
+def test_lists_can_be_read_by_a_program(capsys):
+    listed = json.loads(call(capsys, "list", "--json")[1])
+    assert {"tasks", "guidance", "learners", "presets", "studies", "figures"} <= listed.keys()
+    assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
+    assert json.loads(call(capsys, "list", "Bead", "--json")[1])["hold"] == 1
+    assert "ten in a row" in call(capsys, "list", "metrics")[1]
+
+
+def test_the_demonstration_stands_beside_the_policy(capsys, trained):
+    out = call(capsys, "evaluate", trained, "--episodes", 2)[1]
+    header, *lines = out.splitlines()
+    assert "demonstration alone" in header
+    for name in ("mean return", "collisions", "mean force", "peak force"):
+        (line,) = (line for line in lines if line.startswith(name + " "))
+        assert len(line.removeprefix(name).split()) == 2
+
+
+def test_stress_ends_with_what_it_found(capsys, tmp_path):
+    code, out, err = call(capsys, "stress", "NarrowPassage", "--episodes", 2, "--out", tmp_path / "table.csv")
+    assert code == 0
+    assert json.loads(out)["all"]["episodes"] == 2
+    assert "2 episodes" in err
+    assert (tmp_path / "table.csv").exists()
+
+
+def test_shipped_files_are_generated_as_they_are(capsys, tmp_path):
+    for what, folder in (("connector-objects", bnc_connector.FOLDER), ("clamp-objects", grid_clamp.FOLDER)):
+        assert call(capsys, "generate", what, "--out", tmp_path)[0] == 0
+        for path in tmp_path.iterdir():
+            assert path.read_bytes() == (folder / path.name).read_bytes(), path.name

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.image import imread
 from safetensors.numpy import load_file
@@ -10,14 +11,16 @@ from safetensors.numpy import load_file
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.check import check
-from guiderail.tools.episodes import make_environment, reset_held_out
-from guiderail.tools.evaluate import evaluate
-from guiderail.tools.record import record
-from guiderail.tools.replay import tube, write_replay
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.study import Job, run_jobs
-from guiderail.tools.train import train
-from guiderail.tools.training import configure
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.recording.record import record
+from guiderail.tools.rollouts.evaluate import evaluate
+from guiderail.tools.rollouts.rollout import reset_held_out
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.film import write_film
+from guiderail.tools.viewing.replay import default_page, tube, write_page
+from guiderail.tools.viewing.shown import Shown
 
 SETTINGS = {"units": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}
 
@@ -35,28 +38,23 @@ def trained(config, tmp_path_factory):
 
 
 def test_training_is_safe_from_the_first_episode_on(trained):
-    for row in trained.episodes():
-        assert row["success"] == 1
-        assert row["collisions"] == 0
-        assert row["worst_violation"] <= 1e-9
-        assert row["worst_measured_violation"] <= 1e-9
+    rows = trained.episodes()
+    assert (rows["success"] == 1).all()
+    assert (rows["collisions"] == 0).all()
+    assert rows[["worst_violation", "worst_measured_violation"]].to_numpy().max() <= 1e-9
 
 
 def test_a_rows_terms_add_up_to_its_return(trained):
-    for row in trained.episodes():
-        terms = sum(value for key, value in row.items() if key.startswith("reward_"))
-        assert row["return"] == pytest.approx(terms, rel=1e-9)
+    rows = trained.episodes()
+    np.testing.assert_allclose(rows["return"], rows.filter(like="reward_").sum(axis=1), rtol=1e-9)
 
 
 def test_a_resumed_simulation_goes_on_bit_for_bit(trained, config, tmp_path):
     resumed = RunFolder(tmp_path / "run")
     train(resumed, replace(config, episodes=2))
     train(resumed, config, resume=True)
-    first, second = (
-        [{k: v for k, v in row.items() if k != "wall_time"} for row in folder.episodes()]
-        for folder in (trained, resumed)
-    )
-    assert first == second
+    first, second = (folder.episodes().drop(columns="wall_time") for folder in (trained, resumed))
+    pd.testing.assert_frame_equal(first, second)
     a, b = (load_file(folder.path / "policy.safetensors") for folder in (trained, resumed))
     assert all(np.array_equal(a[key], b[key]) for key in a)
 
@@ -80,8 +78,9 @@ def test_held_out_starts_differ_from_those_of_training_and_from_each_other():
     np.testing.assert_array_equal(starts[0], starts[2])
 
 
-def test_the_replay_is_one_page_that_needs_nothing_else(trained, tmp_path):
-    page = write_replay(trained.path, tmp_path / "replay.html").read_text()
+def test_the_replay_is_one_page_that_needs_nothing_else(trained):
+    write_page(default_page(trained.path, {}), Shown.of_run(trained.path))
+    page = (trained.path / "replay.html").read_text()
     assert "the constraint" in page
     assert "demonstrations" in page
     assert "see through</button>" in page
@@ -89,16 +88,23 @@ def test_the_replay_is_one_page_that_needs_nothing_else(trained, tmp_path):
     assert "https://" not in page.partition("<body>")[0]
 
 
-def test_a_replay_comes_with_a_picture_and_only_on_stations_that_there_are(trained, tmp_path):
-    page, picture = tmp_path / "replay.html", tmp_path / "replay.png"
-    write_replay(trained.path, page, picture=picture)
+@pytest.mark.parametrize(("ending", "magic"), [(".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")])
+def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, ending, magic):
+    picture = tmp_path / f"film{ending}"
+    row = write_film(picture, Shown.of_run(trained.path))
+    assert row["success"]
+    assert picture.read_bytes().startswith(magic)
     image = imread(picture)
     assert image.shape[0] > 400
-    assert image[..., :3].std() > 0.05  # it is not blank
-    page.unlink()
-    with pytest.raises(InputError, match="no argument station"):
-        write_replay(trained.path, page, station="arm")
-    assert not page.exists()
+    assert image[..., :3].std() / image.max() > 0.05  # it is not blank
+
+
+def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
+    with pytest.raises(InputError, match="no option 'station'"):
+        write_page(tmp_path / "replay.html", Shown.of_run(trained.path, {"station": "arm"}))
+    with pytest.raises(InputError, match="a picture is"):
+        write_film(tmp_path / "film.gif", Shown.of_run(trained.path))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_policy_does_can_be_demonstrated_again(trained, tmp_path):
@@ -107,17 +113,6 @@ def test_what_a_policy_does_can_be_demonstrated_again(trained, tmp_path):
     assert check(file)["demonstrations"] == 2
     with pytest.raises(InputError, match="already exists"):
         record(trained.path, file, episodes=2)
-
-
-def test_a_study_keeps_finished_runs_and_refuses_other_ones(config, tmp_path):
-    short = replace(config, episodes=1)
-    jobs = [Job("skgrl", short, tmp_path / "run")]
-    first = run_jobs(jobs)
-    written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
-    assert run_jobs(jobs) == first
-    assert written == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
-    with pytest.raises(InputError, match="another seed"):
-        run_jobs([replace(jobs[0], config=replace(short, seed=2))])
 
 
 def test_a_tube_keeps_its_radius_along_the_path():

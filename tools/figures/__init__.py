@@ -1,33 +1,20 @@
 """Figures and a table of the thesis, made anew: each a picture and a table with the numbers behind it."""
 
 import inspect
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
 
-# Where each figure is made; imported when asked for, so that a list of figures costs nothing.
+# What makes each figure; imported when asked for, so that a list of figures costs nothing.
 FIGURES = {
-    "table 3.3": ("pouring", "table_3_3"),
-    "3.5": ("pouring", "figure_3_5"),
-    "3.6": ("pouring", "figure_3_6"),
-    "3.8": ("pouring", "figure_3_8"),
-    "3.10": ("grid_clamp", "figure_3_10"),
-    "3.11": ("grid_clamp", "figure_3_11"),
-    "4.2": ("properties", "figure_4_2"),
-    "4.4": ("baselines", "figure_4_4"),
-    "4.5": ("baselines", "figure_4_5"),
-    "4.6": ("baselines", "figure_4_6"),
-    "4.7": ("image", "figure_4_7"),
-    "4.8": ("connector", "figure_4_8"),
-    "5.2": ("smoothness", "figure_5_2"),
-    "5.4": ("perturbations", "figure_5_4"),
-    "5.5": ("smoothness", "figure_5_5"),
-    "5.6": ("learning", "figure_5_6"),
-    "5.8": ("connector", "figure_5_8"),
-    "5.9": ("connector", "figure_5_9"),
-    "5.10": ("connector", "figure_5_10"),
+    "table 3.3": "table_3_3",
+    **{f"3.{n}": f"figure_3_{n}" for n in (5, 6, 8, 10, 11)},
+    **{f"4.{n}": f"figure_4_{n}" for n in (2, 4, 5, 6, 7, 8)},
+    **{f"5.{n}": f"figure_5_{n}" for n in (2, 4, 5, 6, 8, 9, 10)},
 }
 
 
@@ -49,13 +36,18 @@ def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: 
     """
     number = figure.lower().removeprefix("figure").strip()
     if number not in FIGURES:
-        raise InputError(f"there is no figure {figure!r} to reproduce: choose one of {', '.join(FIGURES)}")
+        raise InputError(f"there is no figure {figure!r} to reproduce: {did_you_mean(number, FIGURES)}")
     if seeds < 1 or (episodes is not None and episodes < 1):
         raise InputError(f"a figure needs at least one seed and one episode, not {seeds} and {episodes}")
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file: name a folder with --out")
-    module, function = FIGURES[number]
-    make = getattr(import_module(f"guiderail.tools.figures.{module}"), function)
+    make = find_figure(number)
     given: dict[str, Any] = {"seeds": seeds, "episodes": episodes}
     taken = inspect.signature(make).parameters
     return {"figure": number} | make(out, **{k: v for k, v in given.items() if k in taken and v is not None})
+
+
+def find_figure(number: str) -> Callable[..., dict[str, Any]]:
+    """What makes a figure: a function of the module of its chapter."""
+    chapter = number.removeprefix("table ").split(".")[0]
+    return getattr(import_module(f"guiderail.tools.figures.chapter_{chapter}"), FIGURES[number])

@@ -1,72 +1,106 @@
-"""Runs that figures share: trained where they are not there yet, and drawn the same way everywhere."""
+"""What figures about learning share: their studies' runs, and how those are drawn."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
+import pandas as pd
+from matplotlib.figure import Figure
 
-from guiderail.tools.pictures import COLOURS, NAMES, draw_runs
-from guiderail.tools.run_folder import RunFolder
-from guiderail.tools.study import Job, run_jobs
-from guiderail.tools.training import configure
+from guiderail.tools.guidance import colour, label
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.studies.declaration import LearnerChoice, Method, Study, load_study
+from guiderail.tools.studies.study import each
+from guiderail.tools.tables import write_table
+from guiderail.tools.viewing.style import draw_runs, legend, new_figure, save_figure
 
 
-def train_all(
-    out: Path,
-    task: str,
-    guidance: Sequence[str],
+def figure_study(
+    name: str,
     *,
     seeds: int,
-    episodes: int,
-    preset: str,
-    environment: Mapping[str, Any],
-    evaluations: int = 0,
-) -> list[dict[str, Any]]:
-    """One row for each guidance and seed; `rows` in it are the run's episodes. Runs that are there are used again."""
-    jobs = []
-    for kind in guidance:
-        for seed in range(seeds):
-            arguments = {"guidance": kind, **environment}
-            config = configure(task, arguments, preset=preset, episodes=episodes, seed=seed)
-            words = [kind, *(f"{key}-{value}" for key, value in environment.items()), preset, str(episodes), str(seed)]
-            jobs.append(Job(kind, config, out / "runs" / task / "-".join(words), evaluations))
-    return [result | {"rows": RunFolder(result["folder"]).episodes()} for result in run_jobs(jobs)]
+    episodes: int | None = None,
+    methods: Sequence[str] | None = None,
+    judged: bool = True,
+    **changed: Any,
+) -> Study:
+    """A study that comes along, as a figure asks for it.
+
+    Args:
+        name: of the study.
+        seeds: how many, from the study's first.
+        episodes: of each run; the study's own number unless given.
+        methods: those of the study unless given; ones that it doesn't have are guidance of that name.
+        judged: whether its policies are judged.
+        changed: other fields.
+    """
+    study = load_study(name)
+    assert isinstance(study, Study)
+    first = study.seeds[0]
+    known = {m: study.methods.get(m, Method(env={"guidance": m})) for m in methods or study.methods}
+    if episodes is not None:
+        known = {m: one.model_copy(update={"learner": LearnerChoice()}) for m, one in known.items()}
+        changed["learner"] = changed.get("learner", study.learner).model_copy(update={"episodes": episodes})
+    changed |= {} if judged else {"judged_on": ()}
+    return study.model_copy(update={"methods": known, "seeds": tuple(range(first, first + seeds)), **changed})
 
 
-def runs_of(results: Sequence[Mapping[str, Any]], kind: str, column: str) -> list[list[float]]:
-    """A column of `episodes.csv` of every run of one guidance."""
-    return [[row[column] for row in result["rows"]] for result in results if result["name"] == kind]
+def episodes_of(rows: pd.DataFrame, method: str) -> list[pd.DataFrame]:
+    """The training episodes of every run of one method."""
+    return [RunFolder(Path(folder)).episodes() for folder in rows[rows["method"] == method]["folder"]]
 
 
-def mean_of_last(results: Sequence[Mapping[str, Any]], kind: str, column: str, episodes: int = 10) -> float:
+def mean_of_last(rows: pd.DataFrame, method: str, column: str, episodes: int = 10) -> float:
     """The mean over seeds and the last episodes."""
-    return float(np.mean([run[-episodes:] for run in runs_of(results, kind, column)]))
+    return float(np.mean([run[column].tail(episodes) for run in episodes_of(rows, method)]))
 
 
-def draw_learning(
-    axis: Axes,
-    results: Sequence[Mapping[str, Any]],
-    guidance: Sequence[str],
-    column: str,
-    label: str,
+def learning_curves(
+    rows: pd.DataFrame,
+    columns: Mapping[str, str],
+    shape: tuple[int, int],
+    size: tuple[float, float],
+    *,
+    lines: Mapping[str, tuple[str, str]] | None = None,
     window: int = 5,
-) -> None:
-    """One curve a guidance: the mean over seeds, with their range."""
-    for kind in guidance:
-        draw_runs(axis, runs_of(results, kind, column), colour=COLOURS[kind], label=NAMES[kind], window=window)
-    axis.set(xlabel="episode", ylabel=label)
+) -> tuple[Figure, np.ndarray]:
+    """A panel for each column of `episodes.csv` (name → label), a curve a method: the mean over seeds and their range.
+
+    Args:
+        rows: of the study.
+        columns: what is drawn.
+        shape: of the panels.
+        size: of the figure, inches.
+        lines: a label and a colour for each method; those of its guidance unless given.
+        window: episodes that a point averages.
+    """
+    lines = lines or {method: (label(method), colour(method)) for method in dict.fromkeys(rows["method"])}
+    figure, axes = new_figure(*shape, size)
+    runs = {method: episodes_of(rows, method) for method in lines}
+    for axis, (column, words) in zip(axes.flat, columns.items(), strict=True):
+        for method, (name, shade) in lines.items():
+            draw_runs(axis, [run[column] for run in runs[method]], colour=shade, label=name, window=window)
+        axis.set(xlabel="episode", ylabel=words)
+    if len(lines) > 1:
+        legend(figure, axes.flat[0])
+    return figure, axes
 
 
-def of_each_seed(rows: Sequence[Mapping[str, Any]], kind: str, column: str, form: str = "{}") -> str:
-    """A column of a table of every seed of a method: failures of single seeds are not averaged away."""
-    return ", ".join(
-        "never" if row[column] is None else form.format(row[column]) for row in rows if row["method"] == kind
-    )
+def leave(out: Path, name: str, figure: Figure, rows: Any) -> dict[str, Any]:
+    """Writes a figure's picture and the table behind it; says where."""
+    table = pd.DataFrame(rows, dtype=object).drop(columns="folder", errors="ignore")
+    return {
+        "picture": str(save_figure(figure, out / f"{name}.png")),
+        "table": str(write_table(out / name, table)),
+    }
 
 
-def table_row(result: Mapping[str, Any], **more: Any) -> dict[str, Any]:
-    """A run's row in a figure's table: everything of its summary, and what a figure adds."""
-    kept = {key: value for key, value in result.items() if key not in ("rows", "name", "folder")}
-    return {"method": result["name"], **kept, **more}
+def said(rows: pd.DataFrame, columns: Mapping[str, tuple[str, str]], names: Mapping[str, str] | None = None) -> dict:
+    """Each seed's own numbers: column → words and format; `names` are what to call the methods."""
+    found = {}
+    for method, group in rows.groupby("method", sort=False):
+        name = label(str(method)) if names is None else names[str(method)]
+        for column, (words, form) in columns.items():
+            found[f"{name}, {words}"] = each(group, column, form)
+    return found

@@ -15,7 +15,7 @@ from guiderail.diagrams.stations.hardware import HardwareStation, SimulatedIiwa,
 from guiderail.diagrams.stations.rails import RailsStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
 from guiderail.models.errors import InputError
-from guiderail.tools.simulate_iiwa import START
+from guiderail.tools.operate.serve_iiwa import START
 
 WORKCELL = BncWorkcell()
 
@@ -70,7 +70,8 @@ def test_follows_pushes_and_feels_over_messages():
 def test_two_processes_on_one_machine(monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "lcm")  # with a time to live of zero: no message leaves this machine
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
-    command = [sys.executable, "-m", "guiderail.tools.simulate_iiwa", "--url", url, "--seconds", "1.5"]
+    call = f"from guiderail.tools.command import main; main(['serve-iiwa', '--url', {url!r}, '--seconds', '1.5'])"
+    command = [sys.executable, "-c", call]
     with subprocess.Popen(command) as robot:
         lcm = DrakeLcm(url)
         station = HardwareStation(WORKCELL, lcm, robot_timeout=30.0)

@@ -12,9 +12,11 @@ from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
 from guiderail.models.units import MM
-from guiderail.tools.bnc_rule import reactive_rule
-from guiderail.tools.episodes import standing_still
-from guiderail.tools.judging import total, trials, worst
+from guiderail.tools.rollouts.evaluate import evaluate_policy
+from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.studies.scripted import reactive_rule
+
+NEW_RUN = {"new_run": True}  # every episode is a run of its own
 
 
 def play(env, policy, *, seed=None, options=None):
@@ -58,7 +60,7 @@ def test_spaces(skgrl):
 
 @pytest.mark.parametrize("offset", [(0.3, 0.0), (0.0, -0.3), (-0.2, 0.2)])
 def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
-    _, info, total, _ = play(kmp, standing_still(kmp), seed=0, options={"offset": np.array(offset) * MM})
+    _, info, total, _ = play(kmp, still(kmp), seed=0, options={"offset": np.array(offset) * MM})
     assert info["termination"] == "success"
     assert info["control_steps"] < NUM_STEPS
     assert total > 50.0
@@ -66,19 +68,19 @@ def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
 
 def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
     """On the whole at most one in five; here, none of three."""
-    assert total(trials(skgrl, standing_still(skgrl), 3), "success") == 0
+    assert evaluate_policy(skgrl, still(skgrl), episodes=3, options=NEW_RUN)["success"].sum() == 0
 
 
 def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
-    rows = trials(skgrl, reactive_rule, 3)
-    assert total(rows, "success") == 3
-    assert worst(rows, "worst_violation") <= 1e-9
+    rows = evaluate_policy(skgrl, reactive_rule, episodes=3, options=NEW_RUN)
+    assert rows["success"].sum() == 3
+    assert rows["worst_violation"].max() <= 1e-9
 
 
 def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
-    rows = trials(kgrl, reactive_rule, 3)
-    assert total(rows, "success") == 3
-    assert worst(rows, "worst_violation") <= 1e-9
+    rows = evaluate_policy(kgrl, reactive_rule, episodes=3, options=NEW_RUN)
+    assert rows["success"].sum() == 3
+    assert rows["worst_violation"].max() <= 1e-9
 
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
@@ -99,7 +101,7 @@ def test_half_a_turn_of_everything_is_the_same_task(kmp):
     across = signs < 0
     felt = []
     for side in (1.0, -1.0):
-        observations = play(kmp, standing_still(kmp), options={"offset": (side * 1.0 * MM, side * 0.5 * MM)})[3]
+        observations = play(kmp, still(kmp), options={"offset": (side * 1.0 * MM, side * 0.5 * MM)})[3]
         felt.append(observations[6:14].mean(axis=0))  # while the plug stands on the rim
     seen, other = felt[0], signs * felt[1]
     torques = slice(10, 12)

@@ -7,8 +7,8 @@ from guiderail.diagrams.make import make_env
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
-from guiderail.tools.bnc_rule import reactive_rule
-from guiderail.tools.judging import total, trials
+from guiderail.tools.rollouts.evaluate import evaluate_policy
+from guiderail.tools.studies.scripted import reactive_rule
 
 
 def drawn(uncertain, count, seed=0):
@@ -50,4 +50,4 @@ def test_the_plug_in_the_tool_is_tilted():
 
 def test_a_rule_that_feels_the_torque_locks_a_tilted_plug_too():
     env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", grasp_angle=1.0)
-    assert total(trials(env, reactive_rule, 4), "success") == 4
+    assert evaluate_policy(env, reactive_rule, episodes=4, options={"new_run": True})["success"].sum() == 4

@@ -13,8 +13,10 @@ from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
 from guiderail.models.units import MM
-from guiderail.tools.clamp_rule import STIFFNESS, searching_rule, straight_descent
-from guiderail.tools.judging import total, trials, worst
+from guiderail.tools.rollouts.evaluate import evaluate_policy
+from guiderail.tools.studies.scripted import STIFFNESS, searching_rule, straight_descent
+
+NEW_RUN = {"new_run": True}  # every episode is a run of its own
 
 GUIDANCE = ("sct", "residual", "none")
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -65,16 +67,16 @@ def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
 
 
 def test_the_straight_descent_mostly_fails_where_the_offset_is_drawn(env):
-    """Pushed with 12 N for the whole 10 s. `python -m guiderail.tools.clamp_rule --trials 50` asks more often."""
-    rows = trials(env, straight_descent, 3, seed=1)
-    assert total(rows, "success") == 0
-    assert worst(rows, "peak_force") < 1.2 * LEASH * STIFFNESS
+    """Pushed with 12 N for the whole 10 s."""
+    rows = evaluate_policy(env, straight_descent, episodes=3, seed=1, options=NEW_RUN)
+    assert rows["success"].sum() == 0
+    assert rows["peak_force"].max() < 1.2 * LEASH * STIFFNESS
 
 
 def test_the_searching_rule_inserts_where_the_straight_descent_fails(env):
-    rows = trials(env, searching_rule, 4, seed=1)
-    assert total(rows, "success") == 4
-    assert worst(rows, "peak_force") < 15.0
+    rows = evaluate_policy(env, searching_rule, episodes=4, seed=1, options=NEW_RUN)
+    assert rows["success"].sum() == 4
+    assert rows["peak_force"].max() < 15.0
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)

@@ -3,8 +3,8 @@ import numpy as np
 from guiderail.models.demonstrations import bnc_connector as demonstrations
 from guiderail.models.demonstrations.bnc_connector import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
 from guiderail.models.objects.bnc_connector import MM
-from guiderail.tools.record_bnc import TIMES as TIMES_RECORDED
-from guiderail.tools.record_bnc import record_one
+from guiderail.tools.recording.generate.bnc_connector import TIMES as TIMES_RECORDED
+from guiderail.tools.recording.generate.bnc_connector import record_one
 
 TIMES = 0.02 * np.arange(NUM_STEPS)
 

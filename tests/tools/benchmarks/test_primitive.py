@@ -1,0 +1,13 @@
+from guiderail.tools.benchmarks.primitive import REGIMES, SIZES, measure
+
+
+def test_reports_what_it_measured_and_every_command_kept_its_bound(monkeypatch):
+    monkeypatch.setattr("guiderail.tools.benchmarks.primitive.SIZES", SIZES[:1])
+    (parts,) = measure(steps=400).values()
+    assert set(parts["predict"]) == {*REGIMES, "together"}
+    for row in parts["predict"].values():
+        assert 0 < row["median_us"] <= row["p99_us"] <= row["worst_us"]
+        assert row["worst_violation"] <= 1e-9
+        assert row["difference_to_dense"] < 1e-3
+    assert parts["predict"]["slack"]["constrained"] == 0 < parts["predict"]["active"]["constrained"]
+    assert all(row["refused"] == 0 for row in parts["solvers"].values())

@@ -1,0 +1,53 @@
+"""The result of a run is an actor in the midst of success."""
+
+import torch
+
+from guiderail.tools.learning.checkpoint_selection import CheckpointSelection
+
+
+def lived(selection, outcomes, first=0, row=0):
+    """Greedy episodes with these outcomes, acted by actors whose one weight is the episode's number."""
+    for number, success in enumerate(outcomes, first):
+        actor = torch.nn.Linear(1, 1)
+        torch.nn.init.constant_(actor.weight, number)
+        selection.begin(actor, row)
+        selection.finish(success)
+        row = row + 1 if success else 0
+    return selection
+
+
+def selected(selection):
+    result = selection.result()
+    return None if result is None else int(result["weight"])
+
+
+def test_nothing_is_selected_without_successes_on_both_sides():
+    assert selected(lived(CheckpointSelection(3), [1])) is None
+    assert selected(lived(CheckpointSelection(3), [0, 1, 0, 1, 0])) is None
+    assert selected(lived(CheckpointSelection(3), [0, 1, 1])) == 2
+
+
+def test_the_midst_of_the_longest_row_is_selected():
+    #                                  0  1  2  3  4  5  6  7  8  9 10 11
+    assert selected(lived(CheckpointSelection(5), [0, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])) == 4
+    assert selected(lived(CheckpointSelection(5), [0, 1, 1, 0, 1, 1, 1, 1, 1])) == 7  # two on each side
+
+
+def test_a_short_row_later_does_not_replace_a_long_one():
+    # The actor of episode 9 was followed by six that succeeded, but nothing before it did.
+    assert selected(lived(CheckpointSelection(6), [1] * 8 + [0] + [1] * 6)) == 4
+
+
+def test_among_those_with_successes_enough_the_latest_counts():
+    assert selected(lived(CheckpointSelection(2), [1] * 9)) == 7
+    assert selected(lived(CheckpointSelection(2), [1] * 9 + [0])) == 7
+
+
+def test_goes_on_as_it_would_have():
+    first = lived(CheckpointSelection(3), [0, 1, 1, 0, 1])
+    second = CheckpointSelection(3)
+    second.restore(*first.state())
+    for one in (first, second):
+        lived(one, [1, 1, 1, 1, 1], first=5, row=1)
+    assert selected(first) == selected(second) == 7
+    assert first.state()[1] == second.state()[1]

@@ -1,0 +1,320 @@
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from stable_baselines3 import TD3
+
+from guiderail.diagrams.task import Symmetry
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.learner import LEARNERS, register_learner
+from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, policy_of
+from guiderail.tools.learning.presets import PRESETS, resolve_preset
+from guiderail.tools.rollouts.rollout import Decision
+
+
+class Spaces(gymnasium.Env):
+    observation_space = spaces.Box(-1, 1, (3,))
+    action_space = spaces.Box(-1, 1, (2,))
+
+
+SETTINGS = {"units": "8", "batch_size": 4, "learning_starts": 6, "train_every": 4, "gradient_steps": 2}
+
+
+@pytest.fixture
+def preset():
+    return resolve_preset("robust", "tqc", SETTINGS)
+
+
+def make(preset, hold=1, seed=0):
+    return LEARNERS.get(preset.algorithm)(preset, Spaces(), hold=hold, seed=seed, decisions=50)
+
+
+def decision(observation, action, reward, following, terminated=False, truncated=False):
+    return Decision(observation, action, reward, following, terminated, truncated, {})
+
+
+def live(learner, decisions, seed=0):
+    """So many decisions of random experience."""
+    random = np.random.default_rng(seed)
+    for _ in range(decisions):
+        observation, following = random.uniform(-1, 1, (2, 3)).astype(np.float32)
+        learner.remember(decision(observation, learner.act(observation), random.normal(), following))
+        learner.learn()
+
+
+def weights(learner):
+    return torch.nn.utils.parameters_to_vector(learner.model.actor.parameters()).detach().numpy().copy()
+
+
+def test_presets_are_the_tables_of_the_thesis():
+    simulation, robot = PRESETS["table_4_1_simulation"], PRESETS["table_4_1_robot"]
+    for table, tau, discount, entropy in ((simulation, 0.02, 0.99, "auto"), (robot, 0.01, 0.995, "auto_0.1")):
+        assert (table.learning_rate, table.train_every, table.gradient_steps) == (1e-3, 8, 8)
+        assert (table.soft_update, table.discount, table.entropy) == (tau, discount, entropy)
+        assert (table.batch_size, table.buffer_size, table.units) == (256, 10**6, (256, 256))
+    for name, rate, discount in (("table_3_2_iiwa", 8e-4, 0.95), ("table_3_2_sara", 1e-3, 0.98)):
+        table = PRESETS[name]
+        assert (table.learning_rate, table.discount, table.soft_update) == (rate, discount, 0.02)
+        assert (table.train_every, table.gradient_steps, table.learning_starts) == (8, 8, 1000)
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_makes_a_learner_of_every_algorithm(name, algorithm):
+    learner = make(replace(resolve_preset(name, algorithm), units=(4,)))
+    assert learner.act(np.zeros(3, np.float32)).shape == (2,)
+
+
+def test_a_longer_hold_discounts_a_decision_more(preset):
+    assert make(preset, hold=5).model.gamma == pytest.approx(make(preset).model.gamma ** 5)
+
+
+def test_the_pouring_tables_discount_a_decision_whatever_its_hold():
+    table = replace(resolve_preset("table_3_2_sara", "sac"), units=(4,))
+    assert make(table, hold=10).model.gamma == make(table, hold=1).model.gamma == 0.98
+
+
+def test_training_follows_the_count_of_decisions(preset):
+    learner = make(preset)
+    untrained = weights(learner)
+    live(learner, 7)
+    np.testing.assert_array_equal(weights(learner), untrained)
+    live(learner, 1)
+    assert not np.array_equal(weights(learner), untrained)
+    assert learner.model._n_updates == 2
+    live(learner, 12)
+    assert learner.model._n_updates == 8
+
+
+def test_the_averaged_actor_lags_behind_the_learning_one(preset):
+    learner = make(preset)
+    start = weights(learner)
+    live(learner, 40)
+    averaged = torch.nn.utils.parameters_to_vector(learner.averaged.parameters()).detach().numpy()
+    moved = np.linalg.norm(averaged - start)
+    assert 0 < moved < np.linalg.norm(weights(learner) - start)
+    assert learner.actor() is learner.averaged
+    plain = make(replace(preset, averaging=0.0))
+    assert plain.actor() is plain.model.actor
+
+
+def test_a_time_limit_is_no_end_of_the_task(preset):
+    learner = make(preset)
+    seen = np.zeros(3, np.float32)
+    for terminated, truncated in ((True, False), (False, True), (False, False)):
+        learner.remember(decision(seen, np.zeros(2), 0.0, seen, terminated, truncated))
+    buffer = learner.model.replay_buffer
+    bootstrapped = buffer.dones[:3, 0] * (1 - buffer.timeouts[:3, 0])
+    np.testing.assert_array_equal(bootstrapped, [1, 0, 0])
+
+
+def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
+    half_turn = Symmetry((-1.0, -1.0, 1.0), (-1.0, 1.0))
+    learner = TqcLearner(preset, Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
+    plain = TqcLearner(replace(preset, symmetry=False), Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
+    for one in (learner, plain):
+        one.remember(decision(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True))
+    buffer = learner.model.replay_buffer
+    assert (buffer.size(), plain.model.replay_buffer.n_envs, learner.decisions) == (1, 1, 1)
+    np.testing.assert_array_equal(buffer.observations[0], [[1, 2, 3], [-1, -2, 3]])
+    np.testing.assert_array_equal(buffer.next_observations[0], [[4, 5, 6], [-4, -5, 6]])
+    np.testing.assert_array_equal(buffer.actions[0], [[0.5, 0.25], [-0.5, 0.25]])
+    np.testing.assert_array_equal(buffer.rewards[0], [7, 7])
+    np.testing.assert_array_equal(buffer.dones[0], [1, 1])
+    live(learner, 49)  # and the buffer has room for all of it
+    assert (buffer.size(), buffer.full) == (50, False)
+
+
+def test_returns_of_several_steps_stop_where_an_episode_does(preset):
+    learner = make(replace(preset, n_steps=3, discount=0.5))
+    zero = np.zeros(3, np.float32)
+    for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
+        learner.remember(decision(zero, np.zeros(2), reward, zero, terminated))
+    samples = learner.model.replay_buffer._get_samples(np.arange(4))
+    np.testing.assert_allclose(samples.rewards[:, 0], [1 + 2 / 2, 2, 4 + 8 / 2 + 16 / 4, 8 + 16 / 2 + 32 / 4])
+    np.testing.assert_array_equal(samples.dones[:, 0], [1, 1, 0, 0])
+    np.testing.assert_allclose(samples.discounts[2:, 0], 0.125)
+
+
+def test_a_restored_learner_goes_on_as_the_first_would_have(preset):
+    first = make(preset)
+    live(first, 23)
+    arrays, values = (part.copy() for part in first.state())
+    arrays = {key: value.copy() for key, value in arrays.items()}
+    live(first, 17, seed=1)
+    expected = weights(first)
+    second = make(preset, seed=99)
+    second.restore(arrays, values)
+    live(second, 17, seed=1)
+    np.testing.assert_array_equal(weights(second), expected)
+
+
+def test_a_checkpoint_of_another_network_does_not_fit(preset):
+    arrays, values = make(preset).state()
+    with pytest.raises((KeyError, RuntimeError, ValueError)):
+        make(replace(preset, units=(16,))).restore(arrays, values)
+
+
+@pytest.mark.parametrize("settings", [{"discount": 1.5}, {"units": ""}, {"entropy": "much"}, {"batch_size": 2.5}])
+def test_refuses_what_no_learner_can_use(settings):
+    with pytest.raises(InputError):
+        resolve_preset("robust", "tqc", settings)
+
+
+def acted(learner, episodes, decisions=4):
+    """The actions of so many episodes at one and the same observation, (episodes, decisions, 2)."""
+    actions = []
+    for _ in range(episodes):
+        learner.begin()
+        actions.append([learner.act(np.ones(3, np.float32)) for _ in range(decisions)])
+    return np.array(actions)
+
+
+def test_constant_episodes_keep_to_one_action_each(preset):
+    actions = acted(make(replace(preset, constant_episodes=3)), 4)
+    assert (actions[:3] == actions[:3, :1]).all()
+    assert len(np.unique(actions[:3, 0], axis=0)) == 3
+    assert len(np.unique(actions[3], axis=0)) == 4
+
+
+def test_greedy_episodes_do_what_the_policy_would(preset):
+    learner = make(replace(preset, constant_episodes=0, greedy_share=0.5))
+    live(learner, 20)
+    explored, greedy = acted(learner, 2)
+    assert len(np.unique(explored, axis=0)) == 4
+    assert (greedy == greedy[0]).all()
+    policy = policy_of(learner.actor(), {"observation_shape": [3]})
+    np.testing.assert_allclose(greedy[0], policy(np.ones(3, np.float32)), atol=1e-6)
+
+
+def test_so_many_episodes_are_greedy_as_asked_for(preset):
+    for share in (0.0, 0.25, 0.75, 1.0):
+        learner = make(replace(preset, constant_episodes=0, greedy_share=share))
+        live(learner, 20)
+        greedy = [len(np.unique(actions, axis=0)) == 1 for actions in acted(learner, 8)]
+        assert sum(greedy) == 8 * share
+
+
+def test_no_episode_is_greedy_before_learning_has_begun(preset):
+    learner = make(replace(preset, constant_episodes=0, learning_starts=12, greedy_share=1.0, selection_window=3))
+    for begun in (False, False, True, True):  # an episode has eight decisions: the second is still an exploring one
+        learner.begin()
+        assert learner.has_begun() is begun
+        live(learner, 8)
+        learner.end({"success": 1})
+    assert learner.state()[1]["greedy_successes"] == 2
+
+
+def test_temporally_extended_actions_last_for_a_while_now_and_then(preset):
+    settled = replace(preset, constant_episodes=0, learning_starts=1, ez_greedy=0.2, ez_greedy_longest=5)
+    learner = make(settled)
+    live(learner, 20)
+    exploring = acted(learner, 1, decisions=400)[0]
+    repeated = (np.diff(exploring, axis=0) == 0.0).all(axis=1)
+    runs = [len(run) for run in "".join("r" if r else " " for r in repeated).split()]
+    assert max(runs) == settled.ez_greedy_longest - 1  # an action that lasts n decisions comes again n − 1 times
+    assert 0.2 < repeated.mean() < 0.5  # 0.2 begin and last 3 decisions on average: two of eight and a bit
+    greedy = make(replace(settled, greedy_share=1.0))
+    live(greedy, 20)
+    actions = acted(greedy, 1, decisions=50)[0]
+    assert (actions == actions[0]).all()
+
+
+def test_extended_actions_end_once_greedy_episodes_succeed_and_come_back_when_they_fail(preset):
+    settled = replace(
+        preset, constant_episodes=0, learning_starts=1, greedy_share=0.5, ez_greedy=1.0, ez_greedy_until=2
+    )
+    learner = make(settled)
+    live(learner, 20)
+    for success, extended in ((None, True), (True, True), (True, False), (True, False), (False, True)):
+        if success is not None:
+            learner.end({"success": int(success)})  # the greedy episode
+        again = make(settled, seed=9)
+        again.restore(*learner.state())
+        for one in (again, learner):
+            exploring = acted(one, 1, decisions=30)[0]
+            assert bool((np.diff(exploring, axis=0) == 0.0).all(axis=1).any()) is extended
+        learner.end({"success": 0})  # an exploring episode counts for nothing
+        learner.begin()
+
+
+def test_a_restored_learner_is_in_the_same_episode(preset):
+    first = make(replace(preset, constant_episodes=2, greedy_share=0.5))
+    live(first, 20)
+    acted(first, 3)
+    arrays, values = first.state()
+    arrays = {key: value.copy() for key, value in arrays.items()}
+    expected = acted(first, 3)
+    second = make(first.preset, seed=9)
+    second.restore(arrays, values)
+    np.testing.assert_array_equal(acted(second, 3), expected)
+
+
+def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
+    first = make(replace(preset, constant_episodes=0, greedy_share=1.0, selection_window=3, learning_starts=1))
+    greedy = []
+    for episode, success in enumerate([True, True, True, False]):
+        first.begin()
+        greedy.append(first.actor().state_dict()["mu.weight"].clone())
+        live(first, 8, seed=episode)
+        first.end({"success": int(success)})
+    arrays, values = first.state()
+    second = make(first.preset, seed=9)
+    second.restore({key: value.copy() for key, value in arrays.items()}, values)
+    for learner in (first, second):
+        torch.testing.assert_close(learner.result().state_dict()["mu.weight"], greedy[2], rtol=0, atol=0)
+    assert not torch.equal(greedy[2], first.actor().state_dict()["mu.weight"])
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"constant_episodes": -1},
+        {"greedy_share": 1.5},
+        {"selection_window": -1},
+        {"ez_greedy": 1.5},
+        {"ez_greedy_longest": 0},
+        {"ez_greedy_until": -1},
+    ],
+)
+def test_episodes_that_cannot_be_are_refused(settings):
+    with pytest.raises(InputError):
+        resolve_preset("robust", "tqc", settings)
+
+
+def test_a_setting_by_its_older_name_is_told_its_name():
+    with pytest.raises(InputError, match="'practise' is called 'greedy_share'"):
+        resolve_preset("robust", "tqc", {"practise": 0.5})
+
+
+def test_an_algorithm_more_is_one_class(monkeypatch):
+    """One that is deterministic and has no entropy, to be as unlike the others as it can be."""
+    monkeypatch.setattr(LEARNERS, "_entries", dict(LEARNERS._entries))
+
+    @register_learner("td3")
+    class Td3Learner(OffPolicyLearner):
+        algorithm = TD3
+
+        def explore(self, observation):
+            return np.clip(super().explore(observation) + 0.1 * self.random.standard_normal(2), -1, 1)
+
+    learner = make(resolve_preset("robust", "td3", SETTINGS))
+    live(learner, 24)
+    arrays, values = learner.state()
+    again = make(learner.preset, seed=9)
+    again.restore({key: value.copy() for key, value in arrays.items()}, values)
+    np.testing.assert_array_equal(weights(again), weights(learner))
+    policy, seen = learner.policy({"observation_shape": [3]}), np.full(3, 0.3, np.float32)
+    expected = learner.actor()._predict(torch.as_tensor(seen)[None]).detach().numpy()[0]
+    np.testing.assert_allclose(policy(seen), expected, atol=1e-6)
+    assert not np.array_equal(learner.explore(seen), learner.explore(seen))
+
+
+def test_a_network_that_a_policy_cannot_hold_is_refused(preset):
+    actor = make(preset).model.actor
+    actor.latent_pi[1] = torch.nn.GELU()
+    with pytest.raises(InputError, match="GELU"):
+        policy_of(actor, {"observation_shape": [3]})

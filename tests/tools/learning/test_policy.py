@@ -1,0 +1,86 @@
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from guiderail.models.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.off_policy import policy_of
+from guiderail.tools.learning.presets import resolve_preset
+
+
+class Spaces(gymnasium.Env):
+    """Nothing but the two spaces that a learner asks for."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+STATE = spaces.Box(-np.inf, np.inf, (5,))
+IMAGE = spaces.Box(0, 255, (22, 29, 3), np.uint8)
+
+
+@pytest.fixture(
+    params=[("tqc", STATE, 0), ("sac", STATE, 0), ("tqc", STATE, 1), ("tqc", IMAGE, 0)],
+    ids=["tqc", "sac", "normalized", "image"],
+)
+def learner(request):
+    algorithm, observation_space, layer_norm = request.param
+    env = Spaces(observation_space, spaces.Box(np.array([-1, -2]), np.array([1, 3]), dtype=np.float32))
+    return LEARNERS.get(algorithm)(
+        resolve_preset("robust", algorithm, {"units": "32,16", "layer_norm": layer_norm}),
+        env,
+        hold=1,
+        seed=3,
+        decisions=10,
+    )
+
+
+def test_does_what_stable_baselines_predicts(learner, tmp_path):
+    space = learner.model.actor.action_space
+    observations = [learner_observation(learner, seed) for seed in range(20)]
+    policy = policy_of(learner.model.actor, {"observation_shape": list(observations[0].shape)})
+    policy.save(tmp_path)
+    loaded = Policy.load(tmp_path)
+    for observation in observations:
+        expected, _ = learner.model.predict(observation, deterministic=True)
+        np.testing.assert_allclose(loaded(observation), expected, atol=2e-5 * (space.high - space.low).max())
+
+
+def learner_observation(learner, seed):
+    random = np.random.default_rng(seed)
+    if len(learner.model.observation_space.shape) == 3:
+        return random.integers(0, 256, IMAGE.shape, dtype=np.uint8)
+    return random.normal(scale=3, size=STATE.shape).astype(np.float32)
+
+
+def test_refuses_an_observation_of_another_shape(learner):
+    policy = policy_of(learner.model.actor, {"observation_shape": [5]})
+    with pytest.raises(ValueError, match="trained on observations"):
+        policy(np.zeros(4))
+
+
+def test_a_truncated_policy_is_refused_in_a_sentence(learner, tmp_path):
+    shape = list(learner_observation(learner, 0).shape)
+    policy_of(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+    weights = tmp_path / "policy.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-5])
+    with pytest.raises(InputError, match="damaged"):
+        Policy.load(tmp_path)
+
+
+def test_a_policy_with_an_unknown_activation_is_refused_in_a_sentence(learner, tmp_path):
+    shape = list(learner_observation(learner, 0).shape)
+    policy_of(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+    description = json.loads((tmp_path / "policy.json").read_text())
+    (tmp_path / "policy.json").write_text(json.dumps(description | {"activation": "gelu"}))
+    with pytest.raises(InputError, match="of another version"):
+        Policy.load(tmp_path)
+
+
+def test_a_missing_policy_is_refused_in_a_sentence(tmp_path):
+    with pytest.raises(InputError, match="holds no policy"):
+        Policy.load(tmp_path)

@@ -1,0 +1,70 @@
+from dataclasses import replace
+
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.presets import PRESETS
+from guiderail.tools.learning.run_folder import RunFolder
+
+
+def test_a_configuration_comes_back_as_it_was_written(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(bead_config)
+    assert folder.config() == bead_config
+
+
+def test_everything_that_decides_a_run_is_in_its_configuration(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(bead_config)
+    text = (tmp_path / "run" / "config.yaml").read_text()
+    for word in ("guidance: skgrl", "hold: 1", "learning_rate:", "seed: 5", "torch:", "drake:"):
+        assert word in text
+
+
+def test_a_setting_that_a_run_is_older_than_is_off_whatever_its_preset_says_now(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(replace(bead_config, preset="clamp", learner=PRESETS["clamp"]))
+    file = tmp_path / "run" / "config.yaml"
+    lines = [line for line in file.read_text().splitlines() if "ez_greedy_until" not in line]
+    file.write_text("\n".join(lines))
+    assert folder.config().learner == replace(PRESETS["clamp"], ez_greedy_until=0)
+
+
+OLD_NAMES = {
+    "constant_episodes": "steady_episodes",
+    "greedy_share": "practise",
+    "ez_greedy": "bursts",
+    "ez_greedy_longest": "longest_burst",
+    "ez_greedy_until": "bursts_until",
+    "selection_window": "proven_by",
+}
+
+
+def test_a_run_with_the_older_names_of_its_settings_is_read(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(replace(bead_config, preset="clamp", learner=PRESETS["clamp"]))
+    file = tmp_path / "run" / "config.yaml"
+    text = file.read_text()
+    for new, old in OLD_NAMES.items():
+        assert f"  {new}: " in text
+        text = text.replace(f"  {new}: ", f"  {old}: ")
+    file.write_text(text)
+    assert folder.config().learner == PRESETS["clamp"]
+
+
+def test_an_option_that_a_run_is_older_than_does_not_make_it_another(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    older = {key: value for key, value in bead_config.environment.items() if key != "observation"}
+    folder.create(replace(bead_config, environment=older))
+    folder.refuse_another(bead_config)
+    with pytest.raises(InputError, match="another environment"):
+        folder.refuse_another(replace(bead_config, environment=bead_config.environment | {"hold": 2}))
+
+
+def test_a_configuration_that_no_learner_can_use_is_refused(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(bead_config)
+    file = tmp_path / "run" / "config.yaml"
+    file.write_text(file.read_text().replace("batch_size: 16", "batch_size: -3"))
+    with pytest.raises(InputError):
+        folder.config()

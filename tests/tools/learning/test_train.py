@@ -1,0 +1,168 @@
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import threadpoolctl
+from safetensors.numpy import load_file
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.configure import configure, run, with_defaults
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.tasks import make_environment
+
+# Trains like the fixture's run, and says after each episode that it is over; then the parent pulls the plug.
+CHILD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import bead
+bead.register()
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.learning.configure import configure
+settings = dict(units="16", batch_size=16, learning_starts=10, gradient_steps=4)
+train(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
+      report=lambda row: print(row["episode"], flush=True))
+"""
+
+
+def without_clock(rows):
+    return pd.DataFrame(rows).drop(columns="wall_time").to_dict("records")
+
+
+def assert_same_run(first, second):
+    assert without_clock(first.episodes()) == without_clock(second.episodes())
+    a, b = load_file(first.path / "policy.safetensors"), load_file(second.path / "policy.safetensors")
+    assert a.keys() == b.keys()
+    for key in a:
+        np.testing.assert_array_equal(a[key], b[key])
+
+
+def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+    undisturbed, killed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "killed")
+    train(undisturbed, bead_config)
+    code = CHILD.format(tests=str(Path(__file__).parents[1]), out=str(killed.path))
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        for line in child.stdout:
+            if int(line) == 4:
+                os.kill(child.pid, signal.SIGKILL)
+                break
+    assert child.returncode == -signal.SIGKILL
+    assert not (killed.path / "policy.safetensors").exists()
+    train(killed, bead_config, resume=True)
+    assert_same_run(undisturbed, killed)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_another(bead_config, tmp_path):
+    folders = [RunFolder(tmp_path / name) for name in "abc"]
+    for folder, seed in zip(folders, (5, 5, 6), strict=True):
+        train(folder, replace(bead_config, seed=seed))
+    assert_same_run(folders[0], folders[1])
+    assert without_clock(folders[0].episodes()) != without_clock(folders[2].episodes())
+
+
+def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
+    long, extended = RunFolder(tmp_path / "long"), RunFolder(tmp_path / "extended")
+    train(long, bead_config)
+    train(extended, replace(bead_config, episodes=3))
+    train(extended, bead_config, resume=True)
+    assert_same_run(long, extended)
+    assert extended.config() == bead_config
+
+
+def test_a_run_never_replaces_another(bead_config, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="already exists"):
+        train(RunFolder(tmp_path), bead_config)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:-1000]),
+        lambda folder: folder.checkpoint.unlink(),
+        lambda folder: (folder.path / "episodes.csv").write_text("episode,success\n0,1\n"),
+        lambda folder: (folder.path / "config.yaml").write_text("task: [Bead\n"),
+        lambda folder: (folder.path / "config.yaml").write_text("task: Bead\nepisodes: many\n"),
+    ],
+    ids=["truncated checkpoint", "no checkpoint", "another table", "broken yaml", "incomplete yaml"],
+)
+def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, replace(bead_config, episodes=2))
+    damage(folder)
+    before = {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError):
+        run(None, folder.path, environment={}, episodes=4, resume=True)
+    assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+
+
+def test_a_run_killed_between_checkpoint_and_table_loses_nothing(bead_config, tmp_path):
+    whole, torn = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "torn")
+    train(whole, bead_config)
+    train(torn, replace(bead_config, episodes=4))
+    lines = (torn.path / "episodes.csv").read_text().splitlines(keepends=True)
+    (torn.path / "episodes.csv").write_text("".join(lines[:-1]))
+    train(torn, bead_config, resume=True)
+    assert_same_run(whole, torn)
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_again(bead_config, tmp_path):
+    whole, begun = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "begun")
+    train(whole, bead_config)
+    begun.create(bead_config)
+    train(begun, bead_config, resume=True)
+    assert_same_run(whole, begun)
+
+
+def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
+    train(RunFolder(tmp_path / "run"), replace(bead_config, episodes=2))
+    with pytest.raises(InputError, match="seed 5, not 7"):
+        run(None, tmp_path / "run", environment={}, seed=7, resume=True)
+    with pytest.raises(InputError, match="other learner settings"):
+        run(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
+
+
+def test_a_run_of_another_version_is_left_as_it_is(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    rows = train(folder, bead_config)
+    arrays, values = load_checkpoint(folder.checkpoint)
+    older = [{key: value for key, value in row.items() if key != "mean_force"} for row in rows]
+    save_checkpoint(folder.checkpoint, arrays, values | {"rows": older})
+    folder.write_episodes(older)
+    before = (folder.path / "episodes.csv").read_bytes()
+    with pytest.raises(InputError, match="another version"):
+        train(folder, replace(bead_config, episodes=9), resume=True)
+    assert (folder.path / "episodes.csv").read_bytes() == before
+
+
+def test_one_thread_does_the_sums():
+    threadpoolctl.threadpool_limits(2)
+    make_environment("Bead", {})
+    assert {pool["num_threads"] for pool in threadpoolctl.threadpool_info()} == {1}
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "algorithm"),
+    [("GridClamp", "clamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "robust", "tqc")],
+)
+def test_a_task_is_learned_as_it_was_measured_unless_told_otherwise(task, preset, algorithm):
+    environment, given = with_defaults(task, {}, {"seed": 3})
+    config = configure(task, environment, **given)
+    assert (config.preset, config.learner.algorithm, config.seed) == (preset, algorithm, 3)
+
+
+def test_a_learner_that_was_asked_for_is_taken_whole():
+    environment, given = with_defaults("GridClamp", {"guidance": "none"}, {"algorithm": "tqc"})
+    assert (environment, given) == ({"guidance": "none"}, {"algorithm": "tqc"})
+    assert configure("GridClamp", environment, **given).preset == "robust"

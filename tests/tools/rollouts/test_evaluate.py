@@ -1,0 +1,45 @@
+import numpy as np
+import pandas as pd
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.rollouts.evaluate import COMPARED, cached, evaluate, evaluate_policy
+from guiderail.tools.tasks import make_environment
+
+
+def test_every_episode_has_conditions_of_its_own_and_any_of_them_can_be_had_again():
+    env = make_environment("Bead", {})
+    four = evaluate_policy(env, lambda observation: np.zeros(2), episodes=4, seed=20)
+    assert four["return"].nunique() == 4
+    again = evaluate_policy(env, lambda observation: np.zeros(2), episodes=2, seed=22)
+    assert again["return"].tolist() == four["return"][2:].tolist()
+
+
+@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"episodes": 1, "seed": -1}, {"episodes": 1, "seed": 2**31}])
+def test_numbers_out_of_range_are_refused(wrong):
+    with pytest.raises(InputError):
+        evaluate_policy(make_environment("Bead", {}), lambda observation: np.zeros(2), **wrong)
+
+
+def test_what_is_known_is_not_evaluated_again(tmp_path):
+    asked = []
+
+    def evaluated():
+        asked.append(1)
+        return pd.DataFrame({"success": [1, 0], "return": [0.1 + 0.2, -np.inf]})
+
+    first, again = (cached(tmp_path / "rows.csv", evaluated) for _ in range(2))
+    pd.testing.assert_frame_equal(first, again)
+    assert len(asked) == 1
+
+
+def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_config, tmp_path):
+    train(RunFolder(tmp_path / "run"), bead_config)
+    result = evaluate(tmp_path / "run", episodes=3)
+    for name in COMPARED:
+        assert result[f"demonstration_{name}"] is not None, name
+    elsewhere = evaluate(tmp_path / "run", episodes=3, environment={"wall": -0.5})
+    assert elsewhere["success_rate"] == elsewhere["demonstration_success_rate"] == 0.0
+    assert elsewhere["mean_return"] != result["mean_return"]

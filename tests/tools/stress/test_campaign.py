@@ -1,0 +1,143 @@
+import gymnasium
+import numpy as np
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.tools.rollouts.rollout import Observer, rollout
+from guiderail.tools.stress import STRESSED, bnc_connector, narrow_passage
+from guiderail.tools.stress.campaign import ACTIONS, Campaign, Case, Finite, complaints, outcome, run_campaign, stress
+from guiderail.tools.tables import read_table
+from guiderail.tools.tasks import make_environment
+
+
+class Counter(Observer):
+    def __init__(self, env):
+        self.decisions = 0
+
+    def begin(self):
+        self.decisions = 0
+
+    def see(self, decision):
+        self.decisions += 1
+
+    def end(self, row):
+        return {"decisions": self.decisions}
+
+
+BEAD = Campaign("Bead", [Case("bead", {}, constrained=True)], {}, witness=Counter)
+
+
+def at_least(count):
+    return lambda rows: len(rows) >= count
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+def test_actions_are_within_limits_and_follow_from_the_seed(name):
+    observation = np.zeros(3)
+    first, second = (
+        np.array([act(observation) for _ in range(50)])
+        for act in (ACTIONS[name](np.random.default_rng(4), 2) for _ in range(2))
+    )
+    np.testing.assert_array_equal(first, second)
+    assert np.abs(first).max() <= 1.0
+    changes = np.any(np.diff(first, axis=0) != 0.0, axis=1).sum()
+    assert {"white": changes == 49, "held": changes == 4, "corners": 0 < changes < 20, "stuck": changes == 0}[name]
+
+
+def test_a_campaign_goes_on_where_it_was_stopped(tmp_path):
+    whole = run_campaign(BEAD, at_least(6), seed=3, out=tmp_path / "whole.csv")
+    table = tmp_path / "parts.csv"
+    run_campaign(BEAD, at_least(2), seed=3, out=table)
+    assert len(read_table(table)) == 2
+    run_campaign(BEAD, at_least(6), seed=3, out=table)
+    assert table.read_text() == (tmp_path / "whole.csv").read_text()
+    assert [row["seed"] for row in whole] == [3, 4, 5, 6, 7, 8]
+    assert {row["actions"] for row in whole} == set(ACTIONS)
+    with pytest.raises(InputError, match="another campaign"):
+        run_campaign(BEAD, at_least(6), seed=4, out=table)
+
+
+def test_a_witness_sees_every_decision_and_a_case_takes_further_options():
+    for hold in (1, 2):
+        row = run_campaign(BEAD, at_least(1), environment={"hold": hold})[0]
+        assert row["decisions"] == -(-row["steps"] // hold)
+
+
+def test_numbers_that_are_none_are_counted():
+    class Broken(gymnasium.Wrapper):
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return np.full_like(observation, np.nan), *rest
+
+    env = make_environment("Bead", {})
+    for made, count in ((env, 0), (Broken(env), 3)):
+        row = rollout(made, lambda observation: np.zeros(2), Finite(made), seed=0)
+        assert row["not_finite"] == count * row["steps"]
+
+
+SOUND = {
+    "case": "one",
+    "actions": "white",
+    "seed": 0,
+    "constrained": 1,
+    "termination": "success",
+    "steps": 3,
+    "not_finite": 0,
+    "fallbacks": 0,
+    "worst_violation": -0.1,
+    "collisions": 0,
+    "peak_force": 5.0,
+    "depth": 0.1,
+}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({}, []),
+        ({"termination": "simulation_failure"}, ["the simulation failed"]),
+        ({"not_finite": 2}, ["something was not finite"]),
+        ({"fallbacks": 1}, ["a prediction failed"]),
+        ({"worst_violation": 1e-6}, ["a command violated the constraints"]),
+        ({"worst_violation": float("nan")}, ["a command violated the constraints"]),
+        ({"worst_violation": 1e-6, "constrained": 0}, []),
+        ({"depth": 0.3}, ["depth beyond 0.2"]),
+    ],
+)
+def test_what_must_not_be_is_complained_about(wrong, words):
+    assert complaints(outcome([SOUND, SOUND | wrong]), {"depth": 0.2}) == words
+
+
+def test_the_connector_withstands_white_actions():
+    campaign = bnc_connector.campaign()
+    (case,) = (case for case in campaign.cases if case.name == "skgrl, disc, x, y")
+    one = Campaign(campaign.task, [case], campaign.limits, witness=campaign.witness)
+    (row,) = run_campaign(one, at_least(1))
+    assert complaints(outcome([row]), campaign.limits) == []
+    # They did touch: the surfaces gave way a little.
+    assert max(row["lug_impact_mm"], row["barrel_impact_mm"]) > 0.05
+    assert row["peak_force"] > 5.0
+
+
+def test_the_narrow_passage_withstands_actions_that_turn_and_actions_that_do_not():
+    found = stress("NarrowPassage", episodes=8, seed=5)
+    assert found["wrong"] == []
+    assert found["all"]["episodes"] == 8
+    assert set(found["cases"]) == {case.name for case in narrow_passage.campaign().cases}
+
+
+def test_pouring_withstands_somebody_with_shaking_hands():
+    found = stress("Pouring", episodes=1)
+    assert found["wrong"] == []
+    assert 0.0 <= found["all"]["early_tilt"] <= 1e-9
+
+
+@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"steps": 0}, {"seed": -1}])
+def test_nonsense_is_refused(wrong):
+    with pytest.raises(InputError):
+        stress("NarrowPassage", **wrong)
+
+
+def test_a_task_without_a_campaign_is_told_those_that_have_one():
+    with pytest.raises(InputError, match=", ".join(sorted(STRESSED))):
+        stress("Bead")

@@ -1,0 +1,246 @@
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.rollouts.evaluate import evaluate_policy
+from guiderail.tools.rollouts.metrics import STATISTICS
+from guiderail.tools.rollouts.null_policies import always
+from guiderail.tools.studies.declaration import JudgedOn, Smoothness, Study, load_study, shipped_studies
+from guiderail.tools.studies.study import Job, _check, each, ratio, run_study, study_command
+from guiderail.tools.tables import read_table
+from guiderail.tools.tasks import make_environment
+
+SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
+BEAD = {
+    "name": "beads",
+    "task": "Bead",
+    "learner": {"settings": SETTINGS},
+    "methods": {"learner": {}},
+    "seeds": [5, 6],
+    "marks": [2, 4],
+    "judged on": [{"episodes": 3}],
+}
+
+
+def study(**changed):
+    return Study.model_validate(BEAD | changed)
+
+
+def run(one, out):
+    return run_study(one, out, processes=1)
+
+
+def without_clock(rows):
+    return rows.drop(columns=["folder", "training_wall_time"]).to_dict("records")
+
+
+def written(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+def test_there_is_a_row_for_every_method_seed_mark_and_what_is_judged_on(tmp_path):
+    methods = {"learner": {}, "nothing": {"policy": "zero"}, "anything": {"policy": "white", "seeds": [9]}}
+    judged = [{"episodes": 2}, {"name": "far away", "episodes": 3, "env": {"wall": -0.5}}]
+    rows = run(study(methods=methods, **{"judged on": judged}), tmp_path)
+    expected = [
+        *(("learner", seed, mark, name) for seed in (5, 6) for mark in (2, 4) for name in ("held out", "far away")),
+        *(("nothing", seed, 0, name) for seed in (5, 6) for name in ("held out", "far away")),
+        *(("anything", 9, 0, name) for name in ("held out", "far away")),
+    ]
+    assert list(rows[["method", "seed", "mark", "judged_on"]].itertuples(index=False, name=None)) == expected
+    assert rows[rows["judged_on"] == "far away"]["success_rate"].eq(0).all()
+    assert rows[rows["judged_on"] == "far away"]["episodes"].eq(3).all()
+    assert rows[rows["method"] == "learner"]["training_episodes"].eq(rows["mark"][:8]).all()
+    assert rows[rows["method"] == "nothing"]["training_success_rate"].isna().all()
+
+
+def test_a_finished_study_is_not_touched_and_one_that_was_stopped_goes_on_to_the_same_rows(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    expected = run(study(), whole)
+    before = written(whole)
+    assert without_clock(run(study(), whole)) == without_clock(expected)
+    assert written(whole) == before
+    run(study(marks=[2], seeds=[5]), parts)
+    assert without_clock(run(study(), parts)) == without_clock(expected)
+
+
+def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
+    run(study(**{"judged on": []}), tmp_path)
+    late, expected = run(study(), tmp_path), run(study(), tmp_path / "other")
+    assert without_clock(late) == without_clock(expected)
+    for mark in (tmp_path / "learner-5" / "marks").iterdir():
+        for file in mark.iterdir():
+            file.unlink()
+        mark.rmdir()
+    with pytest.raises(InputError, match="its policy of then is gone"):
+        run(study(**{"judged on": [{"episodes": 4}]}), tmp_path)
+
+
+def test_other_episodes_of_the_same_name_are_not_taken_for_these(tmp_path):
+    methods = {"nothing": {"policy": "zero"}}
+    near, far = (
+        run(study(methods=methods, **{"judged on": [{"episodes": 3, "env": {"wall": wall}}]}), tmp_path)
+        for wall in (1.0, -0.5)
+    )
+    assert near["mean_return"].gt(far["mean_return"]).all()
+    other = run(study(methods={"nothing": {"policy": "constant"}}), tmp_path)
+    assert not other["mean_return"].isin(near["mean_return"]).any()
+
+
+def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_path):
+    run(study(seeds=[5], marks=[2]), tmp_path)
+    before = written(tmp_path)
+    with pytest.raises(InputError, match="another learner"):
+        run(study(learner={"settings": SETTINGS | {"batch_size": 8}}), tmp_path)
+    (tmp_path / "learner-6").mkdir()
+    (tmp_path / "learner-6" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="already exists"):
+        run(study(seeds=[6]), tmp_path)
+    assert before.items() <= written(tmp_path).items()
+
+
+def test_the_best_constant_is_the_best_of_its_grid(tmp_path):
+    rows = run(study(methods={"best": {"policy": "best_constant", "grid": [-1, 0, 1]}}, seeds=[1]), tmp_path)
+    tried = read_table(next((tmp_path / "best-1").glob("best_constant-*.csv")))
+    assert len(tried) == 9
+    assert tried[["action_0", "action_1"]].iloc[0].tolist() == [1.0, 1.0]  # up and to the right, where the goal is
+    assert tried["success_rate"].is_monotonic_decreasing
+    env = make_environment("Bead", {})
+    expected = evaluate_policy(env, always(env, np.array([1.0, 1.0])), episodes=3)
+    assert rows["mean_return"].tolist() == [expected["return"].mean()]
+
+
+def test_sampled_arguments_stay_in_their_range_and_change_every_few_episodes(tmp_path):
+    judged = [{"episodes": 5, "every": 2, "sampled": {"wall": [0.2, 0.3]}}]
+    run(study(methods={"nothing": {"policy": "zero"}}, seeds=[0], **{"judged on": judged}), tmp_path)
+    (file,) = (tmp_path / "nothing-0").glob("*.csv")
+    rows = read_table(file)
+    assert rows["episode"].tolist() == [0, 1, 2, 3, 4]
+    assert rows["wall"].between(0.2, 0.3).all()
+    assert [group["episode"].tolist() for _, group in rows.groupby("wall", sort=False)] == [[0, 1], [2, 3], [4]]
+
+
+def test_two_processes_find_what_one_does(tmp_path):
+    declared = Study.model_validate(
+        {
+            "name": "passage",
+            "task": "NarrowPassage",
+            "methods": {"nothing": {"policy": "zero"}, "anything": {"policy": "white"}},
+            "seeds": [0],
+            "judged on": [{"episodes": 1}],
+        }
+    )
+    one, two = (run_study(declared, tmp_path / str(n), processes=n).drop(columns="folder") for n in (1, 2))
+    pd.testing.assert_frame_equal(one, two)
+
+
+def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
+    one = study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], marks=[2])
+    result = study_command(one, tmp_path, processes=1)
+    rows = read_table(tmp_path / "beads.csv")
+    assert len(rows) == 2
+    said = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
+    assert result["learner after 2 episodes, held out, success of each seed"] == said
+    assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
+    err = capsys.readouterr().err
+    assert "1/2 learner, seed 5: held out" in err
+    assert "2/2 learner, seed 6: held out" in err
+
+
+def test_a_ratio_is_of_sums_and_a_number_that_never_was_says_so():
+    rows = pd.DataFrame({"method": ["a", "a", "b", "b"], "force": [1.0, 2.0, 4.0, 2.0], "after": [3, None, 1, 2]})
+    wanted = study(ratios=[{"of": "force", "method": "a", "against": "b"}]).ratios[0]
+    assert list(ratio(rows, wanted).values()) == ["0.25, 1.00", "0.50"]
+    assert ratio(rows[:2], wanted) == {}
+    assert each(rows[:2].astype(object), "after") == "3.0, never"
+
+
+WRONG = [
+    ({"methods": {}}, "methods"),
+    ({"seeds": []}, "seeds"),
+    ({"seeds": ["x"]}, "seeds"),
+    ({"marks": [0]}, "greater than or equal to 1"),
+    ({"marks": [], "learner": {}}, "how long does learner learn"),
+    ({"task": "Beat"}, "did you mean Bead"),
+    ({"tsak": "Bead"}, "did you mean task"),
+    ({"methods": {"learner": {"enf": {}}}}, "did you mean env"),
+    ({"methods": {"../up": {}}}, "should match pattern"),
+    ({"methods": {"one": {"policy": "magic"}}}, "no policy 'magic'"),
+    ({"methods": {"one": {"env": {"guidanse": "kmp"}}}}, "did you mean guidance"),
+    ({"learner": {"preset": "robst"}}, "did you mean robust"),
+    ({"learner": {"algorithm": "ppo"}}, "sac, tqc"),
+    ({"learner": {"settings": {"batchsize": 3}}}, "batch_size"),
+    ({"judged on": [{"episodes": 0}]}, "judged on"),
+    ({"judged on": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
+    ({"judged on": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
+    ({"statistics": ["sucess_rate"]}, "did you mean success_rate"),
+]
+
+
+@pytest.mark.parametrize(("changed", "words"), WRONG, ids=[words for _, words in WRONG])
+def test_what_makes_no_sense_is_one_sentence_and_nothing_is_written(changed, words, tmp_path):
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(BEAD | changed))
+    with pytest.raises(InputError) as refused:
+        run(load_study(tmp_path / "study.yaml"), tmp_path / "out")
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "\x00", "just words"])
+def test_what_is_no_study_is_one_sentence(text, tmp_path):
+    (tmp_path / "study.yaml").write_text(text)
+    with pytest.raises(InputError) as refused:
+        load_study(tmp_path / "study.yaml")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_study_is_named_by_its_file_or_by_its_name(tmp_path):
+    with pytest.raises(InputError, match="did you mean connector"):
+        load_study("conector")
+    with pytest.raises(InputError, match="there is no file"):
+        load_study(tmp_path / "none.yaml")
+    chosen = load_study("connector").only(["kgrl"], [1, 2])
+    assert (list(chosen.methods), chosen.seeds) == (["kgrl"], (1, 2))
+    with pytest.raises(InputError, match="did you mean kgrl"):
+        chosen.only(["kgrll"])
+
+
+@pytest.mark.parametrize("name", shipped_studies())
+def test_every_study_that_comes_along_makes_sense(name, tmp_path):
+    declared = load_study(name)
+    if isinstance(declared, Smoothness):
+        return
+    assert declared.name == name
+    for method in declared.methods:
+        _check(Job(declared, method, declared.seeds[0], tmp_path))
+    for wanted in declared.ratios:
+        assert wanted.of.removeprefix("training_") in STATISTICS
+        assert {wanted.method, wanted.against} <= declared.methods.keys()
+
+
+def test_a_person_pours_and_the_constraints_are_why(tmp_path):
+    declared = load_study("pouring_mugs").only(["person", "person_unconstrained"])
+    declared = declared.model_copy(update={"judged_on": (JudgedOn(episodes=2),)})
+    bound, free = run(declared, tmp_path).to_dict("records")
+    assert (bound["success_rate"], free["success_rate"]) == (1.0, 0.0)
+    assert bound["ended_in_spill"] + bound["ended_in_collision"] == 0
+    assert free["ended_in_spill"] + free["ended_in_collision"] == 2
+    assert bound["worst_violation"] <= 1e-9
+
+
+def test_a_policy_learns_on_rails_wherever_it_is_judged(tmp_path):
+    declared = load_study("connector_on_arm")
+    config = Job(declared, "skgrl", 30, tmp_path).config(80)
+    assert config.environment["station"] == "rails"
+    assert declared.judged_on[0].env == {"station": "arm"}
+
+
+def test_a_run_of_a_study_is_a_run(tmp_path):
+    run(study(seeds=[5]), tmp_path)
+    folder = RunFolder(tmp_path / "learner-5")
+    assert folder.config().episodes == 4
+    assert np.array_equal(folder.episodes()["episode"], range(4))

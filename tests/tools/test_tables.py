@@ -1,0 +1,44 @@
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.tools.tables import read_table, table_text, write_table
+
+
+def test_numbers_come_back_exactly(tmp_path):
+    rows = [{"a": 0.1 + 0.2, "b": 3, "c": "blocked", "d": -math.inf}, {"a": 1e-300, "b": -1, "c": "", "d": 2.0}]
+    (tmp_path / "t.csv").write_text(table_text(rows))
+    assert read_table(tmp_path / "t.csv").to_dict("records") == rows
+
+
+def test_every_number_comes_back_exactly(tmp_path):
+    numbers = np.random.default_rng(0).integers(0, 2**63, 2000, dtype=np.int64).view(float)
+    numbers = numbers[np.isfinite(numbers)]
+    (tmp_path / "t.csv").write_text(table_text(pd.DataFrame({"a": numbers})))
+    np.testing.assert_array_equal(read_table(tmp_path / "t.csv")["a"], numbers)
+
+
+def test_what_is_unknown_is_an_empty_cell_and_makes_no_number_of_words(tmp_path):
+    rows = [{"a": 3, "b": "kgrl, hold 1", "c": None}, {"a": None, "b": "nan", "c": None}]
+    assert table_text(rows) == 'a,b,c\n3,"kgrl, hold 1",\n,nan,\n'
+    (tmp_path / "t.csv").write_text(table_text(rows))
+    table = read_table(tmp_path / "t.csv")
+    assert table["b"].tolist() == ["kgrl, hold 1", "nan"]
+    assert table["a"][0] == 3
+    assert math.isnan(table["a"][1])
+
+
+@pytest.mark.parametrize("text", ["a,b\n1\n", "a,b\n1,2,3\n", ""])
+def test_a_torn_table_is_refused(tmp_path, text):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match="not a table"):
+        read_table(tmp_path / "t.csv")
+
+
+def test_the_readable_table_says_the_same(tmp_path):
+    markdown = write_table(tmp_path / "t", pd.DataFrame({"a_b": [0.123456, 2], "c": ["x", None]}).astype(object))
+    assert markdown.read_text().splitlines() == ["| a b | c |", "| --- | --- |", "| 0.1235 | x |", "| 2 | – |"]
+    assert read_table(tmp_path / "t.csv")["a_b"].tolist() == [0.123456, 2]

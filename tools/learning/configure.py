@@ -1,0 +1,137 @@
+"""`guiderail train`: what was typed becomes a checked configuration, and a run becomes a folder with its pictures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.defaults import DEFAULTS, own_defaults
+from guiderail.tools.learning.presets import resolve_preset
+from guiderail.tools.learning.progress import TrainingProgress
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
+from guiderail.tools.learning.train import train
+from guiderail.tools.rollouts.metrics import summary
+from guiderail.tools.tasks import check_environment, import_modules
+
+# What a finished run says about itself.
+SUMMARY = (
+    "episodes", "converged_after", "success_rate", "success_rate_last_10", "mean_return_last_10",
+    "worst_violation", "peak_force", "collisions", "wall_time",
+)  # fmt: skip
+
+
+def configure(
+    task: str,
+    environment: Mapping[str, Any],
+    *,
+    algorithm: str = DEFAULTS["algorithm"],
+    preset: str = DEFAULTS["preset"],
+    settings: Mapping[str, Any] | None = None,
+    episodes: int = DEFAULTS["episodes"],
+    seed: int = DEFAULTS["seed"],
+    imports: Sequence[str] = (),
+) -> RunConfig:
+    """A checked configuration with everything resolved.
+
+    Raises:
+        InputError: for an unknown name or a number out of range.
+    """
+    if episodes < 1:
+        raise InputError(f"a run needs at least one episode, not {episodes}")
+    if not 0 <= seed < 2**31:
+        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
+    learner = resolve_preset(preset, algorithm, settings)
+    resolved = check_environment(task, environment)
+    return RunConfig(
+        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports)
+    )
+
+
+def run(
+    task: str | None,
+    out: Path | None,
+    *,
+    environment: Mapping[str, Any],
+    algorithm: str | None = None,
+    preset: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    resume: bool = False,
+    imports: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
+
+    A run that goes on keeps its configuration; only more episodes may be asked for.
+
+    Returns:
+        What happened, in a few numbers.
+    """
+    if out is None:
+        raise InputError("where should the run go? name a folder with --out RUN")
+    folder = RunFolder(out)
+    imports = import_modules(imports)
+    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
+    given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
+    if resume:
+        config = _continued(folder, task, environment, given, settings)
+    elif task is None:
+        raise InputError("what should be learned? name a task, such as guiderail train NarrowPassage --out RUN")
+    else:
+        folder.refuse_existing()
+        config = configure(task, environment, settings=settings, imports=imports, **with_defaults(task, given))
+    with TrainingProgress(config.episodes, name=config.task) as progress:
+        rows = train(folder, config, resume=resume, report=progress.update)
+    return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
+
+
+def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """What was asked for, and for the rest the learner that this task was measured with.
+
+    Args:
+        task: its name.
+        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them.
+    """
+    learner = {} if given.keys() & {"algorithm", "preset"} else own_defaults(task)
+    return {**learner, **given}
+
+
+def finish(out: Path) -> dict[str, str]:
+    """Adds the pictures to a run that has its numbers; what cannot be drawn on this machine is said, not raised."""
+    from guiderail.tools.viewing.plot import plot_run
+    from guiderail.tools.viewing.replay import default_page, write_page
+    from guiderail.tools.viewing.shown import Shown
+
+    curve = str(plot_run(out))
+    try:
+        write_page(page := default_page(out, {}), Shown.of_run(out))
+        return {"curve": curve, "replay": str(page)}
+    except InputError as error:
+        return {"curve": curve, "replay": f"none: {error}"}
+
+
+def _continued(
+    folder: RunFolder,
+    task: str | None,
+    environment: Mapping[str, Any],
+    given: Mapping[str, Any],
+    settings: Mapping[str, Any] | None,
+) -> RunConfig:
+    """The configuration of the run that goes on; refuses what would make it another run."""
+    config = folder.config()
+    stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
+    stored |= config.environment
+    wanted = {**environment, **given} | ({} if task is None else {"task": task})
+    for key, value in wanted.items():
+        if key != "episodes" and stored.get(key) != value:
+            raise InputError(
+                f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train anew"
+            )
+    stored_learner = {key: value for key, value in asdict(config.learner).items() if key != "algorithm"}
+    learner = resolve_preset(config.preset, config.learner.algorithm, stored_learner | dict(settings or {}))
+    if learner != config.learner:
+        raise InputError(f"the run in {folder.path} has other learner settings: leave --set out, or train anew")
+    return replace(config, episodes=max(config.episodes, given.get("episodes", 0)))

@@ -1,0 +1,56 @@
+"""What training needs of a learner, and the learners by name."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.policy import Policy
+from guiderail.models.registry import Registry
+from guiderail.tools.rollouts.rollout import Observer
+
+
+class Learner(Observer, ABC):
+    """Acts in training episodes, and learns from what it sees of them as their observer."""
+
+    @abstractmethod
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """The action for an observation, in the units of the action space."""
+
+    @abstractmethod
+    def policy(self, description: Mapping[str, Any]) -> Policy:
+        """What a run leaves, as NumPy evaluates it; `description` is what else is known of it."""
+
+    @abstractmethod
+    def has_diverged(self) -> bool:
+        """Whether anything that it learned is not a finite number."""
+
+    @abstractmethod
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Between episodes: everything that the rest of a run depends on, as arrays by name and as what JSON holds."""
+
+    @abstractmethod
+    def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Becomes what it was when `state` was called. KeyError, ValueError or RuntimeError where it does not fit."""
+
+
+# An entry is called with a preset and an environment, and by name with `hold`, `seed`, `decisions` and `symmetry`.
+LEARNERS: Registry[Callable[..., Learner]] = Registry("algorithm", entry_points="guiderail.learners")
+register_learner = LEARNERS.register
+learner_names = LEARNERS.names
+
+
+# These import PyTorch, which takes seconds, when one is made.
+@register_learner("sac")
+def _sac(*given: Any, **named: Any) -> Learner:
+    from guiderail.tools.learning.off_policy import SacLearner
+
+    return SacLearner(*given, **named)
+
+
+@register_learner("tqc")
+def _tqc(*given: Any, **named: Any) -> Learner:
+    from guiderail.tools.learning.off_policy import TqcLearner
+
+    return TqcLearner(*given, **named)

@@ -1,0 +1,138 @@
+"""What a run leaves behind: one folder, readable without the program that wrote it."""
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, field, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import pandas as pd
+import yaml
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from guiderail.models.errors import InputError
+from guiderail.tools.files import write_atomically
+from guiderail.tools.learning import older
+from guiderail.tools.learning.presets import Preset
+from guiderail.tools.tables import read_table, table_text
+from guiderail.tools.tasks import check_environment, import_modules
+
+PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides how a run goes, resolved: the same file gives the same run."""
+
+    task: str
+    environment: dict[str, Any]  # arguments of gymnasium.make
+    learner: Preset
+    preset: str  # the learner's settings started from it
+    episodes: Annotated[int, Field(ge=1)]
+    seed: Annotated[int, Field(ge=0)]
+    versions: dict[str, str] = field(default_factory=dict)
+    imports: tuple[str, ...] = ()  # modules or files that register what is used here
+
+    @property
+    def hold(self) -> int:
+        """Control steps that an action lasts."""
+        return int(self.environment.get("hold", 1))
+
+
+def installed_versions() -> dict[str, str]:
+    """The versions that a result depends on."""
+    return {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
+
+
+class RunFolder:
+    """The files of one run.
+
+    `config.yaml` is there from the start, `episodes.csv` and `checkpoint/` grow together at the end of an episode, the
+    rest is written when the run ends. Every file is replaced whole.
+    """
+
+    def __init__(self, path: Path | str):
+        """
+        Args:
+            path: the folder; it need not exist.
+        """
+        self.path = Path(path)
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file that `--resume` goes on from."""
+        return self.path / "checkpoint" / "state.safetensors"
+
+    def create(self, config: RunConfig) -> None:
+        """Starts a run.
+
+        Raises:
+            InputError: if the folder holds something already.
+        """
+        self.refuse_existing()
+        self.write_config(config)
+
+    def refuse_existing(self) -> None:
+        """Raises an InputError if the folder holds something already."""
+        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            raise InputError(f"{self.path} already exists: name another folder, or go on with that run by --resume")
+
+    def refuse_another(self, wanted: RunConfig, also: Sequence[str] = ()) -> None:
+        """A run with other settings is neither trained further nor judged as if it were this one.
+
+        Raises:
+            InputError: if task, environment, learner, seed or one of `also` differs.
+        """
+        found = self.config()
+        # An option that a run is older than had its default then.
+        found = replace(found, environment=as_arguments(check_environment(found.task, found.environment)))
+        for key in ("task", "environment", "learner", "seed", *also):
+            if getattr(found, key) != getattr(wanted, key):
+                raise InputError(f"{self.path} holds a run with another {key}: name another folder with --out")
+
+    def write_config(self, config: RunConfig) -> None:
+        """Replaces `config.yaml`."""
+        values = asdict(config) | {"learner": asdict(config.learner) | {"units": list(config.learner.units)}}
+        values["imports"] = list(config.imports)
+        write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
+
+    def config(self) -> RunConfig:
+        """The configuration that the run was started with.
+
+        Raises:
+            InputError: if this is no run, or its configuration makes no sense.
+        """
+        file = self.path / "config.yaml"
+        if not file.is_file():
+            raise InputError(
+                f"{self.path} is not a run: it has no config.yaml; give a folder that guiderail train made"
+            )
+        try:
+            values = yaml.safe_load(file.read_text(encoding="utf-8"))
+            # A setting that did not exist yet was off, as its default is, whatever the preset has become since.
+            values["learner"] = Preset(**(asdict(Preset()) | older.settings(values["learner"])))
+            values["environment"] = as_arguments(values["environment"])
+            config = RunConfig(**values)
+        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{file} is damaged or of another version: restore it, or train anew") from error
+        import_modules(config.imports)
+        return config
+
+    def write_episodes(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Replaces `episodes.csv`. Numbers are written so that reading them gives the same number."""
+        write_atomically(self.path / "episodes.csv", table_text(rows).encode())
+
+    def episodes(self) -> pd.DataFrame:
+        """The table `episodes.csv`.
+
+        Raises:
+            InputError: if the file is missing or no such table.
+        """
+        return read_table(self.path / "episodes.csv")
+
+
+def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """An environment's arguments as they are passed: YAML knows lists only, arguments are tuples."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in dict(environment).items()}

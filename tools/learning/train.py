@@ -1,0 +1,109 @@
+"""Training: one page, from a configuration to a run folder. Everything else that `guiderail train` does is a call."""
+
+import time
+from collections.abc import Callable
+from typing import Any, cast
+
+import torch
+
+from guiderail.models.errors import InputError
+from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.learner import LEARNERS, Learner
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.rollouts.rollout import rollout
+from guiderail.tools.tables import table_text
+from guiderail.tools.tasks import make_environment
+
+# Checkpoints cost at most this part of the time: small ones are written after every episode, a large one now and then.
+CHECKPOINT_SHARE = 0.05
+
+
+def train(
+    folder: RunFolder,
+    config: RunConfig,
+    *,
+    resume: bool = False,
+    report: Callable[[dict[str, Any]], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Trains a run to its last episode and writes its folder.
+
+    A run that was killed and resumed gives bit for bit what it would have given undisturbed: a checkpoint is taken at
+    an episode's end and holds every number and every random generator that the rest depends on.
+
+    Args:
+        folder: where it is written; with `resume`, where it goes on.
+        config: the run. The folder's own configuration must agree with it when it goes on.
+        report: called with each episode's row.
+
+    Returns:
+        The rows of `episodes.csv`.
+    """
+    torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
+    env = make_environment(config.task, config.environment)
+    task = cast(Any, env.unwrapped).task
+    decisions = config.episodes * -(-task.num_steps // config.hold)  # the most that the run can take
+    make_learner = LEARNERS.get(config.learner.algorithm)
+    learner = make_learner(
+        config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=task.symmetry
+    )
+    env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
+    if resume:
+        rows = _resume(folder, learner, env)
+        folder.write_config(config)
+    else:
+        rows = []
+        folder.create(config)
+
+    spent_training, spent_saving = 0.0, 0.0
+    for episode in range(len(rows), config.episodes):
+        started = time.perf_counter()
+        row = rollout(env, learner.act, learner, index=episode)
+        if learner.has_diverged():
+            raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
+        row["wall_time"] = time.perf_counter() - started
+        if rows and rows[0].keys() != row.keys():
+            raise InputError(
+                f"the run in {folder.path} was begun by another version of guiderail, whose episodes have other "
+                "numbers: go on with that one, or train anew"
+            )
+        rows.append(row)
+        spent_training += time.perf_counter() - started
+        if report is not None:
+            report(rows[-1])
+        if spent_saving <= CHECKPOINT_SHARE * spent_training or episode + 1 == config.episodes:
+            started = time.perf_counter()
+            _save(folder, rows, learner, env)
+            spent_saving += time.perf_counter() - started
+    policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
+    policy.save(folder.path, write=write_atomically)
+    env.close()
+    return rows
+
+
+def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any) -> None:
+    """The checkpoint first: it holds the table too, and whoever is killed between the two loses nothing."""
+    arrays, values = learner.state()
+    generator = env.unwrapped.np_random.bit_generator.state
+    save_checkpoint(folder.checkpoint, arrays, {"rows": rows, "learner": values, "environment": generator})
+    folder.write_episodes(rows)
+
+
+def _resume(folder: RunFolder, learner: Learner, env: Any) -> list[dict[str, Any]]:
+    """Puts learner and environment back to the last checkpoint; returns the rows up to it."""
+    table = folder.path / "episodes.csv"
+    if not folder.checkpoint.exists() and not table.exists():
+        return []  # it was killed in its first episode
+    arrays, values = load_checkpoint(folder.checkpoint)
+    rows = values["rows"]
+    written = folder.episodes() if table.exists() else []
+    if table_text(written) != table_text(rows[: len(written)]):
+        raise InputError(f"{table} is not the table of its checkpoint: restore it, or remove it to have it rewritten")
+    try:
+        learner.restore(arrays, values["learner"])
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
+        ) from error
+    env.unwrapped.np_random.bit_generator.state = values["environment"]
+    return rows

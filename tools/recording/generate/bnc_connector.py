@@ -1,0 +1,74 @@
+"""Records the BNC connector's demonstrations in simulation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.recording import drive_along
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.rails import RailsStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
+from guiderail.models.demonstrations.bnc_connector import (
+    NAMES,
+    NUM_STEPS,
+    PATH,
+    demonstrator_motions,
+)
+from guiderail.models.errors import InputError
+from guiderail.systems.recorder import Recording
+
+TIMES = CONTROL_PERIOD * np.arange(NUM_STEPS + 1)
+
+
+def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
+    """One motion (N, 6) through the rails' impedance, and whether the plug was locked in the end."""
+    workcell = BncWorkcell()
+    driven, recording = drive_along(RailsStation(workcell), TIMES, motion)
+    return recording, workcell.is_locked(workcell.plug_in_locked_frame(driven.station.plant, driven.plant_context))
+
+
+def record_session(seed: int) -> list[Recording] | None:
+    """All demonstrations of a session; None if one of them doesn't end locked."""
+    recordings = []
+    for motion in demonstrator_motions(seed, TIMES):
+        recording, is_locked = record_one(motion)
+        if not is_locked:
+            return None
+        recordings.append(recording)
+    return recordings
+
+
+def record(seeds: range) -> dict[str, np.ndarray]:
+    """The arrays of the demonstrations' file: the first session in which every demonstration ends locked."""
+    for seed in seeds:
+        recordings = record_session(seed)
+        if recordings is not None:
+            break
+    else:
+        raise InputError(f"no session of the seeds {seeds} ends locked every time: give more seeds")
+
+    def stacked(name: str) -> np.ndarray:
+        return np.stack([recording[name] for recording in recordings])
+
+    return {
+        "times": recordings[0].times,
+        "outputs": stacked("desired_pose"),
+        "names": np.array(NAMES),
+        # What was measured is kept to single precision: a nanometre.
+        "measured": stacked("pose").astype(np.float32),
+        "wrench": stacked("wrench").astype(np.float32),
+        "contact_force": stacked("contact_force")[..., 0].astype(np.float32),
+        "seed": np.array(seed),
+        "stiffness": np.array(Impedance().stiffness),
+        "frame": np.array("T: the locked plug on the nominal jack; [x y z Rz Ry Rx], R = Rz Ry Rx"),
+        "source": np.array("scripted demonstrator on the rails station, through its impedance; outputs are commands"),
+    }
+
+
+def main(folder: Path = PATH.parent) -> None:
+    """Writes the file."""
+    arrays: dict[str, Any] = record(range(100))
+    np.savez_compressed(folder / PATH.name, **arrays)

@@ -1,0 +1,130 @@
+"""`guiderail evaluate`: what a policy achieves on held-out conditions, beside the demonstration alone."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pandas as pd
+from rich.console import Console
+from rich.progress import track
+
+from guiderail.models.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.files import write_atomically
+from guiderail.tools.guidance import is_demonstrated
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.rollouts.metrics import converged_after, summary
+from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.tables import read_table, table_text
+from guiderail.tools.tasks import make_environment
+
+HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
+COMPARED = (
+    "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "worst_violation",
+    "worst_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
+)  # fmt: skip
+
+
+def evaluate_policy(
+    env: gymnasium.Env,
+    act: Act,
+    *,
+    episodes: int,
+    seed: int = HELD_OUT_SEED,
+    options: Mapping[str, Any] | None = None,
+    words: str = "",
+) -> pd.DataFrame:
+    """Rows of held-out episodes; episode i has seed + i.
+
+    Args:
+        env: the environment; what is hidden in a run stays what it is, unless the reset option `new_run` is given.
+        act: the policy.
+        episodes: how many.
+        seed: of the first.
+        options: further ones of the resets.
+        words: what a progress bar on a terminal says; without them there is none.
+
+    Raises:
+        InputError: for a number out of range.
+    """
+    if episodes < 1:
+        raise InputError(f"an evaluation needs at least one episode, not {episodes}")
+    if not 0 <= seed < 2**31:
+        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
+    console = Console(stderr=True)
+    shown = words and console.is_terminal
+    indices = track(range(episodes), words, console=console, transient=True, disable=not shown)
+    return pd.DataFrame([rollout(env, act, index=i, seed=seed + i, held_out=True, options=options) for i in indices])
+
+
+def evaluate_run(
+    config: RunConfig,
+    policy: Callable[[gymnasium.Env], Act],
+    environment: Mapping[str, Any] | None = None,
+    **how: Any,
+) -> pd.DataFrame:
+    """Rows of held-out episodes of a run's environment, or of one with other arguments.
+
+    What is hidden and constant in the run is what it was in training. `policy` is what acts, for an environment; `how`
+    are arguments of `evaluate_policy`.
+    """
+    env = make_environment(config.task, config.environment if environment is None else environment)
+    try:
+        env.reset(seed=config.seed)
+        return evaluate_policy(env, policy(env), **how)
+    finally:
+        env.close()
+
+
+def cached(file: Path, evaluated: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+    """The rows in a file; where there is none yet, those that come of evaluating, and then they are in it."""
+    if not file.exists():
+        rows = evaluated()
+        if not len(rows):
+            return rows
+        write_atomically(file, table_text(rows).encode())
+    return read_table(file)
+
+
+def evaluate(
+    run: Path,
+    *,
+    episodes: int = 100,
+    seed: int = HELD_OUT_SEED,
+    environment: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Evaluates the policy that a run left.
+
+    Args:
+        run: the run's folder.
+        episodes: how many, each with held-out initial conditions and offsets.
+        seed: of the first; the policy and the demonstration meet the same ones.
+        environment: arguments of the environment that are other ones than where it learned, such as the station.
+
+    Returns:
+        The statistics `COMPARED`, each also as `demonstration_<name>` (the same episodes before anything was learned;
+        None where guidance has no demonstration); `episodes` and `seed`; `converged_after` and `trained_episodes` of
+        the training.
+
+    Raises:
+        InputError: if there is no trained run, or a number is out of range.
+    """
+    folder = RunFolder(run)
+    config, policy, trained = folder.config(), Policy.load(folder.path), folder.episodes()
+    where = config.environment | dict(environment or {})
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed}
+    rows = evaluate_run(config, lambda env: policy, where, words="held-out episodes", **how)
+    alone = pd.DataFrame()
+    if is_demonstrated(where.get("guidance")):
+        alone = evaluate_run(config, still, where, words="demonstration alone", **how)
+    result: dict[str, Any] = {}
+    for name in COMPARED:
+        result |= summary(rows, [name]) | summary(alone, [name], "demonstration_")
+    return result | {
+        "episodes": episodes,
+        "seed": seed,
+        "converged_after": converged_after(trained),
+        "trained_episodes": len(trained),
+    }

@@ -1,0 +1,192 @@
+"""What is measured, each number once: the columns of an episode's row, and the statistics of many episodes.
+
+Everything comes from the trace and the safety ledger, which know every control step and not only the last of a
+decision. `guiderail list metrics` prints the definitions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from guiderail.diagrams.trace import Trace, mean_jerk
+
+TOLERANCE = 1e-9  # what a primitive keeps its bounds to; below it there is only rounding
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An episode that is over."""
+
+    index: int
+    trace: Trace  # every control step
+    ledger: Mapping[str, float]  # the safety ledger's row
+    total: float  # of the rewards
+    terms: Mapping[str, float]  # the sum of each of the reward's terms
+    success: bool
+    termination: str
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A number with a name, a unit, a definition in words, and what computes it."""
+
+    name: str
+    unit: str
+    words: str
+    of: Callable[[Any], Any]
+
+
+def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
+    """Mean jerk of positions (n, ≤ 3) and, in a pose of six numbers, of rotations [1/s³ of their units]."""
+    poses = np.array(poses)
+    angular = mean_jerk(poses[:, 3:], period) if poses.shape[1] == 6 else 0.0
+    return {"linear": mean_jerk(poses[:, :3], period), "angular": angular}
+
+
+def _jerk(which: str, part: str) -> Callable[[Episode], float]:
+    return lambda e: jerk(getattr(e.trace, which), e.trace.period)[part]
+
+
+def _ledger(name: str) -> Callable[[Episode], float]:
+    return lambda e: float(e.ledger[name])
+
+
+def _count(name: str) -> Callable[[Episode], int]:
+    return lambda e: int(e.ledger.get(name, 0))
+
+
+def _squared_force(e: Episode) -> float:
+    return float(np.mean(np.asarray(e.trace.force) ** 2)) if len(e.trace) else 0.0
+
+
+STEPS, SLACK = "control steps", "the constraint's, negative is slack"
+ENDINGS = "success, collision, spill, blocked, violation, time_limit or simulation_failure"
+
+COLUMNS = (
+    Metric("episode", "", "number of the episode, from 0", lambda e: e.index),
+    Metric("return", "reward", "sum of all rewards, undiscounted", lambda e: e.total),
+    Metric("success", "", "1 if the task was done", lambda e: int(e.success)),
+    Metric("termination", "", f"how it ended: {ENDINGS}", lambda e: e.termination),
+    Metric("steps", STEPS, "how long it took", lambda e: len(e.trace)),
+    Metric("peak_force", "N", "largest contact force of any control step", _ledger("peak_force")),
+    Metric("mean_force", "N", "contact force, mean over control steps", _ledger("mean_force")),
+    Metric("mean_squared_force", "N²", "squared contact force, mean over control steps", _squared_force),
+    *(
+        Metric(f"jerk_{which}_{part}", unit, f"third derivative of the {which} {of}, mean norm", _jerk(which, part))
+        for which in ("commanded", "measured")
+        for part, of, unit in (("linear", "position", "m/s³"), ("angular", "orientation (0 without one)", "rad/s³"))
+    ),
+    Metric("worst_violation", SLACK, "how far any command was outside", _ledger("worst_commanded_violation")),
+    Metric("worst_measured_violation", SLACK, "the same of measured poses", _ledger("worst_measured_violation")),
+    Metric("collisions", "", "collisions that began, by the safety ledger, however long", _count("collisions")),
+    Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
+    Metric("saturations", STEPS, "control steps with an actuator at its limit", _count("saturations")),
+    Metric("fallbacks", STEPS, "control steps that repeated the last safe command", _count("fallbacks")),
+)
+
+
+def episode_row(episode: Episode) -> dict[str, Any]:
+    """An episode's row: every column, and each of the reward's terms as `reward_<term>`."""
+    row = {column.name: column.of(episode) for column in COLUMNS}
+    return row | {f"reward_{name}": value for name, value in episode.terms.items()}
+
+
+def first_in_a_row(good: Iterable[bool], number: int) -> int | None:
+    """How many come before the first so many good ones in a row, those not counted; None if there are none."""
+    run = 0
+    for index, one in enumerate(good):
+        run = run + 1 if one else 0
+        if run == number:
+            return index + 1 - number
+    return None
+
+
+def converged_after(rows: pd.DataFrame) -> int | None:
+    """Episodes before the first ten in a row that succeed, those ten not counted (the thesis's figure 3.8)."""
+    return first_in_a_row(rows["success"] == 1, 10)
+
+
+def avoids_obstacle_from(rows: pd.DataFrame, cost: float = 1.0, in_a_row: int = 5) -> int | None:
+    """The first episode, from 1, from which the obstacle costs less than 1 for five in a row.
+
+    A path through its middle costs about a hundred; a policy that explores brushes its margin now and then.
+    """
+    before = first_in_a_row(rows["reward_obstacle_cost"] > -cost, in_a_row)
+    return None if before is None else before + 1
+
+
+def _mean(column: str, of: slice = slice(None)) -> Callable[[pd.DataFrame], float]:
+    return lambda rows: float(np.mean(rows[column].to_numpy(float)[of]))
+
+
+def _largest(column: str) -> Callable[[pd.DataFrame], float]:
+    return lambda rows: float(rows[column].max(skipna=False))
+
+
+def _total(column: str) -> Callable[[pd.DataFrame], int]:
+    return lambda rows: int(rows[column].sum())
+
+
+def _ended(how: str) -> Callable[[pd.DataFrame], int]:
+    return lambda rows: int((rows["termination"] == how).sum())
+
+
+def _violating(column: str) -> Callable[[pd.DataFrame], int]:
+    return lambda rows: int((~(rows[column] <= TOLERANCE)).sum())  # what is no number is no slack
+
+
+def _wilson(end: int) -> Callable[[pd.DataFrame], float]:
+    return lambda rows: float(binomtest(int(rows["success"].sum()), len(rows)).proportion_ci(method="wilson")[end])
+
+
+def _force_since_converged(rows: pd.DataFrame) -> float | None:
+    converged = converged_after(rows)
+    return None if converged is None else _mean("mean_squared_force", slice(converged, None))(rows)
+
+
+FIRST, LAST = slice(10), slice(-10, None)
+SINCE = "mean_squared_force_since_converged"
+JERKS = {"jerk_commanded_linear": "m/s³", "jerk_commanded_angular": "rad/s³", "jerk_measured_linear": "m/s³"}
+
+_STATISTICS = (
+    Metric("episodes", "", "how many episodes the other numbers are of", len),
+    Metric("success_rate", "", "part of the episodes that succeeded", _mean("success")),
+    Metric("success_low", "", "lower end of the success rate's 95 % interval (Wilson)", _wilson(0)),
+    Metric("success_high", "", "upper end of the success rate's 95 % interval (Wilson)", _wilson(1)),
+    Metric("success_rate_last_10", "", "success rate of the last ten episodes", _mean("success", LAST)),
+    Metric("converged_after", "episodes", "those before the first ten in a row that succeed", converged_after),
+    Metric("mean_return", "reward", "return, mean over episodes", _mean("return")),
+    Metric("mean_return_last_10", "reward", "return, mean over the last ten episodes", _mean("return", LAST)),
+    Metric("mean_steps", STEPS, "length, mean over episodes", _mean("steps")),
+    Metric("total_steps", STEPS, "length of all episodes together", _total("steps")),
+    Metric("peak_force", "N", "largest force of any episode", _largest("peak_force")),
+    Metric("mean_force", "N", "each episode's mean force, mean over episodes", _mean("mean_force")),
+    Metric("mean_squared_force", "N²", "the same of the squared force", _mean("mean_squared_force")),
+    Metric(SINCE, "N²", "the same of the episodes after `converged_after`", _force_since_converged),
+    Metric("worst_violation", SLACK, "of a command, the largest of any episode", _largest("worst_violation")),
+    Metric("worst_measured_violation", SLACK, "of a measured pose", _largest("worst_measured_violation")),
+    Metric("violating_episodes", "", "episodes with a command outside", _violating("worst_violation")),
+    Metric("measured_violating_episodes", "", "those with a pose outside", _violating("worst_measured_violation")),
+    Metric("collisions", "", "collisions that began in all episodes, by the safety ledger", _total("collisions")),
+    Metric("collision_steps", STEPS, "control steps in collision, in all", _total("collision_steps")),
+    Metric("fallbacks", STEPS, "repeated safe commands, in all episodes", _total("fallbacks")),
+    Metric("ended_in_success", "", "episodes that ended in success", _ended("success")),
+    Metric("ended_in_collision", "", "episodes that a collision ended", _ended("collision")),
+    Metric("ended_in_spill", "", "episodes that a spill ended", _ended("spill")),
+    Metric("ended_blocked", "", "episodes that ended as the robot got nowhere", _ended("blocked")),
+    *(Metric(f"{kind}_first_10", unit, "mean over ten episodes", _mean(kind, FIRST)) for kind, unit in JERKS.items()),
+    Metric("wall_time", "s", "how long acting and learning took", lambda rows: float(rows["wall_time"].sum())),
+    Metric("avoids_obstacle_from", "episode", "whose obstacle cost stays below 1, from 1", avoids_obstacle_from),
+)
+STATISTICS = {metric.name: metric for metric in _STATISTICS}
+
+
+def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "") -> dict[str, Any]:
+    """Statistics of episodes by name, each name with `prefix`; None where there are no episodes."""
+    return {prefix + name: STATISTICS[name].of(rows) if len(rows) else None for name in names}

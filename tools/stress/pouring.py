@@ -1,0 +1,54 @@
+"""Tries to make the pouring template fail: careless, random and malicious inputs.
+
+A collision is counted at every plant step: nothing may touch what it must not, and the thermos must not be commanded
+to tilt before that is allowed.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET
+from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES, Inputs
+from guiderail.models.pose_coordinates import pose_to_transform
+from guiderail.tools.rollouts.metrics import TOLERANCE
+from guiderail.tools.rollouts.null_policies import Choose
+from guiderail.tools.rollouts.rollout import Decision, EnvObserver
+from guiderail.tools.stress.campaign import Campaign, Case
+
+
+class EarlyTilt(EnvObserver):
+    """The greatest tilt [rad] that is commanded while the template is in its first state, where it is upright."""
+
+    def begin(self) -> None:
+        """Nothing is tilted yet."""
+        self._diagram, self._context = self.base.task.diagram, self.base.simulator.get_context()
+        self._worst = 0.0
+
+    def see(self, decision: Decision) -> None:
+        """Measures, unless the template is in another state."""
+        if self._diagram.GetOutputPort("state").Eval(self._context)[0] != 0:
+            return
+        X = pose_to_transform(self._diagram.GetOutputPort("desired_pose").Eval(self._context))
+        R = X.rotation().matrix()
+        self._worst = max(self._worst, float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2])))
+
+    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """`early_tilt` [rad]."""
+        return {"early_tilt": self._worst}
+
+
+def _three_inputs(make: Callable[[np.random.Generator], Inputs]) -> Choose:
+    return lambda rng, size: make(rng)
+
+
+def campaign() -> Campaign:
+    """The template with a mug that is moved, and everyone who is careless or worse."""
+    return Campaign(
+        "Pouring",
+        [Case("sct", {"guidance": "sct", "mug_offset": MAX_MUG_OFFSET}, constrained=True)],
+        {"collisions": 0, "early_tilt": TOLERANCE},
+        witness=EarlyTilt,
+        actions={name: _three_inputs(make) for name, make in ADVERSARIES.items()},
+    )

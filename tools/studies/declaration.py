@@ -1,0 +1,161 @@
+"""What a study's YAML file may say, and one sentence where it says something else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
+from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
+from guiderail.tools.rollouts.metrics import STATISTICS
+
+FolderName = Annotated[str, Field(pattern=r"^[\w.-]+$")]
+SHIPPED = Path(__file__).parent
+LEARNED = "learned"
+
+
+class _Strict(BaseModel):
+    """Unknown keys are refused; `first_seed` is written `first seed`."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, populate_by_name=True, alias_generator=lambda name: name.replace("_", " ")
+    )
+
+
+class LearnerChoice(_Strict):
+    """How it is learned; what is left out is the task's own."""
+
+    algorithm: str | None = None
+    preset: str | None = None
+    settings: dict[str, Any] = {}
+    episodes: int | None = Field(default=None, ge=1)  # of training; the last mark unless given
+
+
+class Method(_Strict):
+    """Who acts, through what."""
+
+    env: dict[str, Any] = {}
+    learner: LearnerChoice = LearnerChoice()
+    policy: str = LEARNED  # or a null policy, best_constant, rule, or a rule's name
+    grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # of each number of an action, for best_constant
+    seeds: tuple[int, ...] | None = None  # the study's unless given: what doesn't depend on them needs one
+
+
+class JudgedOn(_Strict):
+    """Held-out episodes that a policy is judged on."""
+
+    name: str = "held out"
+    env: dict[str, Any] = {}  # other arguments than where it learned
+    sampled: dict[str, tuple[float, float]] = {}  # arguments that are uniform in a range, anew every few episodes
+    every: int = Field(default=4, ge=1)
+    options: dict[str, Any] = {}  # of each reset
+    episodes: int = Field(default=100, ge=1)
+    first_seed: int = Field(default=HELD_OUT_SEED, ge=0)
+    file: str = "{name}-{mark}-{digest}.csv"  # in the run's folder: what was evaluated already
+
+
+class Ratio(_Strict):
+    """A column of one method as a part of another's."""
+
+    of: str
+    method: str
+    against: str
+
+
+class Study(_Strict):
+    """Methods × seeds × marks × what is judged on."""
+
+    name: FolderName
+    task: str
+    env: dict[str, Any] = {}
+    learner: LearnerChoice = LearnerChoice()
+    methods: dict[FolderName, Method] = Field(min_length=1)
+    seeds: tuple[int, ...] = Field(min_length=1)
+    marks: tuple[
+        Annotated[int, Field(ge=1)], ...
+    ] = ()  # training episodes after which a policy is judged; all of them unless given
+    judged_on: tuple[JudgedOn, ...] = (JudgedOn(),)
+    statistics: tuple[str, ...] = ()  # of training, besides the usual ones
+    ratios: tuple[Ratio, ...] = ()
+    folder: str = "{method}-{seed}"  # of a run
+
+    @field_validator("statistics")
+    @classmethod
+    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        for name in names:
+            if name not in STATISTICS:
+                raise ValueError(f"there is no statistic {name!r}: {did_you_mean(name, STATISTICS)}")
+        return names
+
+    def only(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
+        """The same study with some of its methods, or with other seeds.
+
+        Raises:
+            InputError: for a method that it doesn't have.
+        """
+        chosen = self.methods if methods is None else {}
+        for name in methods or ():
+            if name not in self.methods:
+                raise InputError(f"the study {self.name} has no method {name!r}: {did_you_mean(name, self.methods)}")
+            chosen[name] = self.methods[name]
+        return self.model_copy(update={"methods": chosen, "seeds": tuple(self.seeds if seeds is None else seeds)})
+
+
+class Smoothness(_Strict):
+    """The benchmark of smoothness, which is a program of its own."""
+
+    program: Literal["smoothness"]
+    name: FolderName
+    episodes: int = Field(default=4, ge=1)
+    kappa: float = Field(default=1.0, gt=0.0)
+    outputs: Literal["all", "xy"] = "all"
+    seed: int = Field(default=0, ge=0)
+
+
+def shipped_studies() -> list[str]:
+    """The names of the studies that come along."""
+    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
+
+
+def load_study(file: Path | str) -> Study | Smoothness:
+    """The study of a YAML file, or one that comes along by its name.
+
+    Raises:
+        InputError: if there is no such file, or it is no study.
+    """
+    path = Path(file)
+    if not path.suffix:
+        path = SHIPPED / f"{file}.yaml"
+        if not path.is_file():
+            raise InputError(f"there is no study {str(file)!r}: {did_you_mean(file, shipped_studies())}")
+    if not path.is_file():
+        raise InputError(f"there is no file {path}: name a study's YAML file, or one of {', '.join(shipped_studies())}")
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path} is no study: it needs at least name, task, methods and seeds")
+    kind = Smoothness if "program" in data else Study
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{path}: {_sentence(error)}") from error
+
+
+def _sentence(error: ValidationError) -> str:
+    """What is wrong first, where, and what it may be."""
+    first = error.errors()[0]
+    where = ", ".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        kinds: tuple[type[BaseModel], ...] = (Study, Method, LearnerChoice, JudgedOn, Ratio, Smoothness)
+        known = {str(field.alias) for kind in kinds for field in kind.model_fields.values()}
+        return f"{where} is nothing that a study has: {did_you_mean(str(first['loc'][-1]), known)}"
+    if first["type"] == "value_error":
+        return str(first["ctx"]["error"])
+    return f"{where}: {first['msg'][:1].lower()}{first['msg'][1:]}, not {first['input']!r}"[:300]

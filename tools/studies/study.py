@@ -1,0 +1,308 @@
+"""`guiderail study`: trains where it has to, judges after every mark, and writes a row for each.
+
+Each seed has rows of its own: what failed on one is not averaged away. A study that was interrupted goes on where it
+was, and figures use the same runs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.progress import track
+
+from guiderail.models.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.configure import configure, with_defaults
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments
+from guiderail.tools.rollouts.evaluate import cached, evaluate_run
+from guiderail.tools.rollouts.metrics import summary
+from guiderail.tools.rollouts.null_policies import always
+from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.studies.declaration import LEARNED, JudgedOn, Ratio, Study
+from guiderail.tools.studies.scripted import untrained
+from guiderail.tools.tables import write_table
+from guiderail.tools.tasks import make_environment
+
+PROCESSES = 2
+BEST_CONSTANT = "best_constant"
+SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
+
+TRAINING = (
+    "episodes", "success_rate", "success_rate_last_10", "converged_after", "mean_return_last_10", "mean_force",
+    "mean_squared_force", "mean_squared_force_since_converged", "peak_force", "worst_violation",
+    "worst_measured_violation", "violating_episodes", "measured_violating_episodes", "collisions",
+    "ended_in_success", "ended_in_collision", "ended_in_spill", "fallbacks", "jerk_commanded_linear_first_10",
+    "jerk_commanded_angular_first_10", "jerk_measured_linear_first_10", "total_steps", "wall_time",
+)  # fmt: skip
+JUDGED = (
+    "episodes", "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "mean_force",
+    "mean_squared_force", "peak_force", "worst_violation", "violating_episodes", "collisions",
+    "ended_in_collision", "ended_in_spill",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Job:
+    """One method of a study, one seed."""
+
+    study: Study
+    method: str
+    seed: int
+    out: Path
+
+    @property
+    def learns(self) -> bool:
+        """Whether there is a run at all."""
+        return self.study.methods[self.method].policy == LEARNED
+
+    @property
+    def marks(self) -> list[int]:
+        """Training episodes after which it is judged; 0 for what doesn't learn.
+
+        Raises:
+            InputError: if nobody says how many.
+        """
+        if not self.learns:
+            return [0]
+        own, common = self.study.methods[self.method].learner.episodes, self.study.learner.episodes
+        episodes = own or common or max(self.study.marks, default=0)
+        if not episodes:
+            raise InputError(f"how long does {self.method} learn? give the study marks, or its learner episodes")
+        return sorted({mark for mark in self.study.marks if mark < episodes} | {episodes})
+
+    def config(self, episodes: int) -> RunConfig:
+        """Its run of so many episodes.
+
+        Raises:
+            InputError: for an unknown name or a number out of range.
+        """
+        study, method = self.study, self.study.methods[self.method]
+        choices = [study.learner, method.learner]
+        given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
+        environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
+        settings = {**study.learner.settings, **method.learner.settings}
+        return configure(study.task, environment, settings=settings, episodes=max(episodes, 1), seed=self.seed, **given)
+
+    @property
+    def folder(self) -> RunFolder:
+        """Where its run is, and what was evaluated of it."""
+        config = self.config(self.marks[-1])
+        words = {"method": self.method, "seed": self.seed, "episodes": config.episodes}
+        return RunFolder(self.out / self.study.folder.format(**words, algorithm=config.learner.algorithm))
+
+
+def run_study(
+    study: Study,
+    out: Path,
+    *,
+    processes: int = PROCESSES,
+    say: Callable[[str], None] = lambda words: None,
+) -> pd.DataFrame:
+    """Runs what is not there yet and returns a row for each method, seed, mark and what is judged on, in this order.
+
+    Args:
+        study: what to run.
+        out: the folder; runs in it are used again, and those that were interrupted go on.
+        processes: side by side, each with one thread.
+        say: is told of every job that is done.
+
+    Raises:
+        InputError: before anything is written, if something makes no sense or a folder holds another run.
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out} is a file: name a folder with --out")
+    jobs = [
+        Job(study, name, seed, out) for name, method in study.methods.items() for seed in method.seeds or study.seeds
+    ]
+    for job in jobs:
+        _check(job)
+    done: dict[int, list[dict[str, Any]]] = {}
+    for index, rows in _finished(jobs, processes):
+        done[index] = rows
+        said = "".join(f": {row['judged_on']} {row['success_rate']:.0%}" for row in rows[-1:] if row["judged_on"])
+        say(f"{len(done)}/{len(jobs)} {jobs[index].method}, seed {jobs[index].seed}{said}")
+    return pd.DataFrame([row for index in range(len(jobs)) for row in done[index]], dtype=object)
+
+
+def study_command(study: Study, out: Path, processes: int = PROCESSES) -> dict[str, Any]:
+    """Runs a study, writes `<name>.csv` and `.md`, and says what the rows come to, each seed by itself."""
+    say = partial(Console(stderr=True).print, soft_wrap=True, highlight=False)
+    rows = run_study(study, out, processes=processes, say=say)
+    result: dict[str, Any] = {"table": str(write_table(out / study.name, rows.drop(columns="folder")))}
+    for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
+        after = f" after {mark} episodes" if mark else ""
+        if judged:
+            result[f"{method}{after}, {judged}, success of each seed"] = each(group, "success_rate", "{:.0%}")
+        if mark:
+            result[f"{method}{after}, converged after, each seed"] = each(group, "training_converged_after")
+    for one in study.ratios:
+        result |= ratio(rows, one)
+    return result
+
+
+def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
+    """A column of every seed: failures of single seeds are not averaged away."""
+    return ", ".join("never" if pd.isna(value) else form.format(value) for value in rows[column])
+
+
+def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
+    """A column of one method as a part of another's, each seed and all together; nothing where either is missing."""
+    part, whole = (rows[rows["method"] == m][wanted.of].to_numpy(float) for m in (wanted.method, wanted.against))
+    if not len(part) or len(part) != len(whole):
+        return {}
+    words = f"{wanted.of.replace('_', ' ')} of {wanted.method} as a part of {wanted.against}'s"
+    return {
+        f"{words}, each seed": ", ".join(f"{value:.2f}" for value in part / whole),
+        f"{words}, all seeds together": f"{part.sum() / whole.sum():.2f}",
+    }
+
+
+def _finished(jobs: Sequence[Job], processes: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """The jobs' indices and rows as they are done, and a bar that says how far it is."""
+    if processes == 1:
+        yield from ((index, run_job(job)) for index, job in enumerate(jobs))
+        return
+    console = Console(stderr=True)
+    # Fresh processes: a forked one would inherit the threads and random generators of this one.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_one_thread) as pool:
+        waiting = {pool.submit(run_job, job): index for index, job in enumerate(jobs)}
+        bar: dict[str, Any] = {"total": len(jobs), "console": console, "disable": not console.is_terminal}
+        for future in track(as_completed(waiting), "runs", **bar):
+            yield waiting[future], future.result()
+
+
+def _one_thread() -> None:
+    os.environ["OMP_NUM_THREADS"] = "1"
+
+
+def _check(job: Job) -> None:
+    """Refuses what makes no sense before anything runs."""
+    config, policy = job.config(job.marks[-1]), job.study.methods[job.method].policy
+    if policy not in (LEARNED, BEST_CONSTANT):
+        untrained(job.study.task, policy)
+    for judged in job.study.judged_on:
+        extra = {**judged.env, **{name: low for name, (low, _) in judged.sampled.items()}}
+        configure(job.study.task, config.environment | extra, episodes=1)
+    if (job.folder.path / "config.yaml").exists():
+        job.folder.refuse_another(config)
+    elif job.learns:
+        job.folder.refuse_existing()
+
+
+def run_job(job: Job) -> list[dict[str, Any]]:
+    """The rows of a job; it is trained and judged where it isn't yet."""
+    rows = []
+    for mark in job.marks:
+        trained = _train(job, mark).iloc[:mark]
+        algorithm = job.config(mark).learner.algorithm if job.learns else ""
+        policy = job.study.methods[job.method].policy
+        row = {"method": job.method, "policy": policy, "algorithm": algorithm, "seed": job.seed, "mark": mark}
+        training = summary(trained, (*TRAINING, *job.study.statistics), "training_")
+        training["folder"] = str(job.folder.path)
+        for judged in job.study.judged_on:
+            rows.append(row | {"judged_on": judged.name} | summary(_evaluated(job, mark, judged), JUDGED) | training)
+        if not job.study.judged_on:
+            rows.append(row | {"judged_on": ""} | training)
+    return rows
+
+
+def _train(job: Job, mark: int) -> pd.DataFrame:
+    """The episodes of a run that has come at least as far as a mark, whose policy is copied."""
+    from guiderail.tools.learning.train import train
+
+    if not job.learns:
+        return pd.DataFrame()
+    folder, copy = job.folder, _policy_folder(job, mark)
+    begun, table = (folder.path / "config.yaml").exists(), folder.path / "episodes.csv"
+    done = len(folder.episodes()) if table.exists() else 0
+    if done <= mark and not copy.exists():
+        complete = done == mark == folder.config().episodes and (folder.path / "policy.json").exists()
+        if not complete:
+            train(folder, job.config(mark), resume=begun)
+        Policy.load(folder.path).save(copy, write=write_atomically)
+    return folder.episodes()
+
+
+def _policy_folder(job: Job, mark: int) -> Path:
+    return job.folder.path / "marks" / str(mark)
+
+
+def _digest(job: Job, judged: JudgedOn | None = None) -> str:
+    """What a file was evaluated with: other episodes of the same name, or another method's, are not taken for these."""
+    method = job.study.methods[job.method].model_dump_json(include={"env", "policy", "grid"})
+    said = "" if judged is None else judged.model_dump_json(exclude={"name", "file"})
+    return hashlib.blake2b((said + method + json.dumps(job.study.env)).encode(), digest_size=4).hexdigest()
+
+
+def _evaluated(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
+    """Rows of held-out episodes, from the file where they are known already."""
+    words = {"name": judged.name.replace(" ", "_"), "mark": mark, "episodes": judged.episodes}
+    file = job.folder.path / judged.file.format(**words, digest=_digest(job, judged))
+    return cached(file, lambda: _evaluate(job, mark, judged))
+
+
+def _evaluate(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
+    config, policy = job.config(mark), _policy(job, mark)
+    environment = as_arguments(config.environment | judged.env)
+    every, tables = judged.every if judged.sampled else judged.episodes, []
+    for done in range(0, judged.episodes, every):
+        rng, number = np.random.default_rng([judged.first_seed, done]), min(every, judged.episodes - done)
+        sampled = {name: float(rng.uniform(low, high)) for name, (low, high) in judged.sampled.items()}
+        how: dict[str, Any] = {"episodes": number, "seed": judged.first_seed + done, "options": judged.options}
+        rows = evaluate_run(config, policy, environment | sampled, **how)
+        tables.append(rows.assign(episode=rows["episode"] + done, **sampled))
+    return pd.concat(tables, ignore_index=True)
+
+
+def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], Act]:
+    """What acts, for an environment."""
+    name = job.study.methods[job.method].policy
+    if name == LEARNED:
+        folder = _policy_folder(job, mark)
+        if not folder.exists():
+            raise InputError(
+                f"the run in {job.folder.path} went on learning after episode {mark}, and its policy of then is gone: "
+                "leave that mark out, or train anew in another folder"
+            )
+        learned = Policy.load(folder)
+        return lambda env: learned
+    if name == BEST_CONSTANT:
+        best = _best_constant(job)
+        return lambda env: always(env, best)
+    return untrained(job.study.task, name, job.seed)
+
+
+def _best_constant(job: Job) -> np.ndarray:
+    """The constant action of a grid with the most successes, then the highest return, on what training would meet."""
+    file = job.folder.path / f"best_constant-{_digest(job)}.csv"
+
+    def tried() -> pd.DataFrame:
+        config, grid = job.config(1), job.study.methods[job.method].grid
+        env = make_environment(config.task, config.environment)
+        rows = []
+        for action in itertools.product(grid, repeat=int(np.prod(env.action_space.shape or ()))):
+            env.reset(seed=config.seed)
+            found = pd.DataFrame([rollout(env, always(env, np.array(action))) for _ in range(SELECTION_EPISODES)])
+            numbers = {f"action_{i}": value for i, value in enumerate(action)}
+            rows.append(numbers | summary(found, ("success_rate", "mean_return")))
+        env.close()
+        return pd.DataFrame(rows).sort_values(["success_rate", "mean_return"], ascending=False, kind="stable")
+
+    best = cached(file, tried).iloc[0]
+    return best.filter(like="action_").to_numpy(float)

@@ -1,0 +1,135 @@
+"""Tasks by name: the one place where tools ask which there are and what they take."""
+
+import inspect
+import sys
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium
+import yaml
+from gymnasium.envs.registration import load_env_creator
+from threadpoolctl import threadpool_limits
+
+import guiderail.diagrams  # noqa: F401 (registers the environments)
+from guiderail.diagrams.make import resolve
+from guiderail.diagrams.register import register_envs
+from guiderail.diagrams.tasks.task import TASKS, environment_id
+from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
+
+
+def known_tasks() -> list[str]:
+    """The tasks that there are: those that are declared, and environments that somebody registered as guiderail's."""
+    registered = (spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")
+    return sorted({*TASKS.names(), *registered})
+
+
+def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
+    """Imports modules or files (.py) that register tasks, guidance, stations or learners; returns how to name them.
+
+    A file is named by its absolute path, so that whoever goes on with a run elsewhere on the machine finds it.
+
+    Raises:
+        InputError: if there is no such module or file.
+    """
+    names = []
+    for module in modules:
+        path = Path(module)
+        try:
+            names.append(_import_file(path) if path.suffix == ".py" else import_module(module).__name__)
+        except (ModuleNotFoundError, FileNotFoundError) as error:
+            raise InputError(
+                f"--import takes a module or a file (.py), and there is none for {module!r}: {error}"
+            ) from None
+    register_envs()
+    return tuple(names)
+
+
+def _import_file(path: Path) -> str:
+    path = path.resolve()
+    name = f"guiderail_imported_{path.stem}"
+    spec = spec_from_file_location(name, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise FileNotFoundError(f"{path} is no file")
+    module = sys.modules[name] = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return str(path)
+
+
+def task_options(task: str) -> dict[str, Any]:
+    """What a task's environment takes, with its defaults; `inspect.Parameter.empty` where it has none.
+
+    Raises:
+        InputError: for an unknown task.
+    """
+    if task in TASKS.names():
+        return resolve(task, {}).values
+    if task not in known_tasks():
+        raise InputError(f"there is no task {task!r}: {did_you_mean(task, known_tasks())}")
+    entry = gymnasium.spec(environment_id(task)).entry_point
+    creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
+    taken = inspect.signature(creator).parameters.items()
+    return {name: parameter.default for name, parameter in taken if name not in ("self", "render_mode")}
+
+
+def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments of a task's environment, its defaults filled in.
+
+    Raises:
+        InputError: for an unknown task, or an argument that it does not take.
+    """
+    if task in TASKS.names():
+        return resolve(task, arguments).values
+    options = task_options(task)
+    for name, value in arguments.items():
+        if name not in options:
+            raise InputError(f"{task} has no option {name!r}: {did_you_mean(name, options)}")
+        if not _is_like(value, options[name]):
+            raise InputError(f"{task}'s {name} cannot be {value!r}: give a value such as {options[name]!r}")
+    given = {name: arguments.get(name, default) for name, default in options.items()}
+    return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
+
+
+def _is_like(value: Any, default: Any) -> bool:
+    """Whether a value has the type of a default, as far as that says anything."""
+    if default is None or default is inspect.Parameter.empty:
+        return True
+    if isinstance(default, float):
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(default, tuple):
+        return isinstance(value, tuple | list)
+    return isinstance(value, type(default)) and isinstance(value, bool) == isinstance(default, bool)
+
+
+def as_value(text: str) -> Any:
+    """A typed value: what YAML reads, and 1e-8 too, which YAML takes for a word."""
+    try:
+        return _numbers(yaml.safe_load(text))
+    except yaml.YAMLError:
+        return text
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_numbers(one) for one in value)
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
+    """The environment of a task. From here on this process calculates with one thread.
+
+    Matrices are small here. Where another process wants the cores too, threads that wait for each other take eighty
+    times as long (a movement primitive with a history: 78 s for 1), and sums would depend on how many there are.
+
+    Raises:
+        InputError: for an unknown task or argument, or a pairing that makes no sense.
+    """
+    threadpool_limits(1)
+    arguments = check_environment(task, arguments)
+    return gymnasium.make(environment_id(task), disable_env_checker=True, render_mode=render_mode, **arguments)

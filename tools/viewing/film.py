@@ -1,0 +1,65 @@
+"""`guiderail film`: an episode as a camera sees it, some moments of it in one picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.tools.files import check_picture
+from guiderail.tools.rollouts.rollout import Decision, EnvObserver, rollout
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.shown import Shown, outcome
+from guiderail.tools.viewing.style import new_figure, save_figure
+
+ROWS, COLUMNS = 2, 3
+MOST = 24  # frames
+
+
+class Frames(EnvObserver):
+    """What a camera sees of an episode, evenly spread over it and never much: its length isn't known before.
+
+    The environment is made with `render_mode="rgb_array"`.
+    """
+
+    def begin(self) -> None:
+        """Looks at how it starts."""
+        self.seen: list[Any] = [(0.0, 0.0, self.env.render())]
+        self._stride, self._decisions = 1, 0
+
+    def see(self, decision: Decision) -> None:
+        """Looks at a decision if it is due; where there are `MOST` frames, every second one goes first."""
+        self._decisions += 1
+        if not decision.is_last and self._decisions % self._stride:
+            return
+        if len(self.seen) == MOST:
+            self.seen, self._stride = self.seen[::2], 2 * self._stride
+        time = len(self.base.trace) * self.base.task.control_period
+        self.seen.append((time, decision.info["contact_force"], self.env.render()))
+
+    def spread(self, number: int) -> list[Any]:
+        """So many frames (time, force, image), from the first to the last."""
+        return [self.seen[i] for i in np.linspace(0, len(self.seen) - 1, number).round().astype(int)]
+
+
+def write_film(picture: Path, episode: Shown) -> dict[str, Any]:
+    """Runs an episode and writes what the task's camera sees of it at `ROWS` × `COLUMNS` moments; returns its row.
+
+    Raises:
+        InputError: if nothing can be rendered on this machine, or no such picture be written.
+    """
+    check_picture(picture)
+    env = make_environment(episode.task, episode.environment, render_mode="rgb_array")
+    env.reset(seed=episode.run_seed)
+    frames = Frames(env)
+    row = rollout(env, episode.policy(env), frames, seed=episode.seed, held_out=True)
+    env.close()
+    figure, axes = new_figure(ROWS, COLUMNS, (3.6 * COLUMNS, 2.95 * ROWS))
+    figure.suptitle(f"{episode.heading}: {outcome(row)}", fontsize=10)
+    for axis, (time, force, image) in zip(axes.flat, frames.spread(ROWS * COLUMNS), strict=True):
+        axis.imshow(image)
+        axis.set_title(f"{time:.1f} s, {force:.0f} N", fontsize=9)
+        axis.set_axis_off()
+    save_figure(figure, picture)
+    return row

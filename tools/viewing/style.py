@@ -1,0 +1,52 @@
+"""How every picture of guiderail looks: the same colour for the same method, and a file that is complete."""
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from guiderail.tools.files import check_picture, write_atomically
+
+
+def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
+    """A figure without a window, whatever the machine has; axes (rows, columns)."""
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def save_figure(figure: Figure, path: Path, dpi: int = 130) -> Path:
+    """Writes a picture, whole, in the format that its ending says."""
+    check_picture(path)
+    content = io.BytesIO()
+    figure.savefig(content, format=path.suffix[1:].lower(), dpi=dpi)
+    write_atomically(path, content.getvalue())
+    return path
+
+
+def rolling(values: Sequence[float] | np.ndarray, window: int = 10) -> np.ndarray:
+    """The mean of the last `window` values, of fewer at the start."""
+    return pd.Series(np.asarray(values, float)).rolling(window, min_periods=1).mean().to_numpy()
+
+
+def draw_runs(axis: Axes, runs: Sequence[Sequence[float]], *, colour: str, label: str, window: int = 10) -> None:
+    """Several runs of one method: the mean over runs as a line, their range as a band, each smoothed by `window`."""
+    length = min(len(run) for run in runs)
+    smooth = np.stack([rolling(run, window)[:length] for run in runs])
+    episodes = np.arange(1, length + 1)
+    axis.fill_between(episodes, smooth.min(0), smooth.max(0), color=colour, alpha=0.15, linewidth=0)
+    axis.plot(episodes, smooth.mean(0), color=colour, label=label)
+
+
+def legend(figure: Figure, axis: Axes) -> None:
+    """One legend above all axes, where it covers no curve."""
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
