@@ -42,7 +42,7 @@ class PrimitiveOptions(Options):
     """Of every guidance made of demonstrations; see `PrimitiveSkill`."""
 
     kappa: Number = Field(1.0, gt=0, description="κ: a constant action of ±1 ends √3 κ standard deviations away")
-    explored: Integers | None = Field(None, description="the outputs that an action moves, by number; all unless given")
+    explored: Integers | None = Field(None, description="the outputs that an action moves, by number; none named: all")
     history: Integer = Field(10, ge=1, description="P, past outputs that sKGRL's motion passes through")
     history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], how exactly it does")
     history_source: Literal["commanded", "measured"] = Field("commanded", description="what counts as the past")
