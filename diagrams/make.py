@@ -18,7 +18,8 @@ from guiderail.diagrams.options import Integer, Options, PrimitiveOptions, Templ
 from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of
-from guiderail.diagrams.tasks.task import STANDARD, TASKS, Choice, Task
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 
@@ -87,7 +88,9 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
     known = [key for model in models.values() for key in model.model_fields]
     unknown = sorted(set(given) - set(known))
     if unknown:
-        raise InputError(f"{name} has no option {unknown[0]!r}: {did_you_mean(unknown[0], known)}")
+        elsewhere = [place for place in places if unknown[0] in (STATIONS.get(place).options or Options).model_fields]
+        remedy = f"it is one of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
+        raise InputError(f"{name} has no option {unknown[0]!r} here: {remedy}")
     checked = {
         part: validated(model, {key: merged[key] for key in model.model_fields if key in merged}, name)
         for part, model in models.items()

@@ -2,7 +2,7 @@
 
 import gymnasium
 
-from guiderail.diagrams.tasks.task import TASKS, environment_id
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 
 
 def register_envs() -> None:

@@ -19,9 +19,7 @@ STEPS, PERIOD = 80, 0.02
 class WideGap(gr.Task):
     """Through a wide gap to a goal beside the demonstrations."""
 
-    world_kind = "plane"
-    num_steps = STEPS
-    clip = 1.0
+    world_kind, num_steps, clip = "plane", STEPS, 1.0
 
     def world(self) -> NarrowPassage:
         return WORLD

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
 import pkgutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
 from importlib import import_module, metadata
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Generic, TypeVar, overload
 
 from guiderail.models.errors import InputError
@@ -14,24 +18,32 @@ Entry = TypeVar("Entry")
 
 
 class Registry(Generic[Entry]):
-    """Entries by name. Nothing is imported before a name is asked for.
+    """Entries by name; a name costs no import, an entry that of its own module.
 
-    An entry is added by whoever defines it, with `register` as a decorator or a call. The modules of `package` are
-    imported when the list is first looked at, so that a new one costs one file; an installed package adds its own by
-    an entry point of the group `entry_points`, and a file that is not installed by being imported.
+    An entry is added by whoever defines it, with `register` as a decorator or a call. A new module of `package` is
+    found by being there; an installed package adds its own by an entry point of the group `entry_points`, and a file
+    that is not installed by being imported.
     """
 
-    def __init__(self, noun: str, *, package: str | None = None, entry_points: str | None = None):
+    def __init__(
+        self,
+        noun: str,
+        *,
+        package: str | None = None,
+        decorator: str | None = None,
+        entry_points: str | None = None,
+    ):
         """
         Args:
             noun: what an entry is, for sentences: "task", "robot".
             package: the import name of a package whose modules register entries.
+            decorator: the function by whose calls, with a name as first argument, they do that: it is looked for in
+                their text. Unless given they are all imported when the list is first looked at.
             entry_points: the group of entry points that name further ones.
         """
         self.noun = noun
-        self._package, self._group = package, entry_points
+        self._package, self._decorator, self._group = package, decorator, entry_points
         self._entries: dict[str, Entry] = {}
-        self._looked = False
 
     @overload
     def register(self, name: str, value: None = None) -> Callable[[Entry], Entry]: ...
@@ -57,33 +69,43 @@ class Registry(Generic[Entry]):
         Raises:
             InputError: if there is none; the sentence has the nearest name, or all of them.
         """
-        if name not in self._entries:
-            self._look()
+        if name not in self._entries and name in self._modules:
+            import_module(self._modules[name])
+        if name not in self._entries and name in self._points:
+            value = self._points[name].load()
+            if name not in self._entries:  # its module may have registered it while it was imported
+                self.register(name, value)
         if name not in self._entries:
             raise InputError(f"there is no {self.noun} {name!r}: {did_you_mean(name, self.names())}")
         return self._entries[name]
 
     def names(self) -> list[str]:
         """The names of all entries, sorted."""
-        self._look()
-        return sorted(self._entries)
+        return sorted({*self._modules, *self._points, *self._entries})
 
-    def _look(self) -> None:
-        if self._looked:
-            return
-        self._looked = True
-        if self._package is not None:
-            package = import_module(self._package)
-            for module in pkgutil.iter_modules(package.__path__, f"{self._package}."):
-                import_module(module.name)
-        for point in metadata.entry_points(group=self._group) if self._group else ():
-            if point.name not in self._entries:
-                self._load(point)
+    @cached_property
+    def _modules(self) -> dict[str, str]:
+        """The module of each name that the package's own modules register."""
+        if self._package is None:
+            return {}
+        spec = find_spec(self._package)
+        places = list(spec.submodule_search_locations or ()) if spec is not None else []
+        modules = [f"{self._package}.{module.name}" for module in pkgutil.iter_modules(places)]
+        if self._decorator is None:
+            for module in modules:
+                import_module(module)
+            return {}
+        files = {module: Path(place, f"{module.rpartition('.')[2]}.py") for module in modules for place in places}
+        return {
+            name: module
+            for module, file in files.items()
+            if file.is_file()
+            for name in _registered(file.read_text(encoding="utf-8"), self._decorator)
+        }
 
-    def _load(self, point: metadata.EntryPoint) -> None:
-        value = point.load()
-        if point.name not in self._entries:  # its module may have registered it while it was imported
-            self.register(point.name, value)
+    @cached_property
+    def _points(self) -> dict[str, metadata.EntryPoint]:
+        return {point.name: point for point in metadata.entry_points(group=self._group)} if self._group else {}
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
@@ -92,6 +114,15 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     lower = {word.lower(): word for word in known}
     near = difflib.get_close_matches(str(name).lower(), lower, n=1)
     return f"did you mean {lower[near[0]]}?" if near else f"choose one of {', '.join(known) or 'none'}"
+
+
+def _registered(source: str, decorator: str) -> Iterator[str]:
+    """The names with which a module's text calls `decorator`."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", None) == decorator and node.args:
+            name = node.args[0]
+            if isinstance(name, ast.Constant) and isinstance(name.value, str):
+                yield name.value
 
 
 def _origin(value: object) -> str:

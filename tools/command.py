@@ -409,12 +409,12 @@ def list_(
     means. As JSON, without a word, it is everything: tasks, guidance, stations, robots and learners with their ports,
     options and ranges.
     """
-    from guiderail.tools import listing
     from guiderail.tools.tasks import import_modules
 
     import_modules(imports or ())
     if what is None:
-        _print(listing.everything() if as_json else {name: names() for name, names in LISTED.items()}, as_json)
+        names = {name: names() for name, names in LISTED.items()}
+        _print(names | _listing().everything() if as_json else names, as_json)
     elif what == "metrics":
         from guiderail.tools.rollouts.metrics import COLUMNS, STATISTICS
 
@@ -423,9 +423,17 @@ def list_(
     elif what in LISTED:
         _print({what: LISTED[what]()}, as_json)
     elif what in CHOICES["tasks"]():
-        _print(listing.task(what) if as_json else listing.options_in_words(what), as_json, "_")
+        listing = _listing()
+        declared = as_json and what in listing.TASKS.names()
+        _print(listing.task(what) if declared else listing.options_in_words(what), as_json, "_")
     else:
         raise InputError(f"there is no list of {what!r}: {did_you_mean(what, [*CHOICES['listed'](), 'metrics'])}")
+
+
+def _listing() -> Any:
+    from guiderail.tools import listing  # it imports everything that it lists
+
+    return listing
 
 
 @command("demo --out demo")

@@ -12,7 +12,7 @@ from guiderail.diagrams.options import PrimitiveOptions, TemplateOptions, descri
 from guiderail.diagrams.stations.registry import STATIONS, stations_for
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
-from guiderail.diagrams.tasks.task import TASKS, environment_id
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.robots.robot import end_effector_names, find_end_effector, find_robot, robot_names
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.tasks import task_options

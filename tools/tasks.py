@@ -14,9 +14,8 @@ from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
-from guiderail.diagrams.make import resolve
 from guiderail.diagrams.register import register_envs
-from guiderail.diagrams.tasks.task import TASKS, environment_id
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 
@@ -66,7 +65,7 @@ def task_options(task: str) -> dict[str, Any]:
         InputError: for an unknown task.
     """
     if task in TASKS.names():
-        return resolve(task, {}).values
+        return check_environment(task, {})
     if task not in known_tasks():
         raise InputError(f"there is no task {task!r}: {did_you_mean(task, known_tasks())}")
     entry = gymnasium.spec(environment_id(task)).entry_point
@@ -82,6 +81,8 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         InputError: for an unknown task, or an argument that it does not take.
     """
     if task in TASKS.names():
+        from guiderail.diagrams.make import resolve  # Drake takes a second, and a list of names should not
+
         return resolve(task, arguments).values
     options = task_options(task)
     for name, value in arguments.items():

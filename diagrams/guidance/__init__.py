@@ -1,18 +1,5 @@
 """Guidance: what stands between a policy's action and the pose that a robot is commanded."""
 
-from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.known import Approach, Known, Template
-from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
-from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind, build_guidance, register_guidance
+import lazy_loader
 
-__all__ = [
-    "GUIDANCE",
-    "Approach",
-    "Guidance",
-    "GuidanceKind",
-    "Known",
-    "PrimitiveSkill",
-    "Template",
-    "build_guidance",
-    "register_guidance",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -11,14 +11,6 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
 from guiderail.models.skills import Skill
 
-INGREDIENTS = {
-    "demonstrations": "demonstrations",
-    "keep_out": "walls to keep out of",
-    "template": "a shared control template",
-    "approach": "a scripted approach",
-}
-"""What a kind of guidance can need, in words."""
-
 
 @dataclass(frozen=True)
 class Template:

@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from pydrake.systems.framework import Diagram
-
-from guiderail.diagrams.guidance.known import INGREDIENTS, Known
-from guiderail.diagrams.options import Options
 from guiderail.models.errors import InputError
 from guiderail.models.registry import Registry
+
+if TYPE_CHECKING:
+    from pydrake.systems.framework import Diagram
+
+    from guiderail.diagrams.guidance.known import Known
+    from guiderail.diagrams.options import Options
+
+INGREDIENTS = {
+    "demonstrations": "demonstrations",
+    "keep_out": "walls to keep out of",
+    "template": "a shared control template",
+    "approach": "a scripted approach",
+}
+"""What a kind of guidance can need, in words."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,10 @@ class GuidanceKind:
 
 
 GUIDANCE: Registry[GuidanceKind] = Registry(
-    "guidance", package="guiderail.diagrams.guidance", entry_points="guiderail.guidance"
+    "guidance",
+    package="guiderail.diagrams.guidance",
+    decorator="register_guidance",
+    entry_points="guiderail.guidance",
 )
 
 

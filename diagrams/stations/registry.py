@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from guiderail.diagrams.options import Options
-from guiderail.diagrams.stations.station import Station
 from guiderail.models.registry import Registry
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.options import Options
+    from guiderail.diagrams.stations.station import Station
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,10 @@ class StationKind:
 
 
 STATIONS: Registry[StationKind] = Registry(
-    "station", package="guiderail.diagrams.stations", entry_points="guiderail.stations"
+    "station",
+    package="guiderail.diagrams.stations",
+    decorator="register_station",
+    entry_points="guiderail.stations",
 )
 
 

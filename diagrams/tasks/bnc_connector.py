@@ -21,7 +21,8 @@ from guiderail.diagrams.task import Symmetry
 from guiderail.diagrams.tasks.bnc_rewards import reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.task import Choice, Threshold, register_task
+from guiderail.diagrams.tasks.registry import register_task
+from guiderail.diagrams.tasks.task import Choice, Threshold
 from guiderail.models.demonstrations import bnc_connector as demonstrations
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.pose_coordinates import POSE_SIZE

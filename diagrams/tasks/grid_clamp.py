@@ -20,7 +20,8 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.grid_clamp_rewards import reward_terms
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.task import Choice, Threshold, register_task
+from guiderail.diagrams.tasks.registry import register_task
+from guiderail.diagrams.tasks.task import Choice, Threshold
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.skills import Skill, load_skill
 from guiderail.models.units import MM

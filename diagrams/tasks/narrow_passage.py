@@ -17,7 +17,8 @@ from guiderail.diagrams.options import Numbers, Options, ResetOptions
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.narrow_passage_rewards import reward_terms
-from guiderail.diagrams.tasks.task import Choice, Task, register_task
+from guiderail.diagrams.tasks.registry import register_task
+from guiderail.diagrams.tasks.task import Choice, Task
 from guiderail.models.demonstrations import narrow_passage as demonstrations
 from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut

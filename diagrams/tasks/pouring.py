@@ -22,7 +22,8 @@ from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.pouring_conditions import conditions
 from guiderail.diagrams.tasks.pouring_rewards import reward_terms
 from guiderail.diagrams.tasks.pouring_template import SPARSE_INPUT_SPEED, make_skill
-from guiderail.diagrams.tasks.task import Choice, Task, Threshold, register_task
+from guiderail.diagrams.tasks.registry import register_task
+from guiderail.diagrams.tasks.task import Choice, Task, Threshold
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, Ball
 from guiderail.models.pose_coordinates import transform_to_pose

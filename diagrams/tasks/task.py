@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -19,7 +19,6 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import Symmetry
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.models.registry import Registry
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
@@ -162,21 +161,3 @@ class Task(ABC):
             "approach": "approach",
         }
         return tuple(name for name, hook in hooks.items() if getattr(cls, hook) is not getattr(Task, hook))
-
-
-TASKS: Registry[type[Task]] = Registry("task", package="guiderail.diagrams.tasks", entry_points="guiderail.tasks")
-
-
-def register_task(name: str) -> Callable[[type[Task]], type[Task]]:
-    """A decorator that adds a task; `name` may have a namespace of its own, as in "lab/Peg"."""
-
-    def add(task: type[Task]) -> type[Task]:
-        task.name = name
-        return TASKS.register(name, task)
-
-    return add
-
-
-def environment_id(name: str) -> str:
-    """What `gymnasium.make` calls a task."""
-    return f"{name if '/' in name else f'guiderail/{name}'}-v0"

@@ -18,9 +18,9 @@ from .diagrams.task import exact_period as exact_period
 from .diagrams.tasks.assemble import assemble as assemble
 from .diagrams.tasks.assemble import assemble_skill as assemble_skill
 from .diagrams.tasks.insertion import InsertionTask as InsertionTask
+from .diagrams.tasks.registry import register_task as register_task
 from .diagrams.tasks.task import Task as Task
 from .diagrams.tasks.task import Threshold as Threshold
-from .diagrams.tasks.task import register_task as register_task
 from .models.errors import InputError as InputError
 from .models.primitives import Demonstrations as Demonstrations
 from .models.primitives import Kmp as Kmp

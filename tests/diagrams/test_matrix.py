@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS
-from guiderail.diagrams.guidance.known import INGREDIENTS
-from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
+from guiderail.diagrams.guidance.registry import GUIDANCE, INGREDIENTS, possible_guidance
 from guiderail.diagrams.make import make_env, resolve
 from guiderail.diagrams.stations.registry import stations_for
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
-from guiderail.diagrams.tasks.task import TASKS
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.errors import InputError
 
 OWN = [name for name in TASKS.names() if TASKS.get(name).__module__.startswith("guiderail.")]

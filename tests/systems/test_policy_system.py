@@ -8,7 +8,7 @@ from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
 from pydrake.systems.sensors import ImageRgba8U
 
-from guiderail.diagrams.tasks.narrow_passage import make_env
+from guiderail.diagrams.make import make_env
 from guiderail.models.errors import InputError
 from guiderail.systems.policy_system import PolicyError, PolicySystem
 
@@ -173,13 +173,13 @@ def test_a_simulator_does_bit_for_bit_what_the_environment_does(hold):
     def policy(observation):
         return np.sin(np.array([[3.0], [-5.0]]) * observation.sum() + [[0.3], [1.1]])[:, 0]
 
-    env = make_env(guidance="skgrl", hold=hold)
+    env = make_env("NarrowPassage", guidance="skgrl", hold=hold)
     observation, info = env.reset(seed=7)
     while info["control_steps"] < steps:
         observation, *_, info = env.step(policy(observation))
     commanded, measured = (np.array(rows)[:steps] for rows in (env.trace.commanded, env.trace.measured))
 
-    task = make_env(guidance="skgrl", hold=hold).task
+    task = make_env("NarrowPassage", guidance="skgrl", hold=hold).task
     builder = DiagramBuilder()
     diagram = builder.AddSystem(task.diagram)
     system = PolicySystem(policy, task.observation_space.shape[0], 2, hold * task.control_period)

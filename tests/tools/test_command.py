@@ -36,7 +36,7 @@ def trained(bead_config, tmp_path):
         (["train", "--out", "new"], "name a task"),
         (["train", "Pooring", "--out", "new"], "did you mean Pouring?"),
         (["train", "Bead", "--out", "new", "--guidance", "magic"], "kmp or skgrl"),
-        (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "safe_residual, kgrl, skgrl"),
+        (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "kmp, none, residual, safe_residual"),
         (["train", "Bead", "--out", "new", "--algorithm", "ppo"], "choose one of sac, tqc"),
         (["train", "Bead", "--out", "new", "--preset", "robst"], "did you mean robust?"),
         (["train", "Bead", "--out", "new", "--uncertainty", "disc"], "no option 'uncertainty'"),
@@ -167,7 +167,9 @@ def test_help_names_the_choices(capsys):
         assert all(word in out for word in words), command
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["train", "--help"], ["study", "--help"], ["list"], ["--version"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["train", "--help"], ["study", "--help"], ["list", "tasks"], ["--version"]]
+)
 def test_help_needs_neither_pytorch_nor_drake(arguments):
     code = f"import sys; from guiderail.tools.command import main\ntry: main({arguments})\nexcept SystemExit: pass\n"
     check = code + "assert not {'torch', 'pydrake', 'stable_baselines3', 'matplotlib'} & set(sys.modules)"
@@ -207,7 +209,7 @@ def test_lists_can_be_read_by_a_program(capsys):
     listed = json.loads(call(capsys, "list", "--json")[1])
     assert {"tasks", "guidance", "learners", "presets", "studies", "figures"} <= listed.keys()
     assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
-    assert json.loads(call(capsys, "list", "Bead", "--json")[1])["hold"] == 1
+    assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["hold"]
     assert "ten in a row" in call(capsys, "list", "metrics")[1]
 
 

@@ -100,7 +100,7 @@ def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, 
 
 
 def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
-    with pytest.raises(InputError, match="no option 'station'"):
+    with pytest.raises(InputError, match="no station 'arm': choose one of plane"):
         write_page(tmp_path / "replay.html", Shown.of_run(trained.path, {"station": "arm"}))
     with pytest.raises(InputError, match="a picture is"):
         write_film(tmp_path / "film.gif", Shown.of_run(trained.path))

@@ -25,10 +25,10 @@ from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS
 from guiderail.models.objects.bnc_motion import insert_and_lock
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
-from guiderail.systems.command_watch import CommandWatch
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.recorder import Recorder
+from guiderail.systems.support.command_watch import CommandWatch
 from guiderail.systems.wrench_sensor import WrenchSensor
 from guiderail.tools.benchmarks import told
 
@@ -36,7 +36,7 @@ from guiderail.tools.benchmarks import told
 CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
     (CartesianImpedanceController, "_calc_law"),
-    (CommandWatch, "_remember"),
+    (CommandWatch, "_update"),
     (CommandWatchdog, "_calc_safe_pose"),
     (ImpedanceMonitor, "_calc_contact_force"),
     (ImpedanceMonitor, "_calc_saturation"),

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from guiderail.diagrams.tasks.task import TASKS
+from guiderail.diagrams.tasks.registry import TASKS
 
 DEFAULTS: dict[str, Any] = {"algorithm": "tqc", "preset": "robust", "episodes": 60, "seed": 0}
 

@@ -12,11 +12,11 @@ from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialFor
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 
+from guiderail.diagrams.make import make_env
 from guiderail.diagrams.recording import drive_along
 from guiderail.diagrams.stations.arm import MIDDLE_OF_TURN, ArmStation, KnownArm
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector import make_env
 from guiderail.models.errors import InputError
 from guiderail.models.objects.bnc_motion import MM, insert_and_lock
 from guiderail.models.pose_coordinates import pose_to_transform
@@ -181,12 +181,12 @@ def test_arms_have_the_same_ports_and_a_reset_is_exact(robot):
 
 
 def test_a_robot_is_chosen_by_name_where_an_environment_is_made():
-    env = make_env(station="arm", robot="ur5e")
+    env = make_env("BncConnector", station="arm", robot="ur5e")
     assert env.task.diagram.GetSubsystemByName("station").plant.HasBodyNamed("ur5e_forearm")
     with pytest.raises(InputError, match="did you mean ur5e"):
-        make_env(station="arm", robot="ur5")
-    with pytest.raises(InputError, match="rails have no robot"):
-        make_env(robot="panda")
+        make_env("BncConnector", station="arm", robot="ur5")
+    with pytest.raises(InputError, match="no option 'robot' here: it is one of station='arm'"):
+        make_env("BncConnector", robot="panda")
 
 
 def test_refuses_a_robot_whose_model_moves_by_more_than_its_joints():

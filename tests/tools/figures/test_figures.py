@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
+from guiderail.models.policy import FORMAT, Policy
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.tools.figures import FIGURES, find_figure, reproduce
 from guiderail.tools.figures.chapter_3 import METHODS
 from guiderail.tools.figures.chapter_4 import LOWER, UPPER, synthetic_demonstrations, whole_trajectory
-from guiderail.tools.files import write_atomically
 from guiderail.tools.studies.declaration import load_study
 from guiderail.tools.studies.study import JUDGED, TRAINING, Job
 from guiderail.tools.tables import read_table
@@ -65,8 +65,9 @@ def finished(out, study, method, seed, endings):
     ]
     job.folder.create(job.config(len(endings)))
     job.folder.write_episodes(rows)
-    for name in ("policy.json", "policy.safetensors"):
-        write_atomically(job.folder.path / name, b"{}")
+    layer = (np.zeros((1, 1), np.float32), np.zeros(1, np.float32))
+    limits = {"observation_shape": [1], "action_low": [-1.0], "action_high": [1.0]}
+    Policy([layer], {"format": FORMAT, **limits}).save(job.folder.path)
 
 
 def test_the_figures_are_drawn_from_the_studys_runs_and_from_every_seed_there_is(tmp_path):

@@ -157,12 +157,11 @@ def test_one_thread_does_the_sums():
     [("GridClamp", "clamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "robust", "tqc")],
 )
 def test_a_task_is_learned_as_it_was_measured_unless_told_otherwise(task, preset, algorithm):
-    environment, given = with_defaults(task, {}, {"seed": 3})
-    config = configure(task, environment, **given)
+    config = configure(task, {}, **with_defaults(task, {"seed": 3}))
     assert (config.preset, config.learner.algorithm, config.seed) == (preset, algorithm, 3)
 
 
 def test_a_learner_that_was_asked_for_is_taken_whole():
-    environment, given = with_defaults("GridClamp", {"guidance": "none"}, {"algorithm": "tqc"})
-    assert (environment, given) == ({"guidance": "none"}, {"algorithm": "tqc"})
-    assert configure("GridClamp", environment, **given).preset == "robust"
+    given = with_defaults("GridClamp", {"algorithm": "tqc"})
+    assert given == {"algorithm": "tqc"}
+    assert configure("GridClamp", {"guidance": "none"}, **given).preset == "robust"

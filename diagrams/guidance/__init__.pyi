@@ -1,0 +1,9 @@
+from .guidance import Guidance as Guidance
+from .known import Approach as Approach
+from .known import Known as Known
+from .known import Template as Template
+from .primitive_skill import PrimitiveSkill as PrimitiveSkill
+from .registry import GUIDANCE as GUIDANCE
+from .registry import GuidanceKind as GuidanceKind
+from .registry import build_guidance as build_guidance
+from .registry import register_guidance as register_guidance
