@@ -134,7 +134,7 @@ def _read_npz(data: bytes) -> Recording:
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, NotImplementedError, struct.error) as error:
-        raise InputError(f"it is damaged or no .npz file: {error}") from error
+        raise InputError(f"it is damaged or no .npz file: {brief(str(error))}") from error
 
 
 def _refuse_large_directory(data: bytes) -> None:
@@ -142,8 +142,8 @@ def _refuse_large_directory(data: bytes) -> None:
     if data[:6] == b"\x93NUMPY":
         raise InputError("it is a single array (.npy): save `times` and `outputs` with numpy.savez")
     end = data[-22:]
-    if len(end) < 22 or end[:4] != b"PK\x05\x06":
-        raise InputError("it is damaged or no .npz file: its end is missing")
+    if data[:4] != b"PK\x03\x04" or end[:4] != b"PK\x05\x06":
+        raise InputError("it is damaged or no .npz file: its beginning or its end is missing")
     (size,) = struct.unpack("<L", end[12:16])
     if size > _LARGEST_DIRECTORY or data[-42:-38] == b"PK\x06\x07":
         raise InputError("it holds too many arrays: save `times` and `outputs` alone")

@@ -63,10 +63,11 @@ class Demonstrations:
         for m, t in enumerate(self.times):
             if len(t) < 2:
                 raise InputError(f"demonstration {m} has {len(t)} point: a motion needs at least two")
-            if not (np.diff(t) > 0).all():
-                at = int(np.argmax(np.diff(t) <= 0)) + 1
+            if not (t[1:] > t[:-1]).all():
+                at = int(np.argmax(t[1:] <= t[:-1])) + 1
                 raise InputError(f"demonstration {m}'s time does not increase at sample {at}: sort or drop samples")
-        self.names = tuple(names) if names is not None else tuple(f"y{o + 1}" for o in range(self.num_outputs))
+        default = [f"y{o + 1}" for o in range(self.num_outputs)]
+        self.names: tuple[str, ...] = tuple(default if names is None else _listed(names, "names"))
         if len(self.names) != self.num_outputs:
             raise InputError(f"there are {len(self.names)} names for {self.num_outputs} outputs")
         for name in self.names:
@@ -78,7 +79,7 @@ class Demonstrations:
         times, outputs = [], []
         for t, y in zip(self.times, self.outputs, strict=True):
             new = np.ones(len(t), dtype=bool)
-            new[1:] = (np.diff(t) != 0) | (np.diff(y, axis=0) != 0).any(axis=1)
+            new[1:] = (t[1:] != t[:-1]) | (y[1:] != y[:-1]).any(axis=1)
             times.append(t[new])
             outputs.append(y[new])
         self.times, self.outputs = tuple(times), tuple(outputs)
@@ -162,4 +163,4 @@ def _listed(values: Any, what: str) -> list[Any]:
     try:
         return list(values)
     except TypeError as error:
-        raise InputError(f"{what} must be a sequence with an array for each demonstration") from error
+        raise InputError(f"{what} must be a list, not {brief(values)}") from error

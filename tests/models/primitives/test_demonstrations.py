@@ -68,8 +68,8 @@ def test_a_sample_logged_twice_counts_once():
         ([[0.0, 1.0]], [[[10**400], [2.0]]], "not an array of numbers"),
         ([np.array([0, 1], dtype="M8[s]")], [[[1.0], [2.0]]], "not an array of numbers"),
         ([[0, 2**60]], [[[1.0], [2.0]]], "beyond|and more"),
-        (0.0, [[[1.0], [2.0]]], "times must be a sequence"),
-        ([[0.0, 1.0]], 1.0, "outputs must be a sequence"),
+        (0.0, [[[1.0], [2.0]]], "times must be a list"),
+        ([[0.0, 1.0]], 1.0, "outputs must be a list"),
         ([[0.0, 1.0]] * 2, [[[1.0], [2.0]]], "2 time vectors"),
     ],
 )
