@@ -1,5 +1,8 @@
 """What a person is told when what they gave makes no sense."""
 
+import reprlib
+from typing import Any
+
 
 class InputError(ValueError):
     """Something from outside is wrong: data, a file, an argument, a name.
@@ -7,3 +10,13 @@ class InputError(ValueError):
     Its message is one sentence that names the thing and the remedy; the command prints it and exits with code 2.
     Everything that is raised because of what a user gave is of this type, so that nothing else is ever mistaken for it.
     """
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
+_SHORT.maxlevel = 3
+
+
+def brief(value: Any) -> str:
+    """A value as a sentence can quote it: its repr, on one line, short however large the value is."""
+    return " ".join(_SHORT.repr(value).split())

@@ -2,9 +2,9 @@
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import linprog
 
 from guiderail.models.errors import InputError
+from guiderail.models.primitives.arrays import numbers
 from guiderail.models.primitives.least_norm import solve_least_norm
 
 
@@ -25,7 +25,7 @@ class LinearConstraints:
         Raises:
             InputError: if shapes don't fit, a number is not finite, or no output satisfies all constraints of a step.
         """
-        self.G, self.c = np.array(G, dtype=float), np.array(c, dtype=float)
+        self.G, self.c = numbers(G, "G"), numbers(c, "c")
         if self.G.ndim not in (2, 3) or self.c.shape != self.G.shape[:-1]:
             raise InputError(
                 f"constraints need G of shape (F, O) with c of shape (F,), or (N, F, O) with (N, F), "
@@ -42,7 +42,7 @@ class LinearConstraints:
         Raises:
             InputError: if a lower bound exceeds its upper bound, or a bound is NaN or infinite at some steps only.
         """
-        lower, upper = np.broadcast_arrays(np.asarray(lower, dtype=float), np.asarray(upper, dtype=float))
+        lower, upper = _same_shape(numbers(lower, "a lower bound"), numbers(upper, "an upper bound"))
         if lower.ndim not in (1, 2) or np.isnan(lower).any() or np.isnan(upper).any():
             raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
         num_outputs = lower.shape[-1]
@@ -111,6 +111,8 @@ class LinearConstraints:
     def _refuse_contradictions(self) -> None:
         if self.num_constraints == 0:
             return
+        from scipy.optimize import linprog  # half a second to import, and who reads a file needs none
+
         G = self.G.reshape(-1, *self.G.shape[-2:])
         c = self.c.reshape(-1, self.c.shape[-1])
         flat = np.concatenate([G.reshape(len(G), -1), c], axis=1)
@@ -130,3 +132,11 @@ class LinearConstraints:
                     f"the constraints{where} contradict each other: no output satisfies all {self.num_constraints} of "
                     "them; loosen c or remove a row of G"
                 )
+
+
+def _same_shape(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        lower, upper = np.broadcast_arrays(lower, upper)
+    except ValueError as error:
+        raise InputError(f"box bounds must have the same shape, not {lower.shape} and {upper.shape}") from error
+    return lower, upper

@@ -1,14 +1,14 @@
 """Demonstrations: what a person showed (thesis, section 2.2.2)."""
 
-import csv
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
+from guiderail.models.primitives import demonstration_files
+from guiderail.models.primitives.arrays import numbers
 
 
 class Demonstrations:
@@ -38,14 +38,15 @@ class Demonstrations:
             InputError: if there is no demonstration, one has fewer than two points, shapes or dimensions differ, a
                 number is not finite, or time does not increase strictly.
         """
-        self.outputs = tuple(_array(y, f"demonstration {m}") for m, y in enumerate(outputs))
+        self.outputs = tuple(numbers(y, f"demonstration {m}") for m, y in enumerate(_listed(outputs, "outputs")))
         if not self.outputs:
             raise InputError("there is no demonstration: give at least one")
-        common = len(times) > 0 and np.ndim(times[0]) == 0
-        clocks = [times] * len(self.outputs) if common else list(times)
+        clocks = _listed(times, "times")
+        if clocks and np.isscalar(clocks[0]):
+            clocks = [times] * len(self.outputs)
         if len(clocks) != len(self.outputs):
             raise InputError(f"there are {len(clocks)} time vectors for {len(self.outputs)} demonstrations")
-        self.times = tuple(_array(t, f"demonstration {m}'s time") for m, t in enumerate(clocks))
+        self.times = tuple(numbers(t, f"demonstration {m}'s time") for m, t in enumerate(clocks))
         for m, (t, y) in enumerate(zip(self.times, self.outputs, strict=True)):
             if t.ndim != 1 or y.ndim != 2 or len(t) != len(y):
                 raise InputError(
@@ -62,18 +63,23 @@ class Demonstrations:
         for m, t in enumerate(self.times):
             if len(t) < 2:
                 raise InputError(f"demonstration {m} has {len(t)} point: a motion needs at least two")
-            if not (np.diff(t) > 0).all():
-                at = int(np.argmax(np.diff(t) <= 0)) + 1
+            if not (t[1:] > t[:-1]).all():
+                at = int(np.argmax(t[1:] <= t[:-1])) + 1
                 raise InputError(f"demonstration {m}'s time does not increase at sample {at}: sort or drop samples")
-        self.names = tuple(names) if names is not None else tuple(f"y{o + 1}" for o in range(self.num_outputs))
+        default = [f"y{o + 1}" for o in range(self.num_outputs)]
+        self.names: tuple[str, ...] = tuple(default if names is None else _listed(names, "names"))
         if len(self.names) != self.num_outputs:
             raise InputError(f"there are {len(self.names)} names for {self.num_outputs} outputs")
+        for name in self.names:
+            if not (isinstance(name, str) and name.isprintable() and name == name.strip() and len(name) <= 200):
+                raise InputError(f"an output can't be named {brief(name)}: use a short text that can be printed")
 
     def _drop_repeated_samples(self) -> None:
         """A recorder that is faster than its robot logs a sample twice, time and all: that is one sample."""
         times, outputs = [], []
         for t, y in zip(self.times, self.outputs, strict=True):
-            new = np.append(True, (np.diff(t) != 0) | (np.diff(y, axis=0) != 0).any(axis=1))
+            new = np.ones(len(t), dtype=bool)
+            new[1:] = (t[1:] != t[:-1]) | (y[1:] != y[:-1]).any(axis=1)
             times.append(t[new])
             outputs.append(y[new])
         self.times, self.outputs = tuple(times), tuple(outputs)
@@ -124,83 +130,37 @@ class Demonstrations:
             InputError: if the ending is neither.
         """
         path = Path(path)
-        lengths = np.array([len(t) for t in self.times])
-        if path.suffix == ".npz":
-            np.savez_compressed(
-                path,
-                lengths=lengths,
-                times=np.concatenate(self.times),
-                outputs=np.concatenate(self.outputs),
-                names=np.array(self.names),
-            )
-        elif path.suffix == ".csv":
-            with path.open("w", newline="") as file:
-                writer = csv.writer(file)
-                writer.writerow(["demonstration", "time", *self.names])
-                for m, (t, y) in enumerate(zip(self.times, self.outputs, strict=True)):
-                    writer.writerows(
-                        [m, repr(float(a)), *(repr(float(v)) for v in b)] for a, b in zip(t, y, strict=True)
-                    )
-        else:
+        writer = {".npz": demonstration_files.write_npz, ".csv": demonstration_files.write_csv}.get(path.suffix)
+        if writer is None:
             raise InputError(f"cannot write demonstrations to '{path.name}': use the ending .npz or .csv")
+        writer(path, self.times, self.outputs, self.names)
 
     @classmethod
     def load(cls, path: str | Path) -> "Demonstrations":
-        """Reads what `save` writes; an `.npz` may also hold `times` (N,) or (M, N) with `outputs` (M, N, O).
+        """Reads what `save` writes, and what others write.
 
-        Nothing in a file is ever executed: arrays of Python objects are refused.
+        An `.npz` may also hold `times` (N,) or (M, N) with `outputs` (M, N, O). A `.csv` whose first line is `t` (or
+        `time`, with or without a unit) and the outputs' names is one demonstration, and a folder of such files is as
+        many. Nothing in a file is ever executed: arrays of Python objects are refused.
 
         Raises:
-            InputError: if there is no such file, it is truncated or damaged, or what it holds are no demonstrations.
+            InputError: if there is no such file, it is truncated, damaged or too large, or what it holds are no
+                demonstrations.
         """
         path = Path(path)
-        if not path.is_file():
-            raise InputError(f"there is no demonstration file '{path}'")
+        times, outputs, names = demonstration_files.read(path)
         try:
-            if path.suffix == ".npz":
-                return cls._from_npz(path)
-            if path.suffix == ".csv":
-                return cls._from_csv(path)
+            demonstrations = cls(times, outputs, names)
         except InputError as error:
             raise InputError(f"'{path}': {error}") from error
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            reason = str(error).split(". ")[0].rstrip(".")  # NumPy also advises to load what is pickled, unsafely
-            raise InputError(f"'{path}' is damaged or no demonstration file: {reason}") from error
-        raise InputError(f"cannot read demonstrations from '{path.name}': the ending must be .npz or .csv")
-
-    @classmethod
-    def _from_npz(cls, path: Path) -> "Demonstrations":
-        with np.load(path, allow_pickle=False) as file:
-            for key in ("times", "outputs"):
-                if key not in file:
-                    raise InputError(f"the array '{key}' is missing")
-            times, outputs = file["times"], file["outputs"]
-            names = [str(name) for name in file["names"]] if "names" in file else None
-            if "lengths" not in file:
-                return cls(times, list(outputs), names)
-            lengths = file["lengths"]
-            if lengths.sum() != len(times) or len(times) != len(outputs):
-                raise InputError(f"lengths add up to {lengths.sum()}, but there are {len(times)} samples")
-            cuts = np.cumsum(lengths)[:-1]
-            return cls(np.split(times, cuts), np.split(outputs, cuts), names)
-
-    @classmethod
-    def _from_csv(cls, path: Path) -> "Demonstrations":
-        with path.open(newline="") as file:
-            rows = list(csv.reader(file))
-        if not rows or rows[0][:2] != ["demonstration", "time"] or len(rows[0]) < 3:
-            raise InputError("the first line must be demonstration,time,<outputs>")
-        width = len(rows[0])
-        for number, row in enumerate(rows[1:], start=2):
-            if len(row) != width:
-                raise InputError(f"line {number} has {len(row)} fields, the header has {width}")
-        samples = np.array([[float(value) for value in row] for row in rows[1:]]).reshape(-1, width)
-        parts = [samples[samples[:, 0] == m] for m in np.unique(samples[:, 0])]
-        return cls([part[:, 1] for part in parts], [part[:, 2:] for part in parts], rows[0][2:])
+        on_one_clock = demonstrations.num_demonstrations * max(map(np.size, demonstrations.outputs))
+        if on_one_clock > 2 * demonstration_files.MOST_NUMBERS:
+            raise InputError(f"'{path}': one demonstration has far more samples than the others: thin it out")
+        return demonstrations
 
 
-def _array(values: ArrayLike, what: str) -> np.ndarray:
+def _listed(values: Any, what: str) -> list[Any]:
     try:
-        return np.array(values, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{what} is not an array of numbers: {error}") from error
+        return list(values)
+    except TypeError as error:
+        raise InputError(f"{what} must be a list, not {brief(values)}") from error

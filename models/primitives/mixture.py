@@ -3,15 +3,20 @@
 scikit-learn fits the mixture, gmr conditions it; what stands here is what neither knows: that the first column is time.
 """
 
+from __future__ import annotations
+
 import warnings
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from gmr import GMM
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.mixture import GaussianMixture
 
 from guiderail.models.errors import InputError
+
+# Importing them takes over a second, which who only reads a file need not wait for.
+if TYPE_CHECKING:
+    from gmr import GMM
+    from sklearn.mixture import GaussianMixture
 
 # Variance added to every component, relative to the data's own: what keeps EM alive where demonstrations coincide.
 _REGULARIZATION = 1e-6
@@ -42,6 +47,8 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     Raises:
         InputError: if there are fewer points than components need.
     """
+    from gmr import GMM
+
     data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
     center, deviation = data.mean(axis=0), data.std(axis=0)
     scale = np.where(deviation > 0, deviation, 1.0)
@@ -67,6 +74,9 @@ def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _fit(data: np.ndarray, slices: np.ndarray, components: int, seed: int) -> GaussianMixture:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
     label = np.minimum((slices * components).astype(int), components - 1)
     parts = [data[label == c] for c in range(components)]
     floor = 10 * _REGULARIZATION * np.eye(data.shape[1])

@@ -3,6 +3,7 @@
 import numpy as np
 
 from guiderail.models.errors import InputError
+from guiderail.models.primitives.arrays import numbers
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.mixture import fit_mixture, regress
 
@@ -30,8 +31,8 @@ class ReferenceTrajectory:
             InputError: if shapes don't fit, a number is not finite, times don't increase, or a covariance is not
                 symmetric or not positive definite.
         """
-        self.times, self.means = np.array(times, dtype=float), np.array(means, dtype=float)
-        self.covariances = np.array(covariances, dtype=float)
+        self.times, self.means = numbers(times, "times"), numbers(means, "means")
+        self.covariances = numbers(covariances, "covariances")
         if self.times.ndim != 1 or len(self.times) < 2:
             raise InputError(f"a reference trajectory needs at least two times of shape (N,), not {self.times.shape}")
         n = len(self.times)

@@ -23,7 +23,7 @@ from guiderail.models.skills.geometry import (
     tilt_axis,
     with_position_in,
 )
-from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, interpolate, register, require
+from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, interpolate, register, require, require_three
 
 UNBOUNDED = 1e3  # [m] farther than any robot of ours reaches
 
@@ -78,7 +78,8 @@ class HalfSpace(PositionConstraint):
     frame: str = WORLD
 
     def __post_init__(self) -> None:
-        require(len(self.normal) == 3 and np.any(self.normal), f"normal must be three numbers, not {self.normal}.")
+        require_three(self.normal, "normal")
+        require(np.linalg.norm(self.normal) > 1e-6, f"normal must not be zero: {self.normal}.")
 
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
@@ -96,7 +97,8 @@ class Box(PositionConstraint):
     frame: str = WORLD
 
     def __post_init__(self) -> None:
-        require(len(self.lower_m) == len(self.upper_m) == 3, "lower_m and upper_m must be three numbers each.")
+        require_three(self.lower_m, "lower_m")
+        require_three(self.upper_m, "upper_m")
         require(np.all(np.less_equal(self.lower_m, self.upper_m)), "lower_m must not exceed upper_m.")
 
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
@@ -212,7 +214,7 @@ class FixedOrientation(ActiveConstraint):
     frame: str = WORLD
 
     def __post_init__(self) -> None:
-        require(len(self.rpy_deg) == 3, f"rpy_deg must be three angles, not {len(self.rpy_deg)}.")
+        require_three(self.rpy_deg, "rpy_deg")
 
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
         R_FE = rotation_deg(self.rpy_deg)
@@ -284,6 +286,7 @@ class TiltLimits(TiltConstraint):
     turns_along: bool = False
 
     def __post_init__(self) -> None:
+        require_three(self.rpy_deg, "rpy_deg")
         require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
 
     def limits_deg(self, distance_m: float) -> tuple[float, float]:
@@ -302,6 +305,7 @@ class TiltByDistance(TiltConstraint):
     turns_along: bool = False
 
     def __post_init__(self) -> None:
+        require_three(self.rpy_deg, "rpy_deg")
         require(
             len(self.distance_m) == len(self.tilt_deg) >= 1 and np.all(np.diff(self.distance_m) > 0),
             "distance_m must increase, with one tilt_deg for each distance.",
@@ -330,6 +334,7 @@ class Arc(ActiveConstraint):
 
     def __post_init__(self) -> None:
         require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
+        require_three(self.rpy_deg, "rpy_deg")
         require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
 
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:

@@ -1,6 +1,7 @@
 """A skill's state machine, drawn: as Graphviz text for those who have it, as a picture for everyone."""
 
 from pathlib import Path
+from typing import Any
 
 from guiderail.models.errors import InputError
 from guiderail.models.skills.skill import Skill, SkillState
@@ -29,13 +30,19 @@ def edges(skill: Skill) -> list[tuple[str, str, str]]:
 
 def to_dot(skill: Skill) -> str:
     """The state machine in Graphviz's language."""
-    lines = [f'digraph "{skill.name}" {{', "  rankdir=LR;", "  node [shape=box, style=rounded];"]
+    lines = [f"digraph {_quoted(skill.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
     for number, state in enumerate(skill.states):
-        label = "\\n".join([state.name.upper(), *state_lines(state)])
+        label = "\n".join([state.name.upper(), *state_lines(state)])
         emphasis = ", penwidth=2" if number == skill.initial_state else ""
-        lines.append(f'  "{state.name}" [label="{label}"{emphasis}];')
-    lines += [f'  "{start}" -> "{end}" [label="{condition}"];' for start, end, condition in edges(skill)]
+        lines.append(f"  {_quoted(state.name)} [label={_quoted(label)}{emphasis}];")
+    lines += [f"  {_quoted(start)} -> {_quoted(end)} [label={_quoted(said)}];" for start, end, said in edges(skill)]
     return "\n".join([*lines, "}"]) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """A name or a label in Graphviz's language, whatever a person called their states."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    return f'"{escaped}"'
 
 
 def draw(skill: Skill, path: str | Path) -> None:
@@ -56,6 +63,7 @@ def draw(skill: Skill, path: str | Path) -> None:
     axes.set_axis_off()
     axes.set_xlim(-width / 2 - 0.2, (len(skill.states) - 1) * (width + gap) + width / 2 + 0.2)
     axes.set_ylim(-1.4, 1.4)
+    plain: Any = {"parse_math": False}  # a name with a dollar is a name
     where = {state.name: i * (width + gap) for i, state in enumerate(skill.states)}
     for number, state in enumerate(skill.states):
         box = {
@@ -65,7 +73,9 @@ def draw(skill: Skill, path: str | Path) -> None:
             "linewidth": 2.2 if number == skill.initial_state else 1.0,
         }
         text = "\n".join([state.name.upper(), *state_lines(state)])
-        axes.text(where[state.name], 0.0, text, ha="center", va="center", fontsize=8, linespacing=1.4, bbox=box)
+        axes.text(
+            where[state.name], 0.0, text, ha="center", va="center", fontsize=8, linespacing=1.4, bbox=box, **plain
+        )
     for start, end, condition in edges(skill):
         forward = where[end] > where[start]
         side = 1.0 if forward else -1.0
@@ -88,5 +98,5 @@ def draw(skill: Skill, path: str | Path) -> None:
             fontsize=8,
             color="#33506b",
         )
-    axes.set_title(f"{skill.name}: {skill.inputs} inputs", fontsize=10)
+    axes.set_title(f"{skill.name}: {skill.inputs} inputs", fontsize=10, **plain)
     figure.savefig(path, dpi=120)

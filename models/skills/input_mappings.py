@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from guiderail.models.skills.geometry import WORLD, Frames, about, bearing, position_in, tilt_axis
-from guiderail.models.skills.kinds import INPUT_MAPPINGS, interpolate, register, require
+from guiderail.models.skills.kinds import INPUT_MAPPINGS, interpolate, register, require, require_three
 
 TOOL = "tool"
 
@@ -43,9 +43,14 @@ def axes_in_world(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarra
 
 
 def _require_axes(inputs: tuple[int, ...], axes: tuple[tuple[float, ...], ...]) -> None:
-    require(len(inputs) == len(axes), f"{len(inputs)} inputs need as many axes, not {len(axes)}.")
+    require(len(inputs) == len(axes) > 0, f"{len(inputs)} inputs need as many axes, and at least one, not {len(axes)}.")
     for axis in axes:
-        require(len(axis) == 3 and np.any(axis), f"an axis must be three numbers that are not all zero, not {axis}.")
+        require_three(axis, "an axis")
+        require(np.any(axis), "an axis must not be all zero.")
+
+
+def _require_object(frame: str) -> None:
+    require(frame != TOOL, "frame must be an object's, not the tool's own.")
 
 
 @register(INPUT_MAPPINGS, "translation")
@@ -106,6 +111,7 @@ class TiltTowards(InputMapping):
     frame: str
 
     def __post_init__(self) -> None:
+        _require_object(self.frame)
         require(len(self.inputs) == 2, f"tilt_towards needs two inputs, x and y, not {len(self.inputs)}.")
         require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
 
@@ -131,6 +137,7 @@ class Scaled(InputMapping):
     of: InputMapping
 
     def __post_init__(self) -> None:
+        _require_object(self.frame)
         require(
             len(self.distance_m) == len(self.factor) >= 1 and np.all(np.diff(self.distance_m) > 0),
             "distance_m must increase, with one factor for each distance.",

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 
 INPUT_MAPPINGS: dict[str, type] = {}
 ACTIVE_CONSTRAINTS: dict[str, type] = {}
@@ -56,10 +56,10 @@ def build(registry: dict[str, type], data: Any, where: str, number: Callable[[An
         InputError: if the kind or a field is unknown, missing, or not what the kind accepts.
     """
     if not isinstance(data, Mapping) or "kind" not in data:
-        raise InputError(f"{where} must be a mapping with a 'kind', such as {sorted(registry)[0]}, not {data!r}.")
+        raise InputError(f"{where} must be a mapping with a 'kind', such as {sorted(registry)[0]}, not {brief(data)}.")
     name = data["kind"]
-    if name not in registry:
-        raise InputError(f"{where}: unknown kind {name!r}; {did_you_mean(str(name), registry)}.")
+    if not isinstance(name, str) or name not in registry:
+        raise InputError(f"{where}: unknown kind {brief(name)}; {did_you_mean(str(name), registry)}.")
     kind = registry[name]
     fields = {field.name: field for field in dataclasses.fields(kind)}
     where = f"{where} ({name})"
@@ -68,7 +68,7 @@ def build(registry: dict[str, type], data: Any, where: str, number: Callable[[An
         if key == "kind":
             continue
         if key not in fields:
-            raise InputError(f"{where}: unknown field {key!r}; {did_you_mean(str(key), fields)}.")
+            raise InputError(f"{where}: unknown field {brief(key)}; {did_you_mean(str(key), fields)}.")
         values[key] = convert(fields[key].type, value, f"{where}, {key}", registry, number)
     missing = [
         field.name
@@ -91,25 +91,25 @@ def convert(
     """What a field of the type `annotation` makes of an entry of the file."""
     if annotation is str:
         if not isinstance(value, str):
-            raise InputError(f"{where} must be a name, not {value!r}.")
+            raise InputError(f"{where} must be a name, not {brief(value)}.")
         return value
     if annotation is bool:
         if not isinstance(value, bool):
-            raise InputError(f"{where} must be true or false, not {value!r}.")
+            raise InputError(f"{where} must be true or false, not {brief(value)}.")
         return value
     if annotation == tuple[int, ...]:
-        if not isinstance(value, list) or not all(isinstance(entry, int) for entry in value):
-            raise InputError(f"{where} must be a list of whole numbers, not {value!r}.")
+        if not isinstance(value, list) or not all(type(entry) is int for entry in value):
+            raise InputError(f"{where} must be a list of whole numbers, not {brief(value)}.")
         return tuple(value)
     if annotation is float:
         return number(value, where)
     if annotation == tuple[float, ...]:
         if not isinstance(value, list):
-            raise InputError(f"{where} must be a list of numbers, not {value!r}.")
+            raise InputError(f"{where} must be a list of numbers, not {brief(value)}.")
         return tuple(number(entry, where) for entry in value)
     if annotation == tuple[tuple[float, ...], ...]:
         if not isinstance(value, list) or not all(isinstance(row, list) for row in value):
-            raise InputError(f"{where} must be a list of lists of numbers, not {value!r}.")
+            raise InputError(f"{where} must be a list of lists of numbers, not {brief(value)}.")
         return tuple(tuple(number(entry, where) for entry in row) for row in value)
     return build(registry, value, where, number)  # a kind inside a kind, such as `scaled`
 
@@ -118,6 +118,11 @@ def require(condition: Any, sentence: str) -> None:
     """Refuses a field of a kind with a sentence that names the remedy."""
     if not condition:
         raise InputError(sentence)
+
+
+def require_three(values: tuple[float, ...], name: str) -> None:
+    """Refuses a field that is no position, direction or set of angles."""
+    require(len(values) == 3, f"{name} must be three numbers, not {brief(values)}.")
 
 
 def interpolate(x: float, xs: tuple[float, ...], ys: tuple[float, ...]) -> float:

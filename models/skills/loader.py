@@ -8,11 +8,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
+import numpy as np
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.skills import active_constraints, input_mappings, transition_distances
 from guiderail.models.skills.geometry import WORLD
+from guiderail.models.skills.input_mappings import TOOL
 from guiderail.models.skills.kinds import (
     ACTIVE_CONSTRAINTS,
     INPUT_MAPPINGS,
@@ -21,6 +22,7 @@ from guiderail.models.skills.kinds import (
     did_you_mean,
 )
 from guiderail.models.skills.skill import Skill, SkillState, Transition
+from guiderail.models.yaml_files import load_yaml, parse_yaml
 
 # Importing them is what registers the kinds.
 KINDS = (active_constraints, input_mappings, transition_distances)
@@ -32,6 +34,10 @@ OPERATORS: dict[type, Callable[..., float]] = {
     ast.Div: operator.truediv,
     ast.USub: operator.neg,
 }
+MOST_STATES = 30
+MOST_PARTS = 30  # mappings, constraints or transitions of one state
+LONGEST_EXPRESSION = 200  # characters
+LARGEST_NUMBER = 1e6  # in any unit of a skill: metres, degrees, radians, seconds
 SKILL_FIELDS = {
     "name",
     "inputs",
@@ -57,38 +63,46 @@ def load_skill(source: str | Path, **parameters: float) -> Skill:
     path = Path(source)
     if path.suffix not in (".yaml", ".yml"):
         known = resources.files("guiderail.models.skills")
+        names = [Path(str(f)).stem for f in known.iterdir() if str(f).endswith(".yaml")]
+        if str(source) not in names:
+            raise InputError(f"There is no skill {brief(str(source))}; {did_you_mean(str(source), names)}")
         path = Path(str(known / f"{source}.yaml"))
-        if not path.is_file():
-            names = [Path(str(f)).stem for f in known.iterdir() if str(f).endswith(".yaml")]
-            raise InputError(f"There is no skill {str(source)!r}; {did_you_mean(str(source), names)}")
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"The skill {path} can't be read ({error}); check the path.") from error
-    return parse_skill(text, path.name, **parameters)
+    return _skill(load_yaml(path, "skill"), path.name, parameters)
 
 
 def parse_skill(text: str, where: str = "skill", **parameters: float) -> Skill:
     """Like load_skill, from the YAML text itself; `where` names it in messages."""
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"{where} is not YAML: {' '.join(str(error).split())}.") from error
+    return _skill(parse_yaml(text, where), where, parameters)
+
+
+def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> Skill:
     data = _mapping(data, where, SKILL_FIELDS, required=SKILL_FIELDS - {"frames", "parameters", "initial_state"})
     number = _Numbers(_parameters(data.get("parameters", {}), parameters, where))
 
     frames = data.get("frames", [])
-    if not isinstance(frames, list) or not all(isinstance(f, str) for f in frames) or len({*frames}) < len(frames):
-        raise InputError(f"{where}: frames must be a list of different names, not {frames!r}.")
+    if not isinstance(frames, list) or not all(map(_is_name, frames)) or len({*frames}) < len(frames):
+        raise InputError(f"{where}: frames must be a list of different names, not {brief(frames)}.")
+    for reserved in (WORLD, TOOL):
+        if reserved in frames:
+            raise InputError(f"{where}: {reserved} is always there; call that object's frame something else.")
     inputs = data["inputs"]
-    if not isinstance(inputs, int) or not 1 <= inputs <= 6:
-        raise InputError(f"{where}: inputs must be a whole number from 1 to 6, not {inputs!r}.")
+    if not isinstance(inputs, int) or isinstance(inputs, bool) or not 1 <= inputs <= 6:
+        raise InputError(f"{where}: inputs must be a whole number from 1 to 6, not {brief(inputs)}.")
     states = data["states"]
     if not isinstance(states, dict) or not states:
         raise InputError(f"{where}: states must be a mapping from names to states, with at least one.")
+    if len(states) > MOST_STATES:
+        raise InputError(f"{where}: {len(states)} states are more than {MOST_STATES}; make two skills of it.")
+    for name in states:
+        if not _is_name(name):
+            raise InputError(f"{where}: {brief(name)} can't name a state; take a short word.")
     initial = data.get("initial_state", next(iter(states)))
-    if initial not in states:
-        raise InputError(f"{where}: initial_state {initial!r} is not a state; {did_you_mean(str(initial), states)}")
+    if not isinstance(initial, str) or initial not in states:
+        raise InputError(
+            f"{where}: initial_state {brief(initial)} is not a state; {did_you_mean(str(initial), states)}"
+        )
+    if not _is_name(data["name"]):
+        raise InputError(f"{where}: name must be a short text, not {brief(data['name'])}.")
 
     speeds = {key: number(data[key], f"{where}, {key}") for key in ("max_speed_m_per_s", "max_speed_rad_per_s")}
     for key, speed in speeds.items():
@@ -96,7 +110,7 @@ def parse_skill(text: str, where: str = "skill", **parameters: float) -> Skill:
             raise InputError(f"{where}: {key} must be positive, not {speed}.")
     built = tuple(_state(name, state, f"{where}, state {name}", number) for name, state in states.items())
     skill = Skill(
-        name=str(data["name"]),
+        name=data["name"],
         inputs=inputs,
         frames=tuple(frames),
         states=built,
@@ -115,39 +129,54 @@ class _Numbers:
         self.names = names
 
     def __call__(self, entry: Any, where: str) -> float:
-        if isinstance(entry, str):
-            try:
-                value = self._evaluate(ast.parse(entry, mode="eval").body, where)
-            except (SyntaxError, ZeroDivisionError) as error:
-                raise InputError(f"{where}: {entry!r} is not arithmetic on the parameters; mend it.") from error
-        elif isinstance(entry, int | float) and not isinstance(entry, bool):
-            value = float(entry)
-        else:
-            raise InputError(f"{where} must be a number, not {entry!r}.")
+        try:
+            value = self._value(entry, where)
+        except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{where}: {brief(entry)} is not arithmetic on the parameters; mend it.") from error
         if not math.isfinite(value):
-            raise InputError(f"{where} must be a finite number, not {entry!r}.")
+            raise InputError(f"{where} must be a finite number, not {brief(entry)}.")
+        if abs(value) > LARGEST_NUMBER:
+            raise InputError(f"{where} must be at most a million, not {brief(entry)}; mind its unit.")
         return value
 
+    def _value(self, entry: Any, where: str) -> float:
+        if isinstance(entry, str):
+            if len(entry) > LONGEST_EXPRESSION:
+                raise InputError(f"{where}: {brief(entry)} is too long; make parts of it parameters.")
+            return self._evaluate(ast.parse(entry.strip(), mode="eval").body, where)
+        if isinstance(entry, int | float) and not isinstance(entry, bool):
+            return float(entry)
+        raise InputError(f"{where} must be a number, not {brief(entry)}.")
+
     def _evaluate(self, node: ast.expr, where: str) -> float:
-        if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
             return float(node.value)
         if isinstance(node, ast.Name):
             if node.id not in self.names:
-                raise InputError(f"{where}: there is no parameter {node.id!r}; {did_you_mean(node.id, self.names)}")
+                raise InputError(
+                    f"{where}: there is no parameter {brief(node.id)}; {did_you_mean(node.id, self.names)}"
+                )
             return self.names[node.id]
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             return OPERATORS[type(node.op)](self._evaluate(node.left, where), self._evaluate(node.right, where))
         if isinstance(node, ast.UnaryOp) and type(node.op) in OPERATORS:
             return OPERATORS[type(node.op)](self._evaluate(node.operand, where))
-        raise InputError(f"{where}: {ast.unparse(node)!r} is not a number; use parameters with + − * / only.")
+        raise InputError(f"{where}: {brief(ast.unparse(node))} is not a number; use parameters with + − * / only.")
+
+
+def _is_name(entry: Any) -> bool:
+    """A text that can stand in a sentence and in a picture."""
+    return isinstance(entry, str) and 0 < len(entry) <= 100 and entry.isprintable()
 
 
 def _mapping(data: Any, where: str, known: set[str], required: set[str]) -> dict[str, Any]:
     if not isinstance(data, dict):
-        raise InputError(f"{where} must be a mapping with {', '.join(sorted(required))}, not {data!r}.")
+        raise InputError(f"{where} must be a mapping with {', '.join(sorted(required))}, not {brief(data)}.")
     for key in data:
         if key not in known:
-            raise InputError(f"{where}: unknown field {key!r}; {did_you_mean(str(key), known)}")
+            raise InputError(f"{where}: unknown field {brief(key)}; {did_you_mean(str(key), known)}")
     for key in sorted(required):
         if key not in data:
             raise InputError(f"{where}: {key} is missing; give it a value.")
@@ -156,14 +185,22 @@ def _mapping(data: Any, where: str, known: set[str], required: set[str]) -> dict
 
 def _parameters(defaults: Any, given: Mapping[str, float], where: str) -> dict[str, float]:
     if not isinstance(defaults, dict):
-        raise InputError(f"{where}: parameters must be a mapping from names to numbers, not {defaults!r}.")
+        raise InputError(f"{where}: parameters must be a mapping from names to numbers, not {brief(defaults)}.")
     plain = _Numbers({})
-    values = {str(name): plain(value, f"{where}, parameter {name}") for name, value in defaults.items()}
+    for name in defaults:
+        if not (_is_name(name) and name.isascii() and name.isidentifier()):
+            raise InputError(f"{where}: {brief(name)} can't name a parameter; take letters, digits and underscores.")
+    values = {name: plain(value, f"{where}, parameter {name}") for name, value in defaults.items()}
     for name, value in given.items():
         if name not in values:
-            raise InputError(f"{where} has no parameter {name!r}; {did_you_mean(name, values)}")
-        values[name] = plain(float(value), f"{where}, parameter {name}")
+            raise InputError(f"{where} has no parameter {brief(name)}; {did_you_mean(name, values)}")
+        values[name] = plain(_plain(value), f"{where}, parameter {name}")
     return values
+
+
+def _plain(value: Any) -> Any:
+    """A number of NumPy's as one of Python's."""
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _state(name: str, data: Any, where: str, number: _Numbers) -> SkillState:
@@ -186,7 +223,7 @@ def _state(name: str, data: Any, where: str, number: _Numbers) -> SkillState:
         for i, entry in enumerate(_list(data, "transitions", where))
     )
     state = SkillState(
-        name=str(name),
+        name=name,
         input_mapping=tuple(
             build(INPUT_MAPPINGS, entry, f"{where}, input_mapping {i + 1}", number)
             for i, entry in enumerate(_list(data, "input_mapping", where))
@@ -211,7 +248,9 @@ def _state(name: str, data: Any, where: str, number: _Numbers) -> SkillState:
 def _list(data: Mapping[str, Any], key: str, where: str) -> list:
     entries = data.get(key, [])
     if not isinstance(entries, list):
-        raise InputError(f"{where}: {key} must be a list, not {entries!r}.")
+        raise InputError(f"{where}: {key} must be a list, not {brief(entries)}.")
+    if len(entries) > MOST_PARTS:
+        raise InputError(f"{where}: {len(entries)} {key} are more than {MOST_PARTS}; make two states of it.")
     return entries
 
 
@@ -221,7 +260,9 @@ def _transition(data: Any, unit: str, si: float, where: str, number: _Numbers) -
     margin = si * number(data[hysteresis], f"{where}, {hysteresis}") if hysteresis in data else None
     if margin is not None and not margin > 0:
         raise InputError(f"{where}: {hysteresis} must be positive, or left out where there is no way back.")
-    return Transition(str(data["to"]), si * number(data[below], f"{where}, {below}"), margin)
+    if not isinstance(data["to"], str):
+        raise InputError(f"{where}: to must be the name of a state, not {brief(data['to'])}.")
+    return Transition(data["to"], si * number(data[below], f"{where}, {below}"), margin)
 
 
 def _check_names(skill: Skill, where: str) -> None:
@@ -231,11 +272,13 @@ def _check_names(skill: Skill, where: str) -> None:
         place = f"{where}, state {state.name}"
         for transition in state.transitions:
             if transition.to not in states:
-                raise InputError(f"{place}: there is no state {transition.to!r}; {did_you_mean(transition.to, states)}")
+                raise InputError(
+                    f"{place}: there is no state {brief(transition.to)}; {did_you_mean(transition.to, states)}"
+                )
         for frame in sorted(state.frame_names):
             if frame not in skill.frames:
                 known = (*skill.frames, WORLD)
-                raise InputError(f"{place}: there is no frame {frame!r}; {did_you_mean(frame, known)}")
+                raise InputError(f"{place}: there is no frame {brief(frame)}; {did_you_mean(frame, known)}")
         for mapping in state.input_mapping:
             for used in mapping.used_inputs:
                 if not 0 <= used < skill.inputs:

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.models.skills.active_constraints import TiltLimits, axes
 from guiderail.models.skills.geometry import WORLD, Frames, angle_between, position_in, rotation_deg
-from guiderail.models.skills.kinds import TRANSITION_DISTANCES, register, require
+from guiderail.models.skills.kinds import TRANSITION_DISTANCES, register, require, require_three
 
 
 class TransitionDistance(ABC):
@@ -35,6 +35,9 @@ class Distance(TransitionDistance):
 
     frame: str
     point_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        require_three(self.point_m, "point_m")
 
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         p_PE = position_in(self.frame, X_WE, frames) - self.point_m
@@ -75,6 +78,7 @@ class TiltToGo(TransitionDistance):
     unit = "deg"
 
     def __post_init__(self) -> None:
+        require_three(self.rpy_deg, "rpy_deg")
         require(-180 <= self.until_deg <= 180, f"until_deg must be between −180 and 180, not {self.until_deg}.")
 
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
@@ -90,6 +94,9 @@ class RotationToGo(TransitionDistance):
     rpy_deg: tuple[float, ...]
     frame: str = WORLD
     unit = "deg"
+
+    def __post_init__(self) -> None:
+        require_three(self.rpy_deg, "rpy_deg")
 
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return angle_between(X_WE.rotation(), axes(self.frame, frames).multiply(rotation_deg(self.rpy_deg)))

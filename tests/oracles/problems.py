@@ -39,9 +39,16 @@ class Problem:
 
 
 def random_problem(
-    seed: int, history_variance: float = 1e-4, history_noise: float = 1e-3, inverse_length: float | None = None
+    seed: int,
+    history_variance: float = 1e-4,
+    history_noise: float = 1e-3,
+    inverse_length: float | None = None,
+    box: bool = False,
 ) -> Problem:
-    """O = 1…6, F = 0…8, H = 5…60, P = 0…15, correlated covariances, horizons past the end, constraints that bite."""
+    """O = 1…6, F = 0…8, H = 5…60, P = 0…15, correlated covariances, horizons past the end, constraints that bite.
+
+    With `box`, two parallel planes for some of the rows instead of one, in any order.
+    """
     rng = np.random.default_rng(seed)
     outputs, rows, H, P = rng.integers(1, 7), rng.integers(0, 9), rng.integers(5, 61), rng.integers(0, 16)
     N = 80
@@ -57,6 +64,8 @@ def random_problem(
     inside = means.mean(axis=0)
     G = rng.standard_normal((rows, outputs)) / scale
     c = G @ inside - rng.uniform(0.1, 0.8, rows)
+    if box:
+        G, c = _slabs(seed, rows, scale, inside)
     inverse_length = rng.uniform(1, 6) if inverse_length is None else inverse_length
     step = int(rng.integers(0, N))
     primitive = LcNsKmp(
@@ -75,3 +84,13 @@ def random_problem(
         history = means[past] + history_noise * scale * rng.standard_normal((P, outputs))
     action = rng.standard_normal(outputs) * 30 / scale * rng.choice([0.1, 1, 10])
     return Problem(primitive, step, action, history, inverse_length)
+
+
+def _slabs(seed: int, rows: int, scale: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng([seed, 1])
+    G = rng.standard_normal((rows + 1, len(scale))) / scale
+    opposite = rng.uniform(size=rows + 1) < 0.7
+    G = np.vstack([G, -G[opposite]])
+    c = G @ inside - rng.uniform(0.1, 0.8, len(G))
+    order = rng.permutation(len(G))
+    return G[order], c[order]

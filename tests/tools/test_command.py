@@ -170,8 +170,6 @@ def test_help_names_the_choices(capsys):
 @pytest.mark.parametrize(
     "arguments", [["--help"], ["train", "--help"], ["study", "--help"], ["list", "tasks"], ["--version"]]
 )
-    "arguments", [["--help"], ["train", "--help"], ["study", "--help"], ["list", "tasks"], ["--version"]]
-)
 def test_help_needs_neither_pytorch_nor_drake(arguments):
     code = f"import sys; from guiderail.tools.command import main\ntry: main({arguments})\nexcept SystemExit: pass\n"
     check = code + "assert not {'torch', 'pydrake', 'stable_baselines3', 'matplotlib'} & set(sys.modules)"

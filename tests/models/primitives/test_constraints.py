@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import LinearConstraints
@@ -59,4 +61,117 @@ def test_equal_bounds_are_no_contradiction():
 @pytest.mark.parametrize(("G", "c"), [([[1.0]], [1.0, 2.0]), ([1.0], [1.0]), ([[np.nan]], [0.0]), ([[1.0]], [np.inf])])
 def test_refuses_shapes_and_numbers(G, c):
     with pytest.raises(InputError):
+        LinearConstraints(G, c)
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def polytope(seed, steps=None):
+    """Half spaces around a point, of any length of row, and that point."""
+    rng = np.random.default_rng(seed)
+    outputs, rows = rng.integers(1, 5), rng.integers(1, 7)
+    shape = (rows, outputs) if steps is None else (steps, rows, outputs)
+    G = rng.standard_normal(shape) * 10 ** rng.uniform(-3, 3, (*shape[:-1], 1))
+    inside = rng.standard_normal(outputs)
+    size = np.linalg.norm(G, axis=-1)
+    return rng, G, G @ inside - size * rng.uniform(0.01, 1, shape[:-1]), inside
+
+
+@given(SEEDS)
+def test_nearest_is_inside_and_no_allowed_point_is_nearer(seed):
+    rng, G, c, inside = polytope(seed)
+    constraints = LinearConstraints(G, c)
+    wanted = inside + 3 * rng.standard_normal(len(inside))
+    found = constraints.nearest(wanted)
+    size = np.linalg.norm(G, axis=1)
+    assert ((c - G @ found) / size).max() <= 1e-9
+    # A projection's angle to every allowed point is obtuse.
+    for allowed in inside + rng.uniform(0, 1, (50, 1)) * rng.standard_normal((50, len(inside))):
+        if (G @ allowed >= c).all():
+            assert (wanted - found) @ (allowed - found) <= 1e-7
+    if (G @ wanted >= c).all():
+        np.testing.assert_array_equal(found, wanted)
+        assert found is not wanted
+
+
+@given(SEEDS)
+def test_violation_is_the_worst_rows_of_the_step(seed):
+    rng, G, c, inside = polytope(seed, steps=4)
+    constraints = LinearConstraints(G, c)
+    assert (constraints.num_steps, constraints.num_constraints, constraints.num_outputs) == G.shape
+    output = inside + rng.standard_normal(len(inside))
+    for step in (0, 1, 3, 4, 100):
+        n = min(step, 3)
+        assert constraints.violation(output, step) == max(c[n] - G[n] @ output)
+    alone = LinearConstraints(G[2], c[2])
+    assert alone.num_steps is None
+    assert constraints.violation(output, 2) == alone.violation(output) == alone.violation(output, 99)
+    np.testing.assert_allclose(constraints.nearest(output, 2), alone.nearest(output), atol=1e-12)
+    windowed = constraints.window(np.array([1, 3, 7]))
+    np.testing.assert_array_equal(windowed[0], G[[1, 3, 3]])
+    np.testing.assert_array_equal(windowed[1], c[[1, 3, 3]])
+    repeated = alone.window(np.array([0, 5]))
+    np.testing.assert_array_equal(repeated[0], [G[2]] * 2)
+    np.testing.assert_array_equal(repeated[1], [c[2]] * 2)
+
+
+@given(SEEDS)
+def test_contradictions_are_refused_and_nothing_else_is(seed):
+    """Planes around a point are refused exactly where one more leaves nothing of it."""
+    rng, G, c, inside = polytope(seed)
+    LinearConstraints(G, c)
+    row = int(rng.integers(len(G)))
+    size = np.linalg.norm(G[row])
+    # The opposite of a row: a slab of some width, or none.
+    for width, fine in ((1e-3 * size, True), (-1e-3 * size, False)):
+        lower = G[row] @ inside
+        slab = [*G, -G[row], G[row]], [*c, -(lower + width), lower]
+        if fine:
+            assert LinearConstraints(*slab).violation(inside) <= 1e-9 * size
+        else:
+            with pytest.raises(InputError, match="contradict"):
+                LinearConstraints(*slab)
+
+
+def test_a_box_of_each_step_keeps_its_bounds_in_order():
+    lower = np.array([[0.0, -np.inf, 1.0], [0.1, -np.inf, 1.1]])
+    upper = np.array([[2.0, 3.0, np.inf], [2.1, 3.1, np.inf]])
+    box = LinearConstraints.box(lower, upper)
+    assert (box.num_steps, box.num_constraints) == (2, 4)
+    np.testing.assert_array_equal(box.G[1], [[1, 0, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1]])
+    np.testing.assert_array_equal(box.c, [[0, -2, -3, 1], [0.1, -2.1, -3.1, 1.1]])
+    one = LinearConstraints.box(0.0, [1.0, 2.0])
+    np.testing.assert_array_equal(one.c, [0, -1, 0, -2])
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [
+        ([np.nan], [1.0]),
+        ([0.0], [np.nan]),
+        (0.0, 1.0),
+        (np.zeros((2, 2, 2)), np.ones((2, 2, 2))),
+        ([[0.0], [-np.inf]], [[1.0], [1.0]]),
+        ([1.0], [0.0]),
+        ([0.0, 0.0], [1.0, 1.0, 1.0]),
+        (["a"], [1.0]),
+        ([1j], [2.0]),
+    ],
+)
+def test_refuses_boxes_that_are_none(lower, upper):
+    with pytest.raises(InputError):
+        LinearConstraints.box(lower, upper)
+
+
+def test_the_same_constraint_at_every_step_is_checked_once_and_any_other_too():
+    G, c = np.ones((50, 1, 1)), np.zeros((50, 1))
+    LinearConstraints(G, c)
+    G, c = np.tile([[[1.0], [-1.0]]], (50, 1, 1)), np.tile([0.0, -1.0], (50, 1))
+    LinearConstraints(G, c)
+    c[49] = [1.0, 0.0]
+    with pytest.raises(InputError, match="at step 49 contradict"):
+        LinearConstraints(G, c)
+    c[7] = [1.0, 0.0]
+    with pytest.raises(InputError, match="at step 7 contradict"):
         LinearConstraints(G, c)

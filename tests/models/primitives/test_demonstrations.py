@@ -62,11 +62,26 @@ def test_a_sample_logged_twice_counts_once():
         ([[0.0, 1.0]], [[1.0, 2.0]], "shapes"),
         ([[0.0, 1.0, 2.0]], [[[1.0], [2.0]]], "shapes"),
         ([[0.0, 1.0]], [[["a"], ["b"]]], "not an array of numbers"),
+        ([[0.0, 1.0]], [[["1"], ["2"]]], "not an array of numbers"),
+        ([[0.0, 1.0]], [np.array([[1j], [2]])], "not an array of numbers"),
+        ([[0.0, 1.0]], [[[1.0], [2.0, 3.0]]], "not an array of numbers"),
+        ([[0.0, 1.0]], [[[10**400], [2.0]]], "not an array of numbers"),
+        ([np.array([0, 1], dtype="M8[s]")], [[[1.0], [2.0]]], "not an array of numbers"),
+        ([[0, 2**60]], [[[1.0], [2.0]]], "beyond|and more"),
+        (0.0, [[[1.0], [2.0]]], "times must be a list"),
+        ([[0.0, 1.0]], 1.0, "outputs must be a list"),
+        ([[0.0, 1.0]] * 2, [[[1.0], [2.0]]], "2 time vectors"),
     ],
 )
 def test_refuses(times, outputs, names):
     with pytest.raises(InputError, match=names):
         Demonstrations(times, outputs)
+
+
+@pytest.mark.parametrize("names", [["a", "b"], ["a\n"], [" x"], [1], ["x" * 201], ["\ud800"]])
+def test_refuses_names(names):
+    with pytest.raises(InputError, match="name"):
+        Demonstrations([[0.0, 1.0]], [[[1.0], [2.0]]], names)
 
 
 def test_refuses_damaged_and_dangerous_files(tmp_path):

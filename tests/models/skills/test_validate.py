@@ -88,6 +88,21 @@ def test_warns_of_inputs_that_move_nothing_and_frames_that_are_never_used():
     assert any("saucer" in message for message in messages)
 
 
+@pytest.mark.parametrize("name", ['a "b" \\', "$x", "$\\frac{1", "ψ"])
+def test_draws_whatever_a_state_is_called(tmp_path, name):
+    def change(data):
+        data["states"][name] = data["states"].pop("near")
+        data["states"]["far"]["transitions"][0]["to"] = name
+
+    data = yaml.safe_load(SKILL)
+    change(data)
+    skill = parse_skill(yaml.safe_dump(data, sort_keys=False))
+    draw(skill, tmp_path / "a.png")
+    # Quotes and backslashes inside a quoted word are escaped: what is left pairs up.
+    for line in to_dot(skill).splitlines():
+        assert line.replace("\\\\", "").replace('\\"', "").count('"') % 2 == 0
+
+
 def test_draws_every_state_and_every_way(tmp_path):
     skill = load_skill("pouring")
     dot = to_dot(skill)

@@ -1,0 +1,91 @@
+"""Kernels as explicit features, against the matrices that they stand for, in more digits than they have."""
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from guiderail.models.primitives import Matern52, SquaredExponential
+from guiderail.models.primitives.features import KernelBasis, window_features
+
+KERNELS = [SquaredExponential(2.0), SquaredExponential(50.0), Matern52(0.4)]
+
+
+def conditioned(kernel, past, future, noise):
+    """K_fp (K_pp + ρI)⁻¹ and K_ff − K_fp (K_pp + ρI)⁻¹ K_pf with fifty digits behind the kernel's nineteen."""
+    K = kernel(*(np.r_[past, future].astype(np.longdouble),) * 2)
+    P = len(past)
+    with mpmath.workdps(50):
+        exact = mpmath.matrix([[mpmath.mpf(np.format_float_scientific(x, 20)) for x in row] for row in K])
+        Kpp = exact[:P, :P] + mpmath.mpf(noise) * mpmath.eye(P)
+        W = exact[P:, :P] * Kpp**-1
+        left = exact[P:, P:] - W * exact[:P, P:]
+        return np.array(W.tolist(), dtype=float), np.array(left.tolist(), dtype=float)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=repr)
+@pytest.mark.parametrize("noise", [12e-4, 12e-10])
+def test_features_are_the_kernel_given_the_history(kernel, noise):
+    past, future = 0.02 * np.arange(-6, 0), 0.02 * np.arange(9)
+    features = window_features(kernel, past, future, noise)
+    W, left = conditioned(kernel, past, future, noise)
+    np.testing.assert_allclose(features.history_map, W, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(features.features @ features.features.T, left, rtol=0, atol=1e-13)
+    assert features.features.shape[1] <= 9
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=repr)
+def test_without_a_history_they_are_the_kernel(kernel):
+    future = np.linspace(0, 3, 40)
+    features = window_features(kernel, future[:0], future, 0.0)
+    assert features.history_map.shape == (40, 0)
+    np.testing.assert_allclose(features.features @ features.features.T, kernel(future, future), rtol=0, atol=1e-14)
+
+
+def test_there_are_no_more_of_them_than_the_kernel_has_directions():
+    smooth = window_features(SquaredExponential(0.1), np.zeros(0), np.linspace(0, 1, 60), 0.0)
+    rough = window_features(SquaredExponential(1e5), np.zeros(0), np.linspace(0, 1, 60), 0.0)
+    assert smooth.features.shape[1] <= 12
+    assert rough.features.shape[1] == 60
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
+def test_a_basis_represents_what_it_was_given_and_says_how_much_of_anything_else(seed, dimensions):
+    rng = np.random.default_rng(seed)
+    kernel = SquaredExponential(float(rng.uniform(0.1, 5)))
+    inputs, elsewhere = rng.uniform(-1, 1, (15, dimensions)), rng.uniform(-3, 3, (7, dimensions))
+    basis = KernelBasis(kernel, inputs)
+    F = basis.features(inputs)
+    assert F.shape == (15, basis.size)
+    np.testing.assert_allclose(F @ F.T, kernel(inputs, inputs), rtol=0, atol=1e-13)
+    assert np.abs(basis.residual(inputs, F)).max() < 1e-13
+
+    # Elsewhere: the part of the kernel that the given inputs explain, and the rest of its diagonal.
+    G = basis.features(elsewhere)
+    np.testing.assert_allclose(G @ F.T, kernel(elsewhere, inputs), rtol=0, atol=1e-6)
+    residual = basis.residual(elsewhere, G)
+    np.testing.assert_allclose(residual, 1 - (G**2).sum(axis=1), rtol=0, atol=1e-14)
+    assert (residual >= -1e-13).all()
+
+    before = basis.size
+    assert not basis.extend(inputs[:5])
+    assert basis.size == before
+    grew = basis.extend(elsewhere)
+    assert grew == (basis.size > before)
+    everything = np.vstack([inputs, elsewhere])
+    H = basis.features(everything)
+    np.testing.assert_allclose(H @ H.T, kernel(everything, everything), rtol=0, atol=1e-13)
+    # What there was stays where it was: only new features were added.
+    np.testing.assert_allclose(H[:15, :before], F, rtol=0, atol=1e-9)
+
+
+def test_points_far_apart_each_need_a_feature_and_the_same_point_twice_needs_one():
+    kernel = SquaredExponential(1.0)
+    assert KernelBasis(kernel, np.array([[0.0], [100.0], [200.0]])).size == 3
+    assert KernelBasis(kernel, np.array([[1.0], [1.0], [1.0]])).size == 1
+    empty = KernelBasis(kernel, np.zeros((0, 1)))
+    assert empty.size == 0
+    assert empty.features(np.ones((2, 1))).shape == (2, 0)
+    assert not empty.extend(np.zeros((0, 1)))
+    assert empty.extend(np.ones((1, 1)))

@@ -1,0 +1,408 @@
+"""Changes the safety code one place at a time, and asks whether a test notices.
+
+    python tests/mutation/mutate.py                         # everything, about an hour
+    python tests/mutation/mutate.py step least_norm         # these files
+    python tests/mutation/mutate.py --results mutants.json  # goes on where it was stopped
+
+Every operator below is applied at every place of a file that it fits: comparisons, arithmetic, logic, numbers,
+branches, statements, calls that have a counterpart, slices, keyword arguments. A mutant is tried by the tests that
+execute its line, the quickest first. One that no test notices survives: `survivors.md` says of each why that makes no
+difference, and a survivor that it does not name is an error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import importlib
+import importlib.abc
+import importlib.util
+import json
+import os
+import resource
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PRIMITIVES = ["tests/models/primitives"]
+SKILLS = ["tests/models/skills"]
+TARGETS = {
+    "models/primitives/least_norm.py": PRIMITIVES,
+    "models/primitives/step.py": PRIMITIVES,
+    "models/primitives/lc_ns_kmp.py": PRIMITIVES,
+    "models/primitives/constraints.py": PRIMITIVES,
+    "models/primitives/gains.py": PRIMITIVES,
+    "models/primitives/features.py": PRIMITIVES,
+    "models/skills/active_constraints.py": SKILLS,
+    "models/skills/skill.py": SKILLS,
+    "models/skills/geometry.py": SKILLS,
+    "models/keep_out.py": ["tests/models/test_keep_out.py", "tests/models/test_keep_out_properties.py"],
+    "models/cartesian_impedance.py": ["tests/models/test_cartesian_impedance.py"],
+}
+SURVIVORS = ROOT / "tests" / "mutation" / "survivors.md"
+# Imported once, before a process is forked for each mutant: what takes seconds and is never mutated.
+HEAVY = ("daqp", "gmr", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
+HEAVY += ("scipy.optimize", "scipy.sparse", "scipy.spatial.transform", "sklearn.mixture", "yaml", "matplotlib.figure")
+
+
+# --- what is changed ---
+
+ORDER = {
+    ast.Lt: (ast.LtE, ast.Gt),
+    ast.LtE: (ast.Lt, ast.Gt),
+    ast.Gt: (ast.GtE, ast.Lt),
+    ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,),
+    ast.NotIn: (ast.In,),
+}
+ARITHMETIC = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult,
+    ast.Pow: ast.Mult,
+    ast.BitOr: ast.BitAnd,
+    ast.BitAnd: ast.BitOr,
+}
+COUNTERPART = {
+    **{"min": "max", "any": "all", "minimum": "maximum", "argmin": "argmax", "sin": "cos", "zeros": "ones"},
+    **{"max": "min", "all": "any", "maximum": "minimum", "argmax": "argmin", "cos": "sin", "ones": "zeros"},
+    **{"radians": "degrees", "deg2rad": "rad2deg", "sum": "max", "mean": "max", "asin": "sin", "flatnonzero": "argmin"},
+}
+# Without them the number is another one, or the array is the caller's.
+DROPPED = {"abs", "sqrt", "copy", "sorted", "float", "int", "bool", "round", "array", "asarray", "ascontiguousarray"}
+
+
+def changes(node: ast.AST) -> Iterator[ast.AST | None]:
+    """What may stand in place of a node; None removes a statement."""
+    if isinstance(node, ast.Compare) and len(node.ops) >= 1:
+        for i, operator in enumerate(node.ops):
+            for other in ORDER[type(operator)]:
+                yield _with(node, ops=[*node.ops[:i], other(), *node.ops[i + 1 :]])
+    elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
+        yield _with(node, op=ARITHMETIC[type(node.op)]())
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+        yield _with(node, left=node.right, right=node.left)
+    elif isinstance(node, ast.AugAssign):
+        if type(node.op) in ARITHMETIC:
+            yield _with(node, op=ARITHMETIC[type(node.op)]())
+        yield None
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+        yield node.operand
+    elif isinstance(node, ast.BoolOp):
+        yield _with(node, op=ast.Or() if isinstance(node.op, ast.And) else ast.And())
+    elif isinstance(node, ast.Constant):
+        yield from (ast.copy_location(ast.Constant(value), node) for value in _other_constants(node.value))
+    elif isinstance(node, ast.If | ast.While | ast.IfExp):
+        yield from (_with(node, test=ast.copy_location(ast.Constant(value), node.test)) for value in (True, False))
+    elif isinstance(node, ast.Call):
+        yield from _other_calls(node)
+    elif isinstance(node, ast.Attribute) and node.attr == "T" and isinstance(node.ctx, ast.Load):
+        yield node.value
+    elif isinstance(node, ast.Slice):
+        yield from (_with(node, **{end: None}) for end in ("lower", "upper", "step") if getattr(node, end))
+    elif isinstance(node, ast.Continue | ast.Break):
+        yield ast.copy_location(ast.Break() if isinstance(node, ast.Continue) else ast.Continue(), node)
+    elif _can_be_left_out(node):
+        yield None
+
+
+def _can_be_left_out(node: ast.AST) -> bool:
+    """A statement without which the others can still be executed."""
+    if isinstance(node, ast.Assign):
+        return not any(isinstance(target, ast.Name | ast.Tuple) for target in node.targets)
+    return isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call))
+
+
+def _other_constants(value):
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, int):
+        return [value + 1, value - 1]
+    if isinstance(value, float):
+        return [100 * value, value / 100] if value else [1.0]
+    return []
+
+
+def _other_calls(node: ast.Call) -> Iterator[ast.AST]:
+    called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+    if called in COUNTERPART:
+        func = copy.deepcopy(node.func)
+        setattr(func, "attr" if isinstance(func, ast.Attribute) else "id", COUNTERPART[called])
+        yield _with(node, func=func)
+    if called in DROPPED and node.args:
+        yield node.args[0]
+    elif called in DROPPED and isinstance(node.func, ast.Attribute):
+        yield node.func.value
+    for i in range(len(node.keywords)):
+        yield _with(node, keywords=node.keywords[:i] + node.keywords[i + 1 :])
+
+
+def _with(node: ast.AST, **fields) -> ast.AST:
+    other = copy.copy(node)
+    for name, value in fields.items():
+        setattr(other, name, value)
+    return other
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one file; `name` says which, whatever its line number is."""
+
+    file: str
+    name: str
+    line: int
+    last_line: int
+    tree: ast.Module
+
+
+def mutants(file: str) -> list[Mutant]:
+    """Every change of a file, in the order of its lines."""
+    tree = ast.parse((ROOT / file).read_text())
+    found, seen = [], Counter()
+    for path in list(_places(tree)):
+        for i in range(len(list(changes(_at(tree, path))))):
+            mutated = copy.deepcopy(tree)
+            node = _at(mutated, path)
+            before = _statement(tree, path)
+            _replace(mutated, path, list(changes(node))[i])
+            ast.fix_missing_locations(mutated)
+            after = _statement(mutated, path)
+            name = f"{_function(tree, path)}: {_difference(_said(before), _said(after))}"
+            seen[name] += 1
+            if seen[name] > 1:
+                name += f" ({seen[name]})"
+            found.append(Mutant(file, name, before.lineno, before.end_lineno or before.lineno, mutated))
+    return found
+
+
+Path_ = tuple[tuple[str, int | None], ...]
+
+
+def _places(node: ast.AST, path: Path_ = ()) -> Iterator[Path_]:
+    """Paths to all nodes that are code: no docstrings, annotations, decorators, messages or imports."""
+    yield path
+    for field, value in ast.iter_fields(node):
+        if field in ("annotation", "returns", "decorator_list", "ctx", "ops", "op", "bases"):
+            continue
+        if isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr):
+            continue
+        if isinstance(value, ast.AST):
+            yield from _places(value, (*path, (field, None)))
+        elif isinstance(value, list):
+            for i, entry in enumerate(value):
+                if isinstance(entry, ast.AST):
+                    yield from _places(entry, (*path, (field, i)))
+
+
+def _at(node, path: Path_):
+    for field, i in path:
+        node = getattr(node, field) if i is None else getattr(node, field)[i]
+    return node
+
+
+def _replace(tree: ast.Module, path: Path_, new: ast.AST | None) -> None:
+    holder, (field, i) = _at(tree, path[:-1]), path[-1]
+    if new is None:
+        new = ast.copy_location(ast.Pass(), _at(tree, path))
+    if i is None:
+        setattr(holder, field, new)
+    else:
+        getattr(holder, field)[i] = new
+
+
+def _statement(tree: ast.Module, path: Path_) -> ast.stmt:
+    """The innermost statement around a place."""
+    return next(node for n in range(len(path), -1, -1) if isinstance(node := _at(tree, path[:n]), ast.stmt))
+
+
+def _said(statement: ast.stmt) -> str:
+    """A statement's own line: of a block its head alone."""
+    head = copy.copy(statement)
+    if hasattr(head, "body"):
+        head.body = [ast.Pass()]
+        head.orelse = [] if hasattr(head, "orelse") else None
+    if hasattr(head, "decorator_list"):
+        head.decorator_list = []
+    return " ".join(ast.unparse(head).removesuffix("pass").split()).removesuffix(":")
+
+
+def _function(tree: ast.Module, path: Path_) -> str:
+    """The function or class that a place is in."""
+    around = [_at(tree, path[:n]) for n in range(len(path))]
+    return ".".join(node.name for node in around if isinstance(node, ast.FunctionDef | ast.ClassDef)) or "module"
+
+
+def _difference(before: str, after: str, context: int = 30) -> str:
+    """What differs between two lines, with as much around it as tells where it is."""
+    start = _common(before, after)
+    end = _common(before[start:][::-1], after[start:][::-1])
+    left, right = before[max(0, start - context) : start], before[len(before) - end :][:context]
+    return f"`{left}⟨{before[start : len(before) - end]} → {after[start : len(after) - end]}⟩{right}`"
+
+
+def _common(a: str, b: str) -> int:
+    """How many letters two texts begin with alike."""
+    return next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
+
+
+# --- who notices ---
+
+
+class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports the mutated module where the file's own is asked for."""
+
+    def __init__(self, mutant: Mutant):
+        self.name = "guiderail." + mutant.file.removesuffix(".py").replace("/", ".")
+        self.mutant = mutant
+
+    def find_spec(self, fullname, path=None, target=None):
+        return importlib.util.spec_from_loader(fullname, self) if fullname == self.name else None
+
+    def exec_module(self, module):
+        module.__file__ = str(ROOT / self.mutant.file)
+        exec(compile(self.mutant.tree, module.__file__, "exec"), module.__dict__)
+
+
+class _Coverage:
+    """Which tests execute which lines of a file, and how long each takes."""
+
+    def __init__(self, file: str):
+        self.file = str(ROOT / file)
+        self.own: dict[object, bool] = {}
+        self.lines: dict[str, set[int]] = defaultdict(set)
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.test = ""
+
+    def trace(self, frame, event, argument):
+        code = frame.f_code
+        if code not in self.own:
+            self.own[code] = os.path.realpath(code.co_filename) == self.file
+        return self._line if self.own[code] else None
+
+    def _line(self, frame, event, argument):
+        self.lines[self.test].add(frame.f_lineno)
+        return self._line
+
+    def pytest_runtest_logstart(self, nodeid):
+        self.test, self.started = nodeid, time.process_time()
+        sys.settrace(self.trace)
+
+    def pytest_runtest_logfinish(self, nodeid):
+        sys.settrace(None)
+        self.seconds[nodeid] += time.process_time() - self.started
+        self.test = ""
+
+
+def _pytest(arguments: list[str], plugins=()) -> int:
+    import pytest
+
+    quiet = ["-q", "-x", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-p", "no:xdist", "-W", "ignore"]
+    return int(pytest.main([*quiet, *arguments], plugins=list(plugins)))
+
+
+def _forked(work, cpu_seconds: float) -> tuple[int, str]:
+    """Runs `work` in a process of its own, silent and limited; its exit status, and what it returned as text."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reader)
+        silent = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silent, 1)
+        os.dup2(silent, 2)
+        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_seconds), int(cpu_seconds) + 5))
+        resource.setrlimit(resource.RLIMIT_AS, (8 * 2**30, 8 * 2**30))
+        status, text = 3, ""
+        try:
+            status, text = work()
+        finally:
+            os.write(writer, text.encode()) if len(text) < 60_000 else None
+            os._exit(status)
+    os.close(writer)
+    with os.fdopen(reader) as pipe:
+        text = pipe.read()
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), text
+
+
+def coverage(file: str, tests: list[str], store: Path) -> tuple[dict[str, list[int]], dict[str, float]]:
+    """Lines and CPU seconds of each test, measured with nothing changed."""
+
+    def work():
+        watcher = _Coverage(file)
+        status = _pytest(tests, [watcher])
+        lines = {test: sorted(found) for test, found in watcher.lines.items()}
+        store.write_text(json.dumps({"lines": lines, "seconds": watcher.seconds}))
+        return status, ""
+
+    status, _ = _forked(work, 3600)
+    if status != 0:
+        raise SystemExit(f"the tests of {file} fail without any change (status {status}): mend them first")
+    measured = json.loads(store.read_text())
+    store.unlink()
+    return measured["lines"], measured["seconds"]
+
+
+def survives(mutant: Mutant, lines: dict[str, list[int]], seconds: dict[str, float], tests: list[str]) -> bool:
+    """True if every test passes that executes the changed line."""
+    here = range(mutant.line, mutant.last_line + 1)
+    chosen = [test for test in seconds if any(line in here for line in lines.get(test, ()))]
+    # What is executed on import, such as a default or a constant, belongs to no test: any may notice.
+    chosen = sorted(chosen or seconds, key=lambda test: seconds[test])
+    limit = 10 + 5 * sum(seconds[test] for test in chosen)
+
+    def work():
+        sys.meta_path.insert(0, _Mutated(mutant))
+        return _pytest(chosen), ""
+
+    status, _ = _forked(work, limit)
+    return status == 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("files", nargs="*", help="names of files, without .py; all unless given")
+    parser.add_argument("--results", type=Path, help="a JSON file that keeps what was tried")
+    parser.add_argument("--again", action="store_true", help="try those again that survived")
+    arguments = parser.parse_args()
+    os.chdir(ROOT)
+    for name in HEAVY:
+        importlib.import_module(name)
+    tried = json.loads(arguments.results.read_text()) if arguments.results and arguments.results.exists() else {}
+    explained = SURVIVORS.read_text() if SURVIVORS.exists() else ""
+    unexplained, total, killed = 0, 0, 0
+    for file, tests in TARGETS.items():
+        if arguments.files and Path(file).stem not in arguments.files:
+            continue
+        results = tried.setdefault(file, {})
+        found = mutants(file)
+        waiting = [m for m in found if m.name not in results or (arguments.again and results[m.name] == "survived")]
+        if waiting:
+            lines, seconds = coverage(file, tests, Path(f"{arguments.results or 'mutants'}.coverage"))
+        for mutant in waiting:
+            results[mutant.name] = "survived" if survives(mutant, lines, seconds, tests) else "killed"
+            if results[mutant.name] == "survived" and mutant.name not in explained:
+                print(f"{file}:{mutant.line}: {mutant.name}", flush=True)
+            if arguments.results:
+                arguments.results.write_text(json.dumps(tried, indent=1, ensure_ascii=False))
+        survivors = [mutant for mutant in found if results[mutant.name] == "survived"]
+        new = [mutant for mutant in survivors if mutant.name not in explained]
+        unexplained, total, killed = unexplained + len(new), total + len(found), killed + len(found) - len(survivors)
+        print(f"{file}: {len(found) - len(survivors)} of {len(found)} killed, {len(new)} unexplained", flush=True)
+    print(f"together: {killed} of {total} killed ({killed / max(total, 1):.1%}), {unexplained} survivors unexplained")
+    return min(unexplained, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,73 @@
+"""Readers that share nothing with those of the project: what an accepted file must mean."""
+
+import csv
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+
+def npz_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(times, outputs) of each demonstration, by NumPy's own reader."""
+    with np.load(path, allow_pickle=False) as file:
+        times, outputs = file["times"], file["outputs"]
+        if "lengths" in file:
+            ends = [sum(file["lengths"].tolist()[: m + 1]) for m in range(len(file["lengths"]))]
+            starts = [0, *ends[:-1]]
+            parts = [(times[a:b], outputs[a:b]) for a, b in zip(starts, ends, strict=True)]
+        else:
+            parts = [(times if times.ndim == 1 else times[m], outputs[m]) for m in range(len(outputs))]
+    return [_once(_doubles(t), _doubles(y)) for t, y in parts]
+
+
+def csv_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(times, outputs) of each demonstration, every number by way of decimal arithmetic."""
+    text = path.read_bytes().decode("utf-8").removeprefix("\ufeff")
+    rows = list(csv.reader(text.splitlines())) if '"' in text else [line.split(",") for line in text.splitlines()]
+    header, body = [name.strip() for name in rows[0]], [row for row in rows[1:] if row not in ([], [""])]
+    numbers = [[float(Decimal(field.strip())) for field in row] for row in body]
+    if header[:2] != ["demonstration", "time"]:
+        return [_once(np.array([row[0] for row in numbers]), np.array([row[1:] for row in numbers]))]
+    parts = []
+    for label in sorted({row[0] for row in numbers}):
+        own = [row[1:] for row in numbers if row[0] == label]
+        parts.append(_once(np.array([row[0] for row in own]), np.array([row[1:] for row in own])))
+    return parts
+
+
+def skill_numbers(text: str) -> dict[tuple[str, ...], float]:
+    """Every number of a skill by its path, with PyYAML's own reader and Python's own arithmetic."""
+    data = yaml.safe_load(text)
+    parameters = {name: float(_value(value, {})) for name, value in (data.get("parameters") or {}).items()}
+    found: dict[tuple[str, ...], float] = {("parameters", name): value for name, value in parameters.items()}
+
+    def walk(path, entry):
+        if isinstance(entry, dict):
+            for key, value in entry.items():
+                walk((*path, str(key)), value)
+        elif isinstance(entry, list):
+            for number, value in enumerate(entry):
+                walk((*path, str(number)), value)
+        elif isinstance(entry, int | float) and not isinstance(entry, bool):
+            found[path] = float(entry)
+        elif isinstance(entry, str) and path[-1] not in ("kind", "frame", "to", "name"):
+            found[path] = float(_value(entry, parameters))
+
+    for key in ("inputs", "max_speed_m_per_s", "max_speed_rad_per_s", "states"):
+        walk((key,), data[key])
+    return found
+
+
+def _value(entry, parameters):
+    return eval(entry, {"__builtins__": {}}, parameters) if isinstance(entry, str) else entry
+
+
+def _doubles(values: np.ndarray) -> np.ndarray:
+    return np.array([float(value) for value in values.ravel().tolist()]).reshape(values.shape)
+
+
+def _once(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Without samples that repeat the one before, time and all."""
+    kept = [n for n in range(len(t)) if n == 0 or t[n] != t[n - 1] or (y[n] != y[n - 1]).any()]
+    return t[kept], y[kept]
