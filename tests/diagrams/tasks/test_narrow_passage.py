@@ -356,7 +356,7 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
         ({"guidance": "magic"}, "there is no guidance 'magic'"),
         ({"reward": "dense"}, "no reward 'dense': choose one of shaped, sparse"),
         ({"observation": "smell"}, "choose one of image, state"),
-        ({"stetion": "plane"}, "no option 'stetion': did you mean station"),
+        ({"stetion": "plane"}, "no option 'stetion' here: did you mean station"),
         ({"station": "rails"}, "no station 'rails'.*plane"),
         ({"difficulty": "hopeless"}, "no difficulty 'hopeless'"),
         ({"render_mode": "ascii"}, "render mode"),
