@@ -275,11 +275,11 @@ def study(
     where it was with the same command.
     """
     from guiderail.tools.studies import declaration
-    from guiderail.tools.studies.smoothness import smoothness
-    from guiderail.tools.studies.study import study_command
 
     declared = declaration.load_study(file)
     if isinstance(declared, declaration.Smoothness):
+        from guiderail.tools.studies.smoothness import smoothness
+
         _print(smoothness(out, **declared.model_dump(exclude={"program", "name"})), as_json)
         return
     try:
@@ -287,6 +287,8 @@ def study(
     except ValueError:
         raise InputError(f"--seeds takes whole numbers separated by commas, such as 0,1,2, not {seeds!r}") from None
     chosen = declared.only(None if methods is None else methods.split(","), numbers)
+    from guiderail.tools.studies.study import study_command
+
     _print(study_command(chosen, out, processes), as_json)
 
 
@@ -482,8 +484,9 @@ def _usage_sentence(error: Any) -> str:
     if "command" in message and context is not None and hasattr(context.command, "list_commands"):
         names = context.command.list_commands(context)
         typed = message.partition("'")[2].partition("'")[0]
-        known_words = did_you_mean(typed, names) if typed else f"choose one of {', '.join(names)}"
-        return f"{message.split('. ')[0]}: {known_words}"
+        if typed:
+            return f"there is no command {typed}: {did_you_mean(typed, names)}"
+        return f"what should be done? choose one of {', '.join(names)}"
     return f"{message}: see {path} --help"
 
 
@@ -520,8 +523,10 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
     if Path(shown).is_dir() or shown not in CHOICES["tasks"]():
         return showing.Shown.of_run(Path(shown), environment, seed)
     from guiderail.tools.studies.scripted import untrained
+    from guiderail.tools.tasks import check_environment
 
-    return showing.Shown(shown, environment, untrained(shown, policy), policy, "", seed=seed)
+    arguments = check_environment(shown, environment)
+    return showing.Shown(shown, arguments, untrained(shown, policy), policy, policy, seed=seed)
 
 
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import torch
@@ -60,10 +61,7 @@ class CheckpointSelection:
         return None if best is None else best.actor
 
     def _best(self) -> Candidate | None:
-        best = self._selected
-        for candidate in self._open:
-            best = self._better(best, candidate)
-        return best
+        return reduce(self._better, self._open, self._selected)
 
     @staticmethod
     def _better(best: Candidate | None, candidate: Candidate) -> Candidate | None:

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any
 
 from rich.console import Console
@@ -32,37 +31,33 @@ class TrainingProgress:
         self._recent: list[tuple[float, float]] = []
         self._worst = float("-inf")
         self._started = self._said = time.monotonic()
-        self._bar: Progress | None = None
-        if self._console.is_terminal:
-            self._bar = Progress(
-                TextColumn("{task.description}"),
-                BarColumn(bar_width=24),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[said]}"),
-                TimeRemainingColumn(compact=True, elapsed_when_finished=True),
-                console=self._console,
-            )
-            self._task = self._bar.add_task(name, total=episodes, said="")
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[said]}"),
+            TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task(name, total=episodes, said="")
 
     def __enter__(self) -> "TrainingProgress":
-        if self._bar is not None:
-            self._bar.start()
+        self._bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
-        if self._bar is not None:
-            self._bar.stop()
+    def __exit__(self, *error: object) -> None:
+        self._bar.stop()
 
     def update(self, row: Mapping[str, Any]) -> None:
         """Takes one finished episode in."""
         self._done, self._seen = int(row["episode"]) + 1, self._seen + 1
         self._recent = [*self._recent, (float(row["success"]), float(row["return"]))][-WINDOW:]
         self._worst = max(self._worst, float(row["worst_violation"]))
-        if self._bar is not None:
-            self._bar.update(self._task, completed=self._done, said=self.says())
-            return
+        self._bar.update(self._task, completed=self._done, said=self.says())
         now = time.monotonic()
-        if self._seen == 1 or self._done == self._episodes or now - self._said > 10:
+        due = self._seen == 1 or self._done == self._episodes or now - self._said > 10
+        if self._bar.disable and due:
             self._said = now
             self._console.print(
                 f"{self._name} {self._done}/{self._episodes}  {self.says()}  {self._left(now)}", soft_wrap=True

@@ -119,10 +119,9 @@ def evaluate(
     alone = pd.DataFrame()
     if is_demonstrated(where.get("guidance")):
         alone = evaluate_run(config, still, where, words="demonstration alone", **how)
-    result: dict[str, Any] = {}
-    for name in COMPARED:
-        result |= summary(rows, [name]) | summary(alone, [name], "demonstration_")
-    return result | {
+    return {
+        **summary(rows, COMPARED),
+        **summary(alone, COMPARED, "demonstration_"),
         "episodes": episodes,
         "seed": seed,
         "converged_after": converged_after(trained),

@@ -42,16 +42,17 @@ def plot_run(run: Path) -> Path:
         if name.startswith("reward_"):
             terms.plot(episodes, values, label=name.removeprefix("reward_").replace("_", " "))
     terms.set(ylabel="terms of the return")
-    violation.plot(episodes, column["worst_violation"], color=line, label="commanded")
-    violation.plot(episodes, column["worst_measured_violation"], color="0.5", linewidth=1, label="measured")
+    for axis, words, first, second in (
+        (violation, "worst constraint violation\n(negative is slack)", "worst_violation", "worst_measured_violation"),
+        (force, "contact force [N]", "peak_force", "mean_force"),
+        (jerk, "mean jerk [m/s³]", "jerk_commanded_linear", "jerk_measured_linear"),
+    ):
+        names = ("peak", "mean") if axis is force else ("commanded", "measured")
+        axis.plot(episodes, column[first], color=line, label=names[0])
+        axis.plot(episodes, column[second], color="0.5", linewidth=1, label=names[1])
+        axis.set(ylabel=words)
     violation.axhline(0, color="firebrick", linewidth=0.8)
-    violation.set(ylabel="worst constraint violation\n(negative is slack)")
-    force.plot(episodes, column["peak_force"], color=line, label="peak")
-    force.plot(episodes, column["mean_force"], color="0.5", linewidth=1, label="mean")
-    force.set(ylabel="contact force [N]")
-    jerk.plot(episodes, column["jerk_commanded_linear"], color=line, label="commanded")
-    jerk.plot(episodes, column["jerk_measured_linear"], color="0.5", linewidth=1, label="measured")
-    jerk.set(ylabel="mean jerk [m/s³]", yscale="log" if (column["jerk_commanded_linear"] > 0).all() else "linear")
+    jerk.set(yscale="log" if (column["jerk_commanded_linear"] > 0).all() else "linear")
     for axis in (terms, violation, force, jerk):
         axis.legend(frameon=False, fontsize=8)
     for axis in axes[1]:

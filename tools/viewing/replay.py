@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import jinja2
 import numpy as np
+from pydrake.geometry import Rgba
 
 from guiderail.diagrams.scene import Scene, Viewpoint, in_plane
 from guiderail.models.errors import InputError
@@ -106,8 +107,6 @@ def write_page(html: Path, episode: Shown) -> dict[str, Any]:
 
 def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, colour: tuple[float, ...]) -> None:
     """A path as a tube: browsers draw lines one pixel wide, whatever they are asked for."""
-    from pydrake.geometry import Rgba
-
     vertices, faces = tube(points, radius)
     meshcat.SetTriangleMesh(name, vertices.T, faces.T, Rgba(*colour))
 

@@ -32,20 +32,14 @@ def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
 
 def record_session(seed: int) -> list[Recording] | None:
     """All demonstrations of a session; None if one of them doesn't end locked."""
-    recordings = []
-    for motion in demonstrator_motions(seed, TIMES):
-        recording, is_locked = record_one(motion)
-        if not is_locked:
-            return None
-        recordings.append(recording)
-    return recordings
+    recorded = [record_one(motion) for motion in demonstrator_motions(seed, TIMES)]
+    return [recording for recording, _ in recorded] if all(is_locked for _, is_locked in recorded) else None
 
 
 def record(seeds: range) -> dict[str, np.ndarray]:
     """The arrays of the demonstrations' file: the first session in which every demonstration ends locked."""
     for seed in seeds:
-        recordings = record_session(seed)
-        if recordings is not None:
+        if (recordings := record_session(seed)) is not None:
             break
     else:
         raise InputError(f"no session of the seeds {seeds} ends locked every time: give more seeds")
