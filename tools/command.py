@@ -19,10 +19,11 @@ from guiderail.models.registry import did_you_mean
 
 
 def _known(module: str, name: str) -> Callable[[], list[str]]:
-    """Looks up what can be chosen when somebody asks for it."""
+    """Looks up what can be chosen, a list or a registry, when somebody asks for it."""
 
     def names() -> list[str]:
-        found = getattr(import_module(f"guiderail.tools.{module}"), name)
+        found = getattr(import_module(f"guiderail.{module}"), name)
+        found = getattr(found, "names", found)
         return list(found() if callable(found) else found)
 
     return names
@@ -30,18 +31,18 @@ def _known(module: str, name: str) -> Callable[[], list[str]]:
 
 # What a word in braces in a help text stands for, and what a shell completes.
 CHOICES: dict[str, Callable[[], list[str]]] = {
-    "tasks": _known("tasks", "known_tasks"),
-    "guidance": _known("guidance", "guidance_names"),
-    "stations": _known("listing", "station_names"),
-    "robots": _known("listing", "robot_names"),
-    "algorithms": _known("learning.learner", "learner_names"),
-    "presets": _known("learning.presets", "PRESETS"),
-    "studies": _known("studies.declaration", "shipped_studies"),
-    "figures": _known("figures", "FIGURES"),
-    "stressed": _known("stress", "STRESSED"),
-    "benchmarks": _known("benchmarks", "BENCHMARKS"),
-    "generated": _known("recording.generate", "GENERATED"),
-    "pictures": _known("files", "PICTURES"),
+    "tasks": _known("tools.tasks", "known_tasks"),
+    "guidance": _known("diagrams.guidance.registry", "GUIDANCE"),
+    "stations": _known("diagrams.stations.registry", "STATIONS"),
+    "robots": _known("models.robots.robot", "robot_names"),
+    "algorithms": _known("tools.learning.learner", "learner_names"),
+    "presets": _known("tools.learning.presets", "PRESETS"),
+    "studies": _known("tools.studies.declaration", "shipped_studies"),
+    "figures": _known("tools.figures", "FIGURES"),
+    "stressed": _known("tools.stress", "STRESSED"),
+    "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
+    "generated": _known("tools.recording.generate", "GENERATED"),
+    "pictures": _known("tools.files", "PICTURES"),
     "listed": lambda: [*LISTED, *CHOICES["tasks"]()],
 }
 

@@ -1,11 +1,6 @@
-"""Kinds of guidance: the one place where tools ask what to call them, and in which a policy has a demonstration."""
+"""Kinds of guidance: the one place where tools ask what to call them, and which have a demonstration."""
 
 from guiderail.diagrams.guidance.registry import GUIDANCE
-
-
-def guidance_names() -> list[str]:
-    """Every kind that there is; which of them make sense depends on the task."""
-    return GUIDANCE.names()
 
 
 def is_demonstrated(kind: str | None) -> bool:

@@ -85,11 +85,6 @@ def options_in_words(name: str) -> dict[str, str]:
     return words | reset
 
 
-def station_names() -> list[str]:
-    """Of all stations."""
-    return STATIONS.names()
-
-
 def _guidance(name: str) -> dict[str, Any]:
     kind = GUIDANCE.get(name)
     return {
