@@ -39,6 +39,7 @@ FLOOR = np.array([0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0
 RHO = 1e-11
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
 COLLISION_FORCE = 35.0  # [N], of the impedance
+TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
 
 # What a policy sees, [time, pose, wrench], is centred and scaled by these. The wrench's torques are small, and they
@@ -144,10 +145,6 @@ class BncConnector(InsertionTask):
             demonstrations=tuple(demonstrations.load().outputs),
             constraint=tuple(to_world(edge) for edge in box_edges(ALIGNMENT, 0.0, 0.015)),
             viewpoint=near,
-            arm_views={
-                "the tool": ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172)),
-                "the connector": near,
-                "the arm": ARM_VIEW,
-            },
+            arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
             line_radius=0.0001,
         )

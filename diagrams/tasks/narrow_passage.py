@@ -27,15 +27,9 @@ from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
-IMAGE_SIZE = (144, 110)
-"""Width and height of the policy's image (4.4.1, end)."""
-
-COMPONENTS = 20
-"""Of the mixture: with 8 to 16 of them the passage is blurred."""
-
-FLOOR = 0.002
-"""m: how well a hand repeats itself; added to the demonstrations' covariance as a standard deviation."""
-
+IMAGE_SIZE = (144, 110)  # width and height of the policy's image (4.4.1, end)
+COMPONENTS = 20  # of the mixture: with 8 to 16 of them the passage is blurred
+FLOOR = 0.002  # [m], how well a hand repeats itself: added to the demonstrations' covariance as a standard deviation
 BLOCKED_STEPS = 20
 BLOCKED_PROGRESS = 1e-4
 HELD_OUT_DEVIATION = 0.01  # [m] of a held-out start from the usual one

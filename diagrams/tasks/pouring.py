@@ -43,10 +43,7 @@ class PouringOptions(Options):
     """Of pouring."""
 
     input_speed: Number | None = Field(
-        None,
-        ge=0.2,
-        le=2.0,
-        description="how much faster than meant the template's inputs are; 1, and 1.7 where sparse, unless given",
+        None, ge=0.2, le=2.0, description="how much faster the template's inputs are; 1, and 1.7 where sparse, if None"
     )
     mug_inner_diameter: Number = Field(MUG.inner_diameter, description="of the mug that stands there [m]")
     mug_depth: Number = Field(MUG.depth, description="[m]")
