@@ -26,7 +26,7 @@ class KgrlAlong(Guidance):
     def __init__(self, known: Known):
         super().__init__()
         builder = DiagramBuilder()
-        angle = np.deg2rad(float(str(known.options["angle"])))
+        angle = np.deg2rad(known.options["angle"])
         kgrl = builder.AddNamedSystem("kgrl", KgrlGuidance(known))
         direction = MatrixGain(D=np.array([[np.cos(angle)], [np.sin(angle)]]))
         builder.AddNamedSystem("direction", direction)

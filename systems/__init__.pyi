@@ -10,6 +10,7 @@ from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import Condition as Condition
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
 from .gripper_command import GripperCommand as GripperCommand
+from .guidance_law import GuidanceLaw as GuidanceLaw
 from .history_buffer import HistoryBuffer as HistoryBuffer
 from .history_length_schedule import HistoryLengthSchedule as HistoryLengthSchedule
 from .impedance_monitor import ImpedanceMonitor as ImpedanceMonitor

@@ -2,6 +2,7 @@ from .guidance import Guidance as Guidance
 from .known import Approach as Approach
 from .known import Known as Known
 from .known import Template as Template
+from .law import LawGuidance as LawGuidance
 from .primitive_skill import PrimitiveSkill as PrimitiveSkill
 from .registry import GUIDANCE as GUIDANCE
 from .registry import GuidanceKind as GuidanceKind

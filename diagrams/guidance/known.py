@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.models.pose_coordinates import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.primitives import LinearConstraints
 from guiderail.models.skills import Skill
 
 
@@ -58,13 +61,23 @@ class Known:
         template: in its surroundings.
         approach: a scripted one.
         options: of the kind of guidance itself, by name, where it declares some.
+        pose_size: O of the station.
+        wrench_size: W of the station.
     """
 
     period: float
     demonstrations: PrimitiveSkill | None = None
     template: Template | None = None
     approach: Approach | None = None
-    options: Mapping[str, object] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    pose_size: int = POSE_SIZE
+    wrench_size: int = WRENCH_SIZE
+
+    @property
+    def constraints(self) -> LinearConstraints:
+        """The linear ones on a commanded pose (O,), which come with demonstrations; none where there are none."""
+        known = self.demonstrations
+        return LinearConstraints.none(self.pose_size) if known is None else known.constraints
 
     def has(self, ingredient: str) -> bool:
         """Whether that is known."""

@@ -59,6 +59,8 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
         template=task.template() if "template" in knows else None,
         approach=task.approach() if "approach" in knows else None,
         options=guidance,
+        pose_size=station.pose_size,
+        wrench_size=station.wrench_size,
     )
 
 

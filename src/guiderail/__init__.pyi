@@ -3,6 +3,7 @@ from .diagrams.guidance.guidance import Guidance as Guidance
 from .diagrams.guidance.known import Approach as Approach
 from .diagrams.guidance.known import Known as Known
 from .diagrams.guidance.known import Template as Template
+from .diagrams.guidance.law import LawGuidance as LawGuidance
 from .diagrams.guidance.primitive_skill import PrimitiveSkill as PrimitiveSkill
 from .diagrams.guidance.registry import register_guidance as register_guidance
 from .diagrams.make import make_env as make_env

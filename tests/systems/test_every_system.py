@@ -65,6 +65,7 @@ def built():
         systems.ContactWatch(plant, [body], [other], PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
+        systems.GuidanceLaw(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ImpedanceMonitor(np.ones(6)),

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent / "peglab"
-LINES = 170
+LINES = 150
 pytestmark = pytest.mark.xdist_group("peglab")
 
 
@@ -56,7 +56,8 @@ def trained(lab):
 
 
 def test_it_is_small_enough_to_be_worth_it():
-    assert len((PACKAGE / "peglab.py").read_text().splitlines()) <= LINES
+    files = (PACKAGE / "peglab.py", PACKAGE / "pyproject.toml")
+    assert sum(len(path.read_text().splitlines()) for path in files) <= LINES
 
 
 def test_no_file_of_guiderail_knows_it():

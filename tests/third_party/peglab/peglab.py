@@ -5,13 +5,13 @@ from typing import Any
 
 import numpy as np
 from pydantic import Field
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
+from pydrake.systems.framework import Context, Diagram
 
 from guiderail import (
     Condition,
     Guidance,
     Known,
+    LawGuidance,
     LinearConstraints,
     Observed,
     Options,
@@ -22,11 +22,9 @@ from guiderail import (
     register_guidance,
     register_task,
 )
-from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.models.policy import Policy
-from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.tools.learning.learner import LEARNERS, Learner, register_learner
+from guiderail.tools.learning.learner import Learner, register_learner
 from guiderail.tools.rollouts.rollout import Decision
 
 NUM_STEPS, PERIOD = 80, 0.02
@@ -57,9 +55,8 @@ class Slot(Task):
     def reference(self) -> ReferenceTrajectory:
         phase = np.linspace(0.0, 1.0, NUM_STEPS)
         means = np.column_stack([np.full(NUM_STEPS, 0.35), 0.1 + 0.8 * phase])
-        return ReferenceTrajectory(
-            PERIOD * np.arange(NUM_STEPS), means, np.tile(0.04**2 * np.eye(2), (NUM_STEPS, 1, 1))
-        )
+        covariances = np.tile(0.04**2 * np.eye(2), (NUM_STEPS, 1, 1))
+        return ReferenceTrajectory(PERIOD * np.arange(NUM_STEPS), means, covariances)
 
     def constraints(self) -> LinearConstraints:
         return LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
@@ -88,42 +85,10 @@ class OffsetOptions(Options):
     reach: float = Field(0.05, gt=0, description="how far a full action leads from where the robot is [m]")
 
 
-@register_guidance("peglab_offset", needs=(), label="offset", colour="#8c564b", options=OffsetOptions)
-class OffsetGuidance(Guidance):
-    """Commands the measured pose, as it was a control step ago, and what the policy adds."""
-
-    def __init__(self, known: Known):
-        super().__init__()
-        builder, size = DiagramBuilder(), 2
-        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(known.period, size))
-        here = builder.AddNamedSystem("pose_hold", ZeroOrderHold(known.period, size))
-        wrench = builder.AddNamedSystem("wrench", PassThrough(size))
-        both = builder.AddNamedSystem("both", PassThrough(size))
-        reach = float(known.options["reach"])  # type: ignore[arg-type]
-        gain = builder.AddNamedSystem("gain", MatrixGain(D=reach * np.eye(size)))
-        from guiderail.systems.residual import Residual
-
-        command = builder.AddNamedSystem("command", Residual(np.ones(size)))
-        free = ConstraintViolation(LinearConstraints.none(size), known.period)
-        violation = builder.AddNamedSystem("violation", free)
-        never = builder.AddNamedSystem("never", MatrixGain(D=np.zeros((1, size))))
-        builder.Connect(both.get_output_port(), here.get_input_port())
-        builder.Connect(hold.get_output_port(), gain.get_input_port())
-        builder.Connect(here.get_output_port(), command.get_reference_input_port())
-        builder.Connect(gain.get_output_port(), command.get_action_input_port())
-        builder.Connect(hold.get_output_port(), never.get_input_port())
-        builder.Connect(command.get_desired_pose_output_port(), violation.get_pose_input_port())
-        builder.ExportInput(hold.get_input_port(), "action")
-        builder.ExportInput(both.get_input_port(), "pose")
-        builder.ExportInput(wrench.get_input_port(), "wrench")
-        builder.ExportOutput(command.get_desired_pose_output_port(), "desired_pose")
-        builder.ExportOutput(hold.get_output_port(), "held_action")
-        builder.ExportOutput(violation.get_violation_output_port(), "constraint_violation")
-        builder.ExportOutput(never.get_output_port(), "fallback")
-        builder.BuildInto(self)
-
-
-OFFSET = GUIDANCE.get("peglab_offset")
+@register_guidance("peglab_offset", label="offset", options=OffsetOptions)
+def offset(known: Known) -> Guidance:
+    """Commands the measured pose and what the policy adds."""
+    return LawGuidance(known, lambda action, pose, wrench: pose + known.options["reach"] * action, action_size=2)
 
 
 @register_learner("peglab_hill_climbing")
@@ -165,6 +130,3 @@ class HillClimbing(Learner):
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         self.best, self.score = arrays["best"], values["score"]
         self.rng.bit_generator.state = values["random"]
-
-
-HILL_CLIMBING = LEARNERS.get("peglab_hill_climbing")
