@@ -231,11 +231,12 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
     folder, copy = job.folder, _policy_folder(job, mark)
     begun, table = (folder.path / "config.yaml").exists(), folder.path / "episodes.csv"
     done = len(folder.episodes()) if table.exists() else 0
-    if done <= mark and not copy.exists():
+    if done <= mark and not (copy / "policy.json").exists():
         complete = done == mark == folder.config().episodes and (folder.path / "policy.json").exists()
         if not complete:
             train(folder, job.config(mark), resume=begun)
-        Policy.load(folder.path).save(copy, write=write_atomically)
+        for name in ("policy.safetensors", "policy.json"):
+            write_atomically(copy / name, (folder.path / name).read_bytes())
     return folder.episodes()
 
 
