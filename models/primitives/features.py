@@ -4,11 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from guiderail.models.errors import InputError
 from guiderail.models.primitives.kernels import Kernel
 
 # The history is known to √ρ, the kernel to 1: their ratio is what a double loses digits to. Extended precision costs
 # a millisecond here, once for a whole trajectory, and is what keeps sKGRL accurate at ρ = 1e-10.
 _Extended = np.longdouble
+# A point of which the others leave less than this share of the kernel's variance can't be wished for on its own.
+_TIED = 1e-9
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,43 @@ def window_features(
         future_inputs: (H+1,) or (H+1, I).
         history_noise: ħρ, positive where there is a history.
     """
+    history_map, K = _conditioned(kernel, history_inputs, future_inputs, history_noise)
+    return WindowFeatures(history_map.astype(float), _pivoted_cholesky(K).astype(float))
+
+
+def window_interpolation(
+    kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float, points: np.ndarray
+) -> np.ndarray:
+    """(H+1, J): what a wish at some of the future points means at all of them, given that the history stays.
+
+    It is K̂ K̲⁻¹ of equation 4.17 with the history conditioned on. The kernel decides what is between the points.
+
+    Args:
+        kernel, history_inputs, future_inputs, history_noise: as in `window_features`.
+        points: (J,), different indices of the future inputs.
+
+    Raises:
+        InputError: if points are so near to each other that the kernel ties them together, and K̲ is singular.
+    """
+    if len(points) == len(future_inputs) and not len(history_inputs):
+        return np.eye(len(points))[:, points]  # wished for everywhere, nothing is in between
+    _, K = _conditioned(kernel, history_inputs, future_inputs, history_noise)
+    at = future_inputs[points].astype(_Extended)
+    among = kernel(at, at)
+    with np.errstate(invalid="ignore", divide="ignore"):  # of a singular matrix, which is refused
+        L = _cholesky(among)
+    if not (np.diagonal(L) ** 2 >= _TIED * np.diagonal(among)).all():
+        raise InputError(
+            "null-space actions are so near to each other that this kernel ties them together: leave some out, or "
+            "give a primitive without a history one at every point"
+        )
+    return _solve_lower(L[::-1, ::-1].T, _solve_lower(L, K[points])[::-1])[::-1].T.astype(float)
+
+
+def _conditioned(
+    kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The future's map from the history and its kernel given the history, both in extended precision."""
     past, future = history_inputs.astype(_Extended), future_inputs.astype(_Extended)
     K = kernel(future, future)
     history_map = np.zeros((len(future), len(past)), dtype=_Extended)
@@ -47,7 +87,7 @@ def window_features(
         V = _solve_lower(L, kernel(past, future))
         history_map = _solve_lower(L[::-1, ::-1].T, V[::-1])[::-1].T
         K = K - V.T @ V
-    return WindowFeatures(history_map.astype(float), _pivoted_cholesky(K).astype(float))
+    return history_map, K
 
 
 class KernelBasis:

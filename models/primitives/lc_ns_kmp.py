@@ -8,12 +8,15 @@ history sKGRL's primitive (5.1-5.3).
 """
 
 from collections import OrderedDict
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
+from guiderail.models.primitives.arrays import numbers
 from guiderail.models.primitives.constraints import LinearConstraints
-from guiderail.models.primitives.features import WindowFeatures, window_features
+from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
 from guiderail.models.primitives.least_norm import UnsolvableError, find_solver
 from guiderail.models.primitives.reference import ReferenceTrajectory
@@ -58,6 +61,26 @@ class Prediction:
     def trajectory(self) -> np.ndarray:
         """The whole modified window (H+1, O); computed at each call."""
         return self._factor.trajectory(self._x, self._v)
+
+
+@dataclass(frozen=True)
+class Modification:
+    """A stretch of a motion as null-space actions at several of its points modify it.
+
+    Attributes:
+        steps: (n,), which steps of the reference these are; steps past its end are there too.
+        trajectory: (n, O), within the constraints.
+        multipliers: α (n, F) ≥ 0, zero where a constraint is slack.
+    """
+
+    steps: np.ndarray
+    trajectory: np.ndarray
+    multipliers: np.ndarray
+
+    @property
+    def constrained(self) -> bool:
+        """True if some constraint had to be enforced."""
+        return bool(self.multipliers.any())
 
 
 class LcNsKmp:
@@ -129,6 +152,7 @@ class LcNsKmp:
         self._cache: OrderedDict[int, StepFactor] = OrderedDict()
         self._cache_bytes, self.cached_bytes = cache_bytes, 0
         self._shared_features: WindowFeatures | None = None
+        self._whole: StepFactor | None = None
         self._history_shape = (self.history, reference.num_outputs)
 
     @property
@@ -213,6 +237,87 @@ class LcNsKmp:
             raise UnsolvableError(f"the solver left a violation of {violation:.1e}")
         return Prediction(output, factor, x, v, signed)
 
+    def modified_window(
+        self, step: int, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None
+    ) -> Modification:
+        """The window at `step` under null-space actions at several of its points (equations 4.17 and 4.18).
+
+        With one action at `step` itself it is the window of `predict` (equation 4.21). Between the points the kernel
+        decides, as the minimum-norm weights do that reach all of the actions. It is factored anew at each call.
+
+        Args:
+            step: n ≥ 0, the executed point; past the end, the last step.
+            at: (J,), different steps from n … n+H, in any order.
+            null_space_actions: ξ̂ (J, O), one at each of them.
+            history: as in `predict`.
+
+        Raises:
+            InputError: if an argument has the wrong shape, is not finite or no step of the window, or if steps are so
+                near to each other that the kernel ties them together.
+            UnsolvableError: if no window within the constraints was found.
+        """
+        if step < 0:
+            raise InputError(f"step counts from 0, not {step}")
+        step = min(step, self.num_steps - 1)
+        factor = self._factor(step)
+        return self._modified(factor, step, self.horizon, at, null_space_actions, history)
+
+    def modified_trajectory(
+        self, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None
+    ) -> Modification:
+        """The whole motion under null-space actions at several of its points (equations 4.17 and 4.18).
+
+        One problem 4.5 over all N steps, where `predict` solves one for each window: smooth over the whole motion, and
+        within the constraints everywhere. It is factored at the first call.
+
+        Args:
+            at: (J,), different steps from 0 … N−1, in any order; none for the motion without actions.
+            null_space_actions: ξ̂ (J, O), one at each of them.
+            history: (P, O), the outputs before the first step; None where P = 0.
+
+        Raises:
+            InputError: as `modified_window`.
+            UnsolvableError: as `modified_window`.
+        """
+        horizon = self.num_steps - 1
+        if self._whole is None:
+            past, future = self._inputs(0, horizon)
+            features = window_features(self.kernel, past, future, self._history_noise)
+            self._whole = StepFactor(self._window(0, horizon), features, self.lambda_, self.beta)
+        return self._modified(self._whole, 0, horizon, at, null_space_actions, history)
+
+    def _modified(
+        self,
+        factor: StepFactor,
+        step: int,
+        horizon: int,
+        at: ArrayLike,
+        null_space_actions: ArrayLike,
+        history: np.ndarray | None,
+    ) -> Modification:
+        x = self._stack(None, history)
+        points = numbers(at, "the steps of null-space actions")
+        if points.ndim != 1 or not np.isin(points, np.arange(step, step + horizon + 1)).all():
+            raise InputError(f"null-space actions must be at steps among {step} … {step + horizon}: {brief(at)}")
+        if len(np.unique(points)) < len(points):
+            raise InputError(f"null-space actions must be at different steps, not {brief(at)}")
+        actions = np.atleast_2d(numbers(null_space_actions, "null-space actions"))
+        shape = (len(points), self.num_outputs)
+        if actions.shape != shape and actions.size + len(points) > 0:
+            raise InputError(f"null-space actions at {len(points)} steps have shape {shape}, not {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise InputError("null-space actions must be finite")
+        actions = actions.reshape(shape)
+        past, future = self._inputs(step, horizon)
+        indices = points.astype(int) - step
+        wish = window_interpolation(self.kernel, past, future, self._history_noise, indices) @ actions
+        trajectory, signed = factor.modified(x, wish, self._solve)
+        violation = factor.worst_violation(trajectory)
+        if not violation <= TOLERANCE:
+            raise UnsolvableError(f"the solver left a violation of {violation:.1e}")
+        alpha = np.zeros(factor.multipliers_shape) if signed is None else factor.multipliers(signed)
+        return Modification(np.arange(step, step + horizon + 1), trajectory, alpha)
+
     def linear_response(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The free output of a step, R_h h + N ξ̂ + r: R_h (O, PO), N (O, O), r (O,), where no constraint is active."""
         factor = self._factor(step)
@@ -248,7 +353,7 @@ class LcNsKmp:
         step = min(step, self.num_steps - 1)
         factor = self._cache.get(step)
         if factor is None:
-            factor = StepFactor(self._window(step), self._features(step), self.lambda_, self.beta)
+            factor = StepFactor(self._window(step, self.horizon), self._features(step), self.lambda_, self.beta)
             self._cache[step] = factor
             self.cached_bytes += factor.nbytes
             while self.cached_bytes > self._cache_bytes and len(self._cache) > 1:
@@ -261,17 +366,21 @@ class LcNsKmp:
         """ħρ: what the history's covariance weighs against the kernel."""
         return (self.lambda_ + self.beta) * self.history_variance
 
-    def _window(self, step: int) -> Window:
-        steps = np.arange(step, step + self.horizon + 1)
+    def _window(self, step: int, horizon: int) -> Window:
+        steps = np.arange(step, step + horizon + 1)
         held = np.minimum(steps, self.num_steps - 1)
         G, c = self.constraints.window(held)
         return Window(self.reference.means[held], self.reference.covariances[held], G, c)
 
+    def _inputs(self, step: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        """The clock at the history (P,), and at the executed point and the horizon behind it (horizon+1,)."""
+        past = self.reference.inputs(np.arange(step - self.history, step))
+        return past, self.reference.inputs(np.arange(step, step + horizon + 1))
+
     def _features(self, step: int) -> WindowFeatures:
         if self._shared_features is not None:
             return self._shared_features
-        past = self.reference.inputs(np.arange(step - self.history, step))
-        future = self.reference.inputs(np.arange(step, step + self.horizon + 1))
+        past, future = self._inputs(step, self.horizon)
         features = window_features(self.kernel, past, future, self._history_noise)
         if self.kernel.stationary and self.reference.uniform:
             self._shared_features = features

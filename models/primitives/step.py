@@ -35,6 +35,8 @@ class _Solution:
     y = L (latent_mean + latent_map x) + direct_map history, and a correction v moves it by L v.
     """
 
+    whiten: np.ndarray  # Σ^(-1/2), (H+1, O, O)
+    Lw: np.ndarray  # Σ^(-1/2) L
     L: np.ndarray
     latent_mean: np.ndarray
     latent_map: np.ndarray
@@ -87,6 +89,8 @@ class StepFactor:
         whitened_means = np.einsum("joi,ji->jo", whiten, self._window.means).ravel()
         whitened_map = np.einsum("jp,joi->jopi", W, whiten).reshape(steps * outputs, past * outputs)
         return _Solution(
+            whiten=whiten,
+            Lw=Lw,
             L=L,
             latent_mean=Lw.T @ whitened_means,
             latent_map=np.concatenate([-Lw.T @ whitened_map, self._beta * L[:outputs].T], axis=1),
@@ -152,6 +156,38 @@ class StepFactor:
             latent = latent + self._basis @ v
         y = solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]
         return y.reshape(self._window.means.shape)
+
+    def modified(self, x: np.ndarray, wish: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray | None]:
+        """The window under null-space actions at several points: equation 4.18 with its multipliers of 4.17.
+
+        Args:
+            x: [history, null-space action], the action zero.
+            wish: (H+1, O), what the actions ask for at every point, K̂ K̲⁻¹ ξ̂ given the history.
+            solver: for the constraints.
+
+        Returns:
+            The window (H+1, O), and the solver's multipliers (m,), None where every constraint is slack.
+
+        Raises:
+            UnsolvableError: if the solver finds no correction.
+        """
+        solution = self._solve()
+        # β/ħ (K̂ − K A K̂) K̲⁻¹ ξ̂: what is wished for, less what the demonstrations' covariance does not let through.
+        whitened = np.einsum("joi,ji->jo", solution.whiten, wish).ravel()
+        pull = self._beta / self._hbar * (wish - (solution.L @ (solution.Lw.T @ whitened)).reshape(wish.shape))
+        latent = solution.latent_mean + solution.latent_map @ x
+        y = (solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]).reshape(wish.shape) + pull
+        along = np.einsum("jmo,jo->jm", self._window.G[:, self._directions[0]], pull).ravel() * self._scale
+        free = self.constraint_map @ x + along
+        if (free >= self.lower).all() and (free <= self.upper).all():
+            return y, None
+        v, signed = self.correct(free, solver)
+        return y + (solution.L @ (self._basis @ v)).reshape(wish.shape), signed
+
+    def worst_violation(self, trajectory: np.ndarray) -> float:
+        """max(c − G y) over a whole window (H+1, O); −inf where there is no constraint."""
+        short = self._window.c - np.einsum("nfo,no->nf", self._window.G, trajectory)
+        return float(short.max(initial=-np.inf))
 
     @property
     def multipliers_shape(self) -> tuple[int, int]:

@@ -41,8 +41,20 @@ class DenseWindow:
     """
 
     def __init__(
-        self, kernel, inverse_length, inputs, means, covariances, executed, lambda_, beta, action, precision=Extended
+        self,
+        kernel,
+        inverse_length,
+        inputs,
+        means,
+        covariances,
+        executed,
+        lambda_,
+        beta,
+        action,
+        precision=Extended,
+        at=None,
     ):
+        """`at`: where the actions are, (J,) indices of the inputs; at the executed point alone unless given."""
         t = np.asarray(inputs, dtype=precision)
         mu = np.asarray(means, dtype=precision)
         o = mu.shape[1]
@@ -54,6 +66,11 @@ class DenseWindow:
         A_mu_K = cholesky_solve(K + hbar * sigma, np.column_stack([mu.ravel(), K]))
         A_mu, A_K = A_mu_K[:, 0], A_mu_K[:, 1:]
         xi = np.asarray(action, dtype=precision)
+        if at is not None:
+            # K̲⁻¹ ξ̂ of all actions together, put where they are: the columns of K̂ follow.
+            among = np.kron(k[np.ix_(at, at)], np.eye(o, dtype=precision))
+            e = np.concatenate([np.arange(i * o, (i + 1) * o) for i in at]).astype(int)
+            xi = cholesky_solve(among, xi.reshape(-1, 1))[:, 0]
         # (β/ħ)(K̂ − K A K̂) ξ̂: the printed form, not the cancellation-free one.
         self.y = K @ A_mu + precision(beta) * (sigma @ (A_K[:, e] @ xi))
         S = A_K.T @ sigma
