@@ -9,7 +9,6 @@ from matplotlib.patches import Ellipse, Rectangle
 
 from guiderail.models.primitives import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import rms_gains
-from guiderail.models.primitives.least_norm import solve_least_norm
 from guiderail.models.primitives.mixture import fit_mixture
 from guiderail.tools.figures.runs import figure_study, learning_curves, leave, said
 from guiderail.tools.guidance import colour, label
@@ -44,37 +43,6 @@ def synthetic_demonstrations(seed: int = 0, count: int = 6) -> Demonstrations:
     )
 
 
-def whole_trajectory(primitive: LcNsKmp, step: int, action: np.ndarray) -> np.ndarray:
-    """Equation 4.18 for all N points at once, with one null-space action at `step`: (N, O).
-
-    A robot predicts in windows that start where it is (`LcNsKmp.predict`); a picture of one action's effect needs what
-    comes before it too. The constraints are enforced in the least-norm form.
-    """
-    reference, outputs = primitive.reference, primitive.num_outputs
-    eye = np.eye(outputs)
-    size = reference.num_steps * outputs
-    sigma = np.zeros((size, size))
-    for n, covariance in enumerate(reference.covariances):
-        sigma[n * outputs : (n + 1) * outputs, n * outputs : (n + 1) * outputs] = covariance
-    kernel = np.kron(primitive.kernel(reference.times, reference.times), eye)
-    column = kernel[:, step * outputs : (step + 1) * outputs]
-    solved = np.linalg.solve(
-        kernel + (primitive.lambda_ + primitive.beta) * sigma,
-        np.column_stack([reference.means.ravel(), column @ action, sigma]),
-    )
-    free = kernel @ solved[:, 0] + primitive.beta * sigma @ solved[:, 1]
-    spread = kernel @ solved[:, 2:]
-    values, vectors = np.linalg.eigh((spread + spread.T) / 2)
-    root = vectors[:, values > 1e-12 * values[-1]] * np.sqrt(values[values > 1e-12 * values[-1]])
-    G, c = primitive.constraints.window(np.arange(reference.num_steps))
-    rows = np.einsum("nfo,nor->nfr", G, root.reshape(reference.num_steps, outputs, -1)).reshape(c.size, -1)
-    missing = (c - np.einsum("nfo,no->nf", G, free.reshape(-1, outputs))).ravel()
-    if missing.max() <= 0:
-        return free.reshape(-1, outputs)
-    v, _ = solve_least_norm(rows, missing, np.full(c.size, np.inf))
-    return (free + root @ v).reshape(-1, outputs)
-
-
 def explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> np.ndarray:
     """A motion (N, O) with a normally distributed null-space action at every step."""
     random = np.random.default_rng(seed)
@@ -90,7 +58,12 @@ def figure_4_2(out: Path) -> dict[str, Any]:
     primitive = LcNsKmp(reference, constraints=LinearConstraints.box(LOWER, UPPER))
     gain = rms_gains(primitive)
     step = int(np.argmin(np.abs(reference.times - MODULATED_AT)))
-    unmodulated = whole_trajectory(primitive, step, np.zeros(2))
+    unmodulated = primitive.modified_trajectory([], []).trajectory
+
+    def row(panel: str, case: str, path: np.ndarray) -> dict[str, Any]:
+        away = np.linalg.norm(path - unmodulated, axis=1)
+        moved = {"moved_at_3.2_s": float(away[step]), "moved_most_elsewhere": float(away.max())}
+        return {"panel": panel, "case": case, "worst_violation": _violation(primitive, path), **moved}
 
     figure, ((first, second, third),) = new_figure(1, 3, (15, 4.2))
     for outputs in demonstrations.outputs:
@@ -99,32 +72,15 @@ def figure_4_2(out: Path) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
         action = 3 * gain * np.array([np.cos(angle), np.sin(angle)])
-        path = whole_trajectory(primitive, step, action)
+        path = primitive.modified_trajectory([step], [action]).trajectory
         second.plot(*path.T, linewidth=1)
-        moved = path[step] - unmodulated[step]
-        rows.append(
-            {
-                "panel": "A2, one action at 3.2 s",
-                "case": f"{np.degrees(angle):.0f}°",
-                "worst_violation": _violation(primitive, path),
-                "moved_at_3.2_s": float(np.linalg.norm(moved)),
-                "moved_most_elsewhere": float(np.linalg.norm(path - unmodulated, axis=1).max()),
-            }
-        )
+        rows.append(row("A2, one action at 3.2 s", f"{np.degrees(angle):.0f}°", path))
     second.plot(*unmodulated.T, color="black", linewidth=1.5)
     second.plot(*unmodulated[step], "ko", markersize=5)
     paths = np.stack([explore(primitive, gain, seed) for seed in range(5)])
     for path in paths:
         third.plot(*path.T, linewidth=0.5, alpha=0.7)
-        rows.append(
-            {
-                "panel": "A3, random actions",
-                "case": f"motion {len(rows) - 7}",
-                "worst_violation": _violation(primitive, path),
-                "moved_at_3.2_s": float(np.linalg.norm(path[step] - unmodulated[step])),
-                "moved_most_elsewhere": float(np.linalg.norm(path - unmodulated, axis=1).max()),
-            }
-        )
+        rows.append(row("A3, random actions", f"motion {len(rows) - 7}", path))
     for axis, title in zip((first, second, third), ("demonstrations and mixture", "one action", "random"), strict=True):
         if axis is not first:
             axis.add_patch(Rectangle(tuple(LOWER), *(UPPER - LOWER), fill=False, color="firebrick", linestyle="--"))

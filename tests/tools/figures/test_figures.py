@@ -2,33 +2,16 @@ import numpy as np
 import pytest
 
 from guiderail.models.policy import FORMAT, Policy
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
-from guiderail.models.primitives.gains import rms_gains
 from guiderail.tools.figures import FIGURES, find_figure, reproduce
 from guiderail.tools.figures.chapter_3 import METHODS
-from guiderail.tools.figures.chapter_4 import LOWER, UPPER, synthetic_demonstrations, whole_trajectory
 from guiderail.tools.studies.declaration import load_study
 from guiderail.tools.studies.study import JUDGED, TRAINING, Job
 from guiderail.tools.tables import read_table
 
 
-@pytest.fixture(scope="module")
-def reference():
-    return ReferenceTrajectory.from_demonstrations(synthetic_demonstrations(), components=6, num_steps=60)
-
-
 @pytest.mark.parametrize("figure", FIGURES)
 def test_every_figure_has_a_function(figure):
     assert callable(find_figure(figure))
-
-
-def test_a_whole_trajectory_is_a_window_that_spans_it(reference):
-    constraints = LinearConstraints.box(LOWER, UPPER)
-    primitive = LcNsKmp(reference, horizon=reference.num_steps - 1, constraints=constraints)
-    for scale in (0.0, 1.0, 20.0):
-        action = scale * rms_gains(primitive) * [0.3, 1.0]
-        expected = primitive.predict(0, action).trajectory
-        np.testing.assert_allclose(whole_trajectory(primitive, 0, action), expected, atol=1e-7)
 
 
 def test_figure_4_2_shows_a_primitive_that_keeps_its_constraints(tmp_path):
