@@ -12,7 +12,6 @@ from guiderail.tools.learning.defaults import DEFAULTS, own_defaults
 from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.learning.progress import TrainingProgress
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
-from guiderail.tools.learning.train import train
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.tasks import check_environment, import_modules
 
@@ -83,6 +82,8 @@ def run(
     else:
         folder.refuse_existing()
         config = configure(task, environment, settings=settings, imports=imports, **with_defaults(task, given))
+    from guiderail.tools.learning.train import train  # PyTorch takes seconds: what is wrong was refused by now
+
     with TrainingProgress(config.episodes, name=config.task) as progress:
         rows = train(folder, config, resume=resume, report=progress.update)
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)

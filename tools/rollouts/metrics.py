@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
 
 from guiderail.diagrams.trace import Trace, mean_jerk
 
@@ -142,7 +141,12 @@ def _violating(column: str) -> Callable[[pd.DataFrame], int]:
 
 
 def _wilson(end: int) -> Callable[[pd.DataFrame], float]:
-    return lambda rows: float(binomtest(int(rows["success"].sum()), len(rows)).proportion_ci(method="wilson")[end])
+    def bound(rows: pd.DataFrame) -> float:
+        from scipy.stats import binomtest  # half a second to import
+
+        return float(binomtest(int(rows["success"].sum()), len(rows)).proportion_ci(method="wilson")[end])
+
+    return bound
 
 
 def _force_since_converged(rows: pd.DataFrame) -> float | None:

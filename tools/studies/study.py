@@ -174,15 +174,17 @@ def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
 
 def _finished(jobs: Sequence[Job], processes: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
     """The jobs' indices and rows as they are done, and a bar that says how far it is."""
-    if processes == 1:
-        yield from ((index, run_job(job)) for index, job in enumerate(jobs))
+    here = [index for index, job in enumerate(jobs) if processes == 1 or _is_done(job)]
+    yield from ((index, run_job(jobs[index])) for index in here)
+    open_jobs = {index: job for index, job in enumerate(jobs) if index not in here}
+    if not open_jobs:
         return
     console = Console(stderr=True)
     # Fresh processes: a forked one would inherit the threads and random generators of this one.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_one_thread) as pool:
-        waiting = {pool.submit(run_job, job): index for index, job in enumerate(jobs)}
-        bar: dict[str, Any] = {"total": len(jobs), "console": console, "disable": not console.is_terminal}
+    with ProcessPoolExecutor(min(processes, len(open_jobs)), mp_context=context, initializer=_one_thread) as pool:
+        waiting = {pool.submit(run_job, job): index for index, job in open_jobs.items()}
+        bar: dict[str, Any] = {"total": len(open_jobs), "console": console, "disable": not console.is_terminal}
         for future in track(as_completed(waiting), "runs", **bar):
             yield waiting[future], future.result()
 
@@ -222,19 +224,32 @@ def run_job(job: Job) -> list[dict[str, Any]]:
     return rows
 
 
+def _is_done(job: Job) -> bool:
+    """Whether its rows only have to be read."""
+    evaluated = (_evaluated_file(job, mark, judged) for mark in job.marks for judged in job.study.judged_on)
+    return all(file.exists() for file in evaluated) and not any(_is_to_train(job, mark) for mark in job.marks)
+
+
+def _is_to_train(job: Job, mark: int) -> bool:
+    """Whether a run has not come as far as a mark."""
+    folder = job.folder
+    if not job.learns or (_policy_folder(job, mark) / "policy.json").exists():
+        return False
+    done = len(folder.episodes()) if (folder.path / "episodes.csv").exists() else 0
+    complete = done == mark == folder.config().episodes and (folder.path / "policy.json").exists() if done else False
+    return done <= mark and not complete
+
+
 def _train(job: Job, mark: int) -> pd.DataFrame:
     """The episodes of a run that has come at least as far as a mark, whose policy is copied."""
-    from guiderail.tools.learning.train import train
-
     if not job.learns:
         return pd.DataFrame()
     folder, copy = job.folder, _policy_folder(job, mark)
-    begun, table = (folder.path / "config.yaml").exists(), folder.path / "episodes.csv"
-    done = len(folder.episodes()) if table.exists() else 0
-    if done <= mark and not (copy / "policy.json").exists():
-        complete = done == mark == folder.config().episodes and (folder.path / "policy.json").exists()
-        if not complete:
-            train(folder, job.config(mark), resume=begun)
+    if _is_to_train(job, mark):
+        from guiderail.tools.learning.train import train
+
+        train(folder, job.config(mark), resume=(folder.path / "config.yaml").exists())
+    if len(folder.episodes()) == mark and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):
             write_atomically(copy / name, (folder.path / name).read_bytes())
     return folder.episodes()
@@ -253,9 +268,12 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
 
 def _evaluated(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
     """Rows of held-out episodes, from the file where they are known already."""
+    return cached(_evaluated_file(job, mark, judged), lambda: _evaluate(job, mark, judged))
+
+
+def _evaluated_file(job: Job, mark: int, judged: JudgedOn) -> Path:
     words = {"name": judged.name.replace(" ", "_"), "mark": mark, "episodes": judged.episodes}
-    file = job.folder.path / judged.file.format(**words, digest=_digest(job, judged))
-    return cached(file, lambda: _evaluate(job, mark, judged))
+    return job.folder.path / judged.file.format(**words, digest=_digest(job, judged))
 
 
 def _evaluate(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
