@@ -10,9 +10,9 @@ import pandas as pd
 from guiderail.models.errors import InputError
 from guiderail.tools.learning.defaults import DEFAULTS, own_defaults
 from guiderail.tools.learning.presets import resolve_preset
-from guiderail.tools.learning.progress import TrainingProgress
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.rollouts.metrics import summary
+from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.tasks import check_environment, import_modules
 
 # What a finished run says about itself.
@@ -84,7 +84,7 @@ def run(
         config = configure(task, environment, settings=settings, imports=imports, **with_defaults(task, given))
     from guiderail.tools.learning.train import train  # PyTorch takes seconds: what is wrong was refused by now
 
-    with TrainingProgress(config.episodes, name=config.task) as progress:
+    with EpisodeProgress(config.episodes, name=config.task) as progress:
         rows = train(folder, config, resume=resume, report=progress.update)
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
 

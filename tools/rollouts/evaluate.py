@@ -1,13 +1,12 @@
 """`guiderail evaluate`: what a policy achieves on held-out conditions, beside the demonstration alone."""
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import pandas as pd
-from rich.console import Console
-from rich.progress import track
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
@@ -16,6 +15,7 @@ from guiderail.tools.guidance import is_demonstrated
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.rollouts.metrics import converged_after, summary
 from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import make_environment
@@ -44,7 +44,7 @@ def evaluate_policy(
         episodes: how many.
         seed: of the first.
         options: further ones of the resets.
-        words: what a progress bar on a terminal says; without them there is none.
+        words: what its progress is called on standard error; without them there is none.
 
     Raises:
         InputError: for a number out of range.
@@ -53,10 +53,13 @@ def evaluate_policy(
         raise InputError(f"an evaluation needs at least one episode, not {episodes}")
     if not 0 <= seed < 2**31:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
-    console = Console(stderr=True)
-    shown = words and console.is_terminal
-    indices = track(range(episodes), words, console=console, transient=True, disable=not shown)
-    return pd.DataFrame([rollout(env, act, index=i, seed=seed + i, held_out=True, options=options) for i in indices])
+    rows = []
+    with EpisodeProgress(episodes, name=words) if words else nullcontext() as progress:
+        for i in range(episodes):
+            rows.append(rollout(env, act, index=i, seed=seed + i, held_out=True, options=options))
+            if progress is not None:
+                progress.update(rows[-1])
+    return pd.DataFrame(rows)
 
 
 def evaluate_run(

@@ -35,9 +35,12 @@ def test_what_is_known_is_not_evaluated_again(tmp_path):
     assert len(asked) == 1
 
 
-def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_config, tmp_path):
+def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_config, tmp_path, capsys):
     train(RunFolder(tmp_path / "run"), bead_config)
     result = evaluate(tmp_path / "run", episodes=3)
+    said = capsys.readouterr().err
+    assert "held-out episodes 3/3" in said
+    assert "demonstration alone 3/3" in said
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
     elsewhere = evaluate(tmp_path / "run", episodes=3, environment={"wall": -0.5})

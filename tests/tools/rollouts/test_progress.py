@@ -2,7 +2,7 @@ import io
 
 from rich.console import Console
 
-from guiderail.tools.learning.progress import TrainingProgress
+from guiderail.tools.rollouts.progress import EpisodeProgress
 
 
 def rows(count):
@@ -14,7 +14,7 @@ def rows(count):
 
 def shown(terminal):
     text = io.StringIO()
-    with TrainingProgress(4, console=Console(file=text, force_terminal=terminal, width=140)) as progress:
+    with EpisodeProgress(4, console=Console(file=text, force_terminal=terminal, width=140)) as progress:
         for row in rows(4):
             progress.update(row)
     return text.getvalue()

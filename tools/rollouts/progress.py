@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on: success, return, worst violation and the time left."""
+"""What a person sees while episodes go on: success, return, worst violation and the time left."""
 
 import time
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from guiderail.tools.rollouts.metrics import TOLERANCE
 WINDOW = 10  # episodes that success and return are averaged over
 
 
-class TrainingProgress:
+class EpisodeProgress:
     """A bar on a terminal; elsewhere, in a log file or a pipe, a line now and then that says the same.
 
     Use it as a context and call `update` with each episode's row.
@@ -42,7 +42,7 @@ class TrainingProgress:
         )
         self._task = self._bar.add_task(name, total=episodes, said="")
 
-    def __enter__(self) -> "TrainingProgress":
+    def __enter__(self) -> "EpisodeProgress":
         self._bar.start()
         return self
 
