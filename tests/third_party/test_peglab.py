@@ -13,7 +13,6 @@ import pytest
 
 PACKAGE = Path(__file__).parent / "peglab"
 LINES = 150
-pytestmark = pytest.mark.xdist_group("peglab")
 
 
 @pytest.fixture(scope="module")
