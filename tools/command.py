@@ -137,14 +137,18 @@ def train(
     observation: Annotated[str | None, _opt("state or image.")] = None,
     uncertainty: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
     station: Annotated[str | None, _opt("rails or arm, where a task has both.")] = None,
+    ledger: Annotated[
+        bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
+    ] = None,
     resume: Annotated[bool, _opt("Go on with the run in --out.", "--resume")] = False,
     imports: Imports = None,
     as_json: Json = False,
 ) -> None:
     """Train a policy and leave a run folder.
 
-    The folder holds the configuration, a table with a row for every episode, a checkpoint, the policy, a learning
-    curve and a replay. A run that was stopped goes on with --resume to the result it would have had.
+    The folder holds the configuration, a table with a row for every episode, a ledger with one for every control step,
+    a checkpoint, the policy, a learning curve and a replay. A run that was stopped goes on with --resume to the result
+    it would have had.
     """
     from guiderail.tools.learning import configure
 
@@ -161,6 +165,7 @@ def train(
         seed=seed,
         resume=resume,
         imports=imports or (),
+        ledger=ledger,
     )
     _print(summary, as_json)
 
