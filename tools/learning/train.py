@@ -45,15 +45,6 @@ def train(
     Raises:
         InputError: if the folder holds another run, or another process writes into it.
     """
-    if not resume:
-        folder.refuse_existing()
-    with folder.locked():
-        return _train(folder, config, resume, report)
-
-
-def _train(
-    folder: RunFolder, config: RunConfig, resume: bool, report: Callable[[dict[str, Any]], None] | None
-) -> list[dict[str, Any]]:
     torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
     env = make_environment(config.task, config.environment)
     task = cast(Any, env.unwrapped).task
@@ -63,6 +54,23 @@ def _train(
         config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=task.symmetry
     )
     env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
+    if not resume:
+        folder.refuse_existing()
+    try:
+        with folder.locked():
+            return _train(folder, config, env, learner, resume, report)
+    finally:
+        env.close()
+
+
+def _train(
+    folder: RunFolder,
+    config: RunConfig,
+    env: Any,
+    learner: Learner,
+    resume: bool,
+    report: Callable[[dict[str, Any]], None] | None,
+) -> list[dict[str, Any]]:
     if resume:
         rows = _resume(folder, learner, env)
         folder.write_config(config)
@@ -96,7 +104,6 @@ def _train(
             spent_saving += last_saving
     policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
     policy.save(folder.path, write=write_atomically)
-    env.close()
     return rows
 
 
