@@ -55,6 +55,7 @@ class GuidedEnv(DrakeGymEnv):
         task: the `TaskDiagram`.
         hold: control steps for which an action is held.
         trace: the `Trace` of the current episode.
+        drawn: what the task drew for it.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
@@ -107,6 +108,7 @@ class GuidedEnv(DrakeGymEnv):
         self._pose_port = diagram.GetOutputPort("pose")
         sizes = {name: port.size() for name, port in self._recorded}
         self.trace = Trace(task.num_steps, self._pose_port.size(), task.control_period, sizes)
+        self.drawn: dict[str, Any] = {}
         self._control_steps = 0
         self._running = False
         self._observation: np.ndarray | None = None
@@ -120,7 +122,7 @@ class GuidedEnv(DrakeGymEnv):
         context = self.simulator.get_mutable_context()
         context.SetTimeStateAndParametersFrom(self._pristine)
         self._action_value.GetMutableData().set_value(self._neutral)
-        drawn = self.task.randomize(context, self.np_random, dict(options or {}))
+        self.drawn = self.task.randomize(context, self.np_random, dict(options or {}))
         self.simulator.Initialize()
         self._control_steps = 0
         self.trace.clear()
@@ -129,7 +131,7 @@ class GuidedEnv(DrakeGymEnv):
         now = {name: port.Eval(context) for name, port in self._recorded}
         self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
         info = self._info(0, *self._violations, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
-        info.update(drawn)
+        info.update(self.drawn)
         return self._observation, info
 
     def step(self, action):

@@ -39,7 +39,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "presets": _known("tools.learning.presets", "PRESETS"),
     "studies": _known("tools.studies.declaration", "shipped_studies"),
     "figures": _known("tools.figures", "FIGURES"),
-    "stressed": _known("tools.stress", "STRESSED"),
+    "stressed": _known("tools.stress", "stressed"),
     "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
     "generated": _known("tools.recording.generate", "GENERATED"),
     "pictures": _known("tools.files", "PICTURES"),
@@ -333,16 +333,20 @@ def bench(
 @command("stress BncConnector --episodes 1000 --out stress.csv")
 def stress(
     task: Annotated[str, _arg("The task: {stressed}.", "TASK", "stressed")],
-    episodes: Annotated[int | None, _opt("How many in all.  [default: 1000]")] = None,
+    episodes: Annotated[int | None, _opt("How many in all, of one task.  [default: 1000]")] = None,
     steps: Annotated[int | None, _opt("Control steps in all, instead of --episodes.")] = None,
     seed: Annotated[int, _opt("The seed of the first episode; each has its own.")] = 0,
-    out: Annotated[Path | None, _opt("A table (.csv); a campaign that was stopped goes on in it.")] = None,
+    out: Annotated[
+        Path | None,
+        _opt("A table (.csv), and of all tasks a folder; a campaign that was stopped goes on in it."),
+    ] = None,
     env: Env = None,
 ) -> None:
     """Try to make a task fail by actions that no policy sends.
 
-    It prints what came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction
-    failed, constrained guidance commanded a violation, or a limit of the task's own was passed.
+    With "all" it tries every task through every guidance, and leaves a ledger of every control step too. It prints what
+    came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction failed,
+    constrained guidance commanded a violation (recomputed from the commands), or a limit of the task's own was passed.
     """
     from guiderail.tools.stress.campaign import stress as stress_task
 
