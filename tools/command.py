@@ -39,7 +39,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "presets": _known("tools.learning.presets", "PRESETS"),
     "studies": _known("tools.studies.declaration", "shipped_studies"),
     "figures": _known("tools.figures", "FIGURES"),
-    "stressed": _known("tools.stress", "STRESSED"),
+    "stressed": _known("tools.stress", "stressed"),
     "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
     "generated": _known("tools.recording.generate", "GENERATED"),
     "pictures": _known("tools.files", "PICTURES"),
@@ -137,14 +137,18 @@ def train(
     observation: Annotated[str | None, _opt("state or image.")] = None,
     uncertainty: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
     station: Annotated[str | None, _opt("rails or arm, where a task has both.")] = None,
+    ledger: Annotated[
+        bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
+    ] = None,
     resume: Annotated[bool, _opt("Go on with the run in --out.", "--resume")] = False,
     imports: Imports = None,
     as_json: Json = False,
 ) -> None:
     """Train a policy and leave a run folder.
 
-    The folder holds the configuration, a table with a row for every episode, a checkpoint, the policy, a learning
-    curve and a replay. A run that was stopped goes on with --resume to the result it would have had.
+    The folder holds the configuration, a table with a row for every episode, a ledger with one for every control step,
+    a checkpoint, the policy, a learning curve and a replay. A run that was stopped goes on with --resume to the result
+    it would have had.
     """
     from guiderail.tools.learning import configure
 
@@ -161,6 +165,7 @@ def train(
         seed=seed,
         resume=resume,
         imports=imports or (),
+        ledger=ledger,
     )
     _print(summary, as_json)
 
@@ -328,16 +333,20 @@ def bench(
 @command("stress BncConnector --episodes 1000 --out stress.csv")
 def stress(
     task: Annotated[str, _arg("The task: {stressed}.", "TASK", "stressed")],
-    episodes: Annotated[int | None, _opt("How many in all.  [default: 1000]")] = None,
+    episodes: Annotated[int | None, _opt("How many in all, of one task.  [default: 1000]")] = None,
     steps: Annotated[int | None, _opt("Control steps in all, instead of --episodes.")] = None,
     seed: Annotated[int, _opt("The seed of the first episode; each has its own.")] = 0,
-    out: Annotated[Path | None, _opt("A table (.csv); a campaign that was stopped goes on in it.")] = None,
+    out: Annotated[
+        Path | None,
+        _opt("A table (.csv), and of all tasks a folder; a campaign that was stopped goes on in it."),
+    ] = None,
     env: Env = None,
 ) -> None:
     """Try to make a task fail by actions that no policy sends.
 
-    It prints what came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction
-    failed, constrained guidance commanded a violation, or a limit of the task's own was passed.
+    With "all" it tries every task through every guidance, and leaves a ledger of every control step too. It prints what
+    came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction failed,
+    constrained guidance commanded a violation (recomputed from the commands), or a limit of the task's own was passed.
     """
     from guiderail.tools.stress.campaign import stress as stress_task
 
