@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.models.registry import did_you_mean
 
 # Tools are imported where they are called: PyTorch and Drake take seconds, and `guiderail --help` should not.
@@ -38,6 +38,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "algorithms": _known("tools.learning.learner", "learner_names"),
     "presets": _known("tools.learning.presets", "PRESETS"),
     "studies": _known("tools.studies.declaration", "shipped_studies"),
+    "engines": _known("tools.studies.engines.engine", "ENGINES"),
     "figures": _known("tools.figures", "FIGURES"),
     "stressed": _known("tools.stress", "stressed"),
     "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
@@ -272,13 +273,16 @@ def study(
     out: Annotated[Path, _opt("The folder of the study; what is finished in it is used again.")],
     methods: Annotated[str | None, _opt("Some of its methods, separated by commas.")] = None,
     seeds: Annotated[str | None, _opt("Other seeds, separated by commas.")] = None,
-    processes: Annotated[int, _opt("How many runs go side by side.")] = 2,
+    engine: Annotated[str, _opt("What runs them: {engines}.", of="engines")] = "process",
+    address: Annotated[str | None, _opt("Of a Ray cluster.  [default: RAY_ADDRESS, or a Ray of this machine]")] = None,
+    processes: Annotated[int | None, _opt("How many runs go side by side.  [default: 2, or a cluster's cores]")] = None,
     as_json: Json = False,
 ) -> None:
     """Train and judge methods over seeds, as a YAML file says.
 
     It leaves a table with a row for each method, seed, mark and what was judged on. A study that was stopped goes on
-    where it was with the same command.
+    where it was with the same command. A run that fails stops none of the others; it is named at the end, and the
+    command ends with 1.
     """
     from guiderail.tools.studies import declaration
 
@@ -293,9 +297,15 @@ def study(
     except ValueError:
         raise InputError(f"--seeds takes whole numbers separated by commas, such as 0,1,2, not {seeds!r}") from None
     chosen = declared.only(None if methods is None else methods.split(","), numbers)
+    from guiderail.tools.studies.engines.engine import make_engine
+
+    running = make_engine(engine, processes, address)
     from guiderail.tools.studies.study import study_command
 
-    _print(study_command(chosen, out, processes), as_json)
+    found = study_command(chosen, out, running)
+    _print(found, as_json)
+    if "failed" in found:
+        raise RunsFailedError(found["failed"], None)
 
 
 @command("reproduce 5.6 --seeds 3")
@@ -469,6 +479,10 @@ def main(arguments: list[str] | None = None) -> None:
         code = app(args=arguments, prog_name="guiderail", standalone_mode=False)
     except InputError as error:
         code = _refuse(str(error))
+    except RunsFailedError as error:
+        for sentence in error.sentences:
+            _say(sentence)
+        code = 1
     except (KeyboardInterrupt, typer.Abort):
         go_on = {"train": "; go on with --resume", "study": "; the same command goes on where it was"}
         _say(f"stopped{go_on.get(arguments[0] if arguments else '', '')}")
