@@ -177,15 +177,26 @@ def evaluate(
     episodes: Annotated[int, _opt("How many, each with held-out initial conditions.")] = 100,
     seed: Seed = 1_000_000,
     env: Env = None,
+    beside: Annotated[
+        str | None,
+        _opt("Who else meets the same episodes, or none.  [default: zero, white and constant actions, and the rule]"),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Evaluate a run's policy on what training never met.
+    """Evaluate a run's policy on what training never met, beside policies that learned nothing.
 
-    It acts deterministically, and the demonstration alone meets the same episodes.
+    It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
+    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again.
     """
     from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 
-    _print(evaluate_run(run, episodes=episodes, seed=seed, environment=_environment(env)), as_json)
+    environment = _environment(env)
+    others = _beside(run, environment, beside)
+    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others)
+    for name in others:
+        if name not in found["beside"]:
+            _say(f"{name} is left out: it sees or moves other things than this environment")
+    _print(found, as_json)
 
 
 @command("replay runs/passage --html replay.html")
@@ -413,6 +424,9 @@ def generate(
     write(what, out)
 
 
+COLUMN = 19  # characters of a number that others stand beside
+
+
 LISTED: dict[str, Callable[[], Any]] = {
     **{name: CHOICES[name] for name in ("tasks", "guidance", "stations", "robots", "presets", "studies", "figures")},
     "learners": CHOICES["algorithms"],
@@ -540,6 +554,23 @@ def _environment(given: list[str] | None) -> dict[str, Any]:
     return {key: as_value(value) for key, value in _pairs(given, "--env", "station=arm").items()}
 
 
+def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
+    """Null policies and rules by name, for an evaluation; unless named those that the run's task has."""
+    from guiderail.tools.guidance import is_demonstrated
+    from guiderail.tools.learning.run_folder import RunFolder
+    from guiderail.tools.studies.scripted import RULES, untrained
+
+    config = RunFolder(run).config()
+    where = config.environment | dict(environment)
+    if names is None:
+        zero = [] if is_demonstrated(where.get("guidance")) else ["zero"]
+        rule = ["rule"] if config.task in RULES and where.get("observation") != "image" else []
+        chosen = [*zero, "white", "constant", *rule]
+    else:
+        chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
+    return {name: untrained(config.task, name, config.seed) for name in chosen}
+
+
 def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int) -> Any:
     """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
     from guiderail.tools.viewing import shown as showing
@@ -554,7 +585,7 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
 
 
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
-    """A result for a program or for a person; what the demonstration came to stands beside it."""
+    """A result for a program or for a person; what others came to in the same episodes stands beside it."""
     if as_json:
         # JSON knows no infinity: what is unbounded, such as the slack of no constraint at all, is null there.
         known = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
@@ -562,12 +593,14 @@ def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
         return
     from guiderail.tools.tables import cell
 
-    beside = "demonstration_"
+    columns = [*result.get("beside", ())]
     width = max(len(key) for key in result)
-    if any(beside + key in result for key in result):
-        typer.echo(f"{'':<{width}}  {'policy':<12}  demonstration alone")
+    titles = ["policy", *("demonstration alone" if name == "demonstration" else name for name in columns)]
+    if columns:
+        typer.echo("  ".join([" " * width, *(f"{title:<{COLUMN}}" for title in titles)]).rstrip())
     for key, value in result.items():
-        if key.startswith(beside):
+        if key == "beside" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
             continue
-        other = f"{cell(value):<12}  {cell(result[beside + key])}" if beside + key in result else cell(value)
-        typer.echo(f"{key if ' ' in key else key.replace('_', space):<{width}}  {other}")
+        cells = [cell(value), *(cell(result[f"{name}_{key}"]) for name in columns if f"{name}_{key}" in result)]
+        words = key if " " in key else key.replace("_", space)
+        typer.echo("  ".join([f"{words:<{width}}", *(f"{one:<{COLUMN}}" for one in cells)]).rstrip())

@@ -23,7 +23,7 @@ import yaml
 
 TESTS = Path(__file__).parents[3]
 sys.path.insert(0, str(TESTS))
-from oracles.same_runs import differences
+from oracles.same_runs import differences  # noqa: E402
 
 STUDY = {
     "name": "eight",
