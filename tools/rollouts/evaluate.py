@@ -116,7 +116,8 @@ def evaluate(
     Returns:
         The statistics `COMPARED`, each also as `demonstration_<name>` (the same episodes before anything was learned;
         None where guidance has no demonstration) and as `<policy>_<name>` for those beside it; `beside`, the names of
-        those that can act in this environment; `episodes` and `seed`; `converged_after` and `trained_episodes` of the training.
+        those that can act in this environment; `episodes` and `seed`; `converged_after` and `trained_episodes` of
+        the training.
 
     Raises:
         InputError: if there is no trained run, or a number is out of range.
