@@ -29,5 +29,5 @@ def test_no_contact_of_an_insertion_is_a_point(case):
         surfaces += results.num_hydroelastic_contacts()
         points += results.num_point_pair_contacts()
     assert points == 0
-    assert surfaces > 10
+    assert surfaces > 0
     assert info["termination"] == "success"
