@@ -62,8 +62,8 @@ def measure(turns: int = TURNS) -> dict[str, Any]:
     """Milliseconds of a gradient step by algorithm and preset, and how many times faster it is here."""
     torch.set_num_threads(1)
     results: dict[str, Any] = {}
-    for name in told([f"{algorithm} {preset}" for algorithm in LEARNERS for preset in PRESETS], "learner"):
-        results[name] = _compare(*name.split(), turns)
+    for algorithm, preset in told([(algorithm, preset) for algorithm in LEARNERS for preset in PRESETS], "learner"):
+        results[f"{algorithm} {preset}"] = _compare(algorithm, preset, turns)
     results["fast_enough"] = results[REQUIRED_OF]["times_faster"] >= REQUIRED_RATIO
     return results
 

@@ -140,9 +140,7 @@ def measure(
     """
     task = task or TASK
     how = with_defaults(task, {})
-    config = configure(
-        task, environment or {}, settings={"learning_starts": LEARNING_STARTS}, episodes=episodes, **how
-    )
+    config = configure(task, environment or {}, settings={"learning_starts": LEARNING_STARTS}, episodes=episodes, **how)
     with tempfile.TemporaryDirectory() as folder, timed_parts() as clock:
         start = time.perf_counter()
         rows = train.train(RunFolder(Path(folder) / "run"), config)
@@ -182,11 +180,8 @@ def show(result: dict[str, Any]) -> None:
     for row in result["parts"]:
         if row["share"] >= 0.001:
             each = 1e3 * row["seconds"] / max(row["calls"], 1)
-            table.add_row(
-                row["part"], f"{row['seconds']:.2f}", f"{row['share']:.1%}", f"{row['calls']}", f"{each:.3f}"
-            )
+            table.add_row(row["part"], f"{row['seconds']:.2f}", f"{row['share']:.1%}", f"{row['calls']}", f"{each:.3f}")
     console = Console()
     console.print(table)
-    console.print(
-        f"{result['control_steps']} control steps; {result['python_share_of_simulation']:.0%} of the simulation is Python"
-    )
+    python = f"{result['python_share_of_simulation']:.0%}"
+    console.print(f"{result['control_steps']} control steps; {python} of the simulation is Python")

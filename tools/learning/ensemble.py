@@ -6,13 +6,13 @@ learner` compares it with Stable-Baselines3's own; a test holds both to the same
 """
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
@@ -22,17 +22,21 @@ from guiderail.tools.learning.perceptrons import Linear, Perceptrons
 _SQUASHED = 1e-6  # Stable-Baselines3 adds it to a tanh's slope before it takes the logarithm
 _MOST_NUMBERS = 2**22  # of states that are gathered at once: all of a training's, unless they are images
 
+# SAC and TQC have no interface in common that a type checker knows.
 if TYPE_CHECKING:
-    _Base = OffPolicyAlgorithm
+    _Algorithm = Any
 else:
-    _Base = object
+    _Algorithm = object
 
 
-class Ensemble(_Base):
+class Ensemble(_Algorithm):
     """What SAC and TQC have in common; a mixin before either of them."""
 
-    policy_kwargs: dict[str, Any]
-    replay_buffer: Any
+    ent_coef: Any
+    ent_coef_tensor: Any
+    ent_coef_optimizer: Any
+    log_ent_coef: Any
+    policy_kwargs: Any
 
     def _setup_model(self) -> None:
         # A coefficient that is not learned keeps Stable-Baselines3 from creating an optimizer of its own.
@@ -40,7 +44,7 @@ class Ensemble(_Base):
         self.policy_kwargs = {**self.policy_kwargs, "optimizer_class": FlatAdam, "optimizer_kwargs": {}}
         super()._setup_model()
         self.ent_coef = entropy
-        self.ent_coef_tensor: torch.Tensor | None = None
+        self.ent_coef_tensor = None
         if isinstance(entropy, str):
             initial = float(entropy.removeprefix("auto").removeprefix("_") or 1.0)
             self.log_ent_coef = torch.log(torch.ones(1) * initial)
@@ -60,7 +64,7 @@ class Ensemble(_Base):
                 raise TypeError("gradients are written out for features that have no parameters of their own")
         self._features, self._actions = actor.features_dim, self.action_space.shape[0]
         trunk, head = [self._features, *actor.net_arch], [actor.net_arch[-1], self._actions]
-        shared = sum(_count(*pair) for pair in zip(trunk, trunk[1:], strict=False))
+        shared = sum(_count(*pair) for pair in pairwise(trunk))
         values, gradient = actor.optimizer.values, actor.optimizer.gradient
         # The mean and the logarithm of the standard deviation are two networks on one trunk.
         self._actor = Perceptrons(
@@ -100,7 +104,8 @@ class Ensemble(_Base):
         states[:, :batch, :features] = seen.view(steps, batch, -1)
         states[:, batch:, :features] = then.view(steps, batch, -1)
         rewards = data.rewards.view(steps, batch, 1)
-        follows = ((1 - data.dones) * data.discounts).view(steps, batch, 1)
+        discounts = self.gamma if data.discounts is None else data.discounts
+        follows = ((1 - data.dones) * discounts).view(steps, batch, 1)
         noise = torch.randn(steps, 2 * batch, self._actions)
         likely = -(0.5 * noise.square() + 0.5 * math.log(2 * math.pi)).sum(dim=2, keepdim=True)
         for step in zip(states, taken, rewards, follows, noise, likely, strict=True):
@@ -220,7 +225,7 @@ def _count(inputs: int, outputs: int) -> int:
 
 def _layers(values: torch.Tensor, gradient: torch.Tensor, sizes: list[int]) -> list[Linear]:
     """Of n networks whose parameters are the rows of `values`, in the order in which a module has them."""
-    pairs = list(zip(sizes, sizes[1:], strict=False))
+    pairs = list(pairwise(sizes))
     counts = [_count(*pair) for pair in pairs]
     parts = zip(values.split(counts, dim=1), gradient.split(counts, dim=1), pairs, strict=True)
     return [Linear(value, derivative, *pair) for value, derivative, pair in parts]

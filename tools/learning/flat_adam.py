@@ -95,4 +95,4 @@ class FlatAdam:
                 if state[index][name].shape != part.shape:
                     raise ValueError(f"the moment {name} of parameter {index} has another shape")
                 part.copy_(state[index][name])
-        self._steps.copy_(state[0]["step"])
+        self._steps.copy_(state[0]["step"].reshape(()))  # files know no number without a dimension
