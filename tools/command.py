@@ -339,15 +339,17 @@ def reproduce(
 @command("bench primitive")
 def bench(
     what: Annotated[str, _arg("What is measured: {benchmarks}.", "WHAT", "benchmarks")],
+    task: Annotated[str | None, _arg("Whose training is measured: {tasks}.", "TASK", "tasks")] = None,
+    env: Env = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how fast the primitive or the simulation is here.
+    """Measure how fast the primitive, the simulation or a learner is here, or where a training run's time goes.
 
     It takes a minute or two.
     """
     from guiderail.tools.benchmarks import run_benchmark
 
-    result, show = run_benchmark(what)
+    result, show = run_benchmark(what, task=task, environment=_environment(env))
     typer.echo(json.dumps(result)) if as_json else show(result)
 
 
