@@ -12,6 +12,19 @@ class InputError(ValueError):
     """
 
 
+class RunsFailedError(RuntimeError):
+    """Some runs of a study failed, and the others are finished.
+
+    Attributes:
+        sentences: one for each that failed; the command prints them and exits with code 1.
+        rows: what the others came to, a data frame.
+    """
+
+    def __init__(self, sentences: list[str], rows: Any):
+        super().__init__("; ".join(sentences))
+        self.sentences, self.rows = sentences, rows
+
+
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
 _SHORT.maxlevel = 3

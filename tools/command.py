@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.models.registry import did_you_mean
 
 # Tools are imported where they are called: PyTorch and Drake take seconds, and `guiderail --help` should not.
@@ -38,6 +38,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "algorithms": _known("tools.learning.learner", "learner_names"),
     "presets": _known("tools.learning.presets", "PRESETS"),
     "studies": _known("tools.studies.declaration", "shipped_studies"),
+    "engines": _known("tools.studies.engines.engine", "ENGINES"),
     "figures": _known("tools.figures", "FIGURES"),
     "stressed": _known("tools.stress", "stressed"),
     "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
@@ -176,15 +177,26 @@ def evaluate(
     episodes: Annotated[int, _opt("How many, each with held-out initial conditions.")] = 100,
     seed: Seed = 1_000_000,
     env: Env = None,
+    beside: Annotated[
+        str | None,
+        _opt("Who else meets the same episodes, or none.  [default: zero, white and constant actions, and the rule]"),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Evaluate a run's policy on what training never met.
+    """Evaluate a run's policy on what training never met, beside policies that learned nothing.
 
-    It acts deterministically, and the demonstration alone meets the same episodes.
+    It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
+    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again.
     """
     from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 
-    _print(evaluate_run(run, episodes=episodes, seed=seed, environment=_environment(env)), as_json)
+    environment = _environment(env)
+    others = _beside(run, environment, beside)
+    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others)
+    for name in others:
+        if name not in found["beside"]:
+            _say(f"{name} is left out: it sees or moves other things than this environment")
+    _print(found, as_json)
 
 
 @command("replay runs/passage --html replay.html")
@@ -272,13 +284,16 @@ def study(
     out: Annotated[Path, _opt("The folder of the study; what is finished in it is used again.")],
     methods: Annotated[str | None, _opt("Some of its methods, separated by commas.")] = None,
     seeds: Annotated[str | None, _opt("Other seeds, separated by commas.")] = None,
-    processes: Annotated[int, _opt("How many runs go side by side.")] = 2,
+    engine: Annotated[str, _opt("What runs them: {engines}.", of="engines")] = "process",
+    address: Annotated[str | None, _opt("Of a Ray cluster.  [default: RAY_ADDRESS, or a Ray of this machine]")] = None,
+    processes: Annotated[int | None, _opt("How many runs go side by side.  [default: 2, or a cluster's cores]")] = None,
     as_json: Json = False,
 ) -> None:
     """Train and judge methods over seeds, as a YAML file says.
 
     It leaves a table with a row for each method, seed, mark and what was judged on. A study that was stopped goes on
-    where it was with the same command.
+    where it was with the same command. A run that fails stops none of the others; it is named at the end, and the
+    command ends with 1.
     """
     from guiderail.tools.studies import declaration
 
@@ -293,9 +308,15 @@ def study(
     except ValueError:
         raise InputError(f"--seeds takes whole numbers separated by commas, such as 0,1,2, not {seeds!r}") from None
     chosen = declared.only(None if methods is None else methods.split(","), numbers)
+    from guiderail.tools.studies.engines.engine import make_engine
+
+    running = make_engine(engine, processes, address)
     from guiderail.tools.studies.study import study_command
 
-    _print(study_command(chosen, out, processes), as_json)
+    found = study_command(chosen, out, running)
+    _print(found, as_json)
+    if "failed" in found:
+        raise RunsFailedError(found["failed"], None)
 
 
 @command("reproduce 5.6 --seeds 3")
@@ -403,6 +424,9 @@ def generate(
     write(what, out)
 
 
+COLUMN = 19  # characters of a number that others stand beside
+
+
 LISTED: dict[str, Callable[[], Any]] = {
     **{name: CHOICES[name] for name in ("tasks", "guidance", "stations", "robots", "presets", "studies", "figures")},
     "learners": CHOICES["algorithms"],
@@ -469,6 +493,10 @@ def main(arguments: list[str] | None = None) -> None:
         code = app(args=arguments, prog_name="guiderail", standalone_mode=False)
     except InputError as error:
         code = _refuse(str(error))
+    except RunsFailedError as error:
+        for sentence in error.sentences:
+            _say(sentence)
+        code = 1
     except (KeyboardInterrupt, typer.Abort):
         go_on = {"train": "; go on with --resume", "study": "; the same command goes on where it was"}
         _say(f"stopped{go_on.get(arguments[0] if arguments else '', '')}")
@@ -526,6 +554,23 @@ def _environment(given: list[str] | None) -> dict[str, Any]:
     return {key: as_value(value) for key, value in _pairs(given, "--env", "station=arm").items()}
 
 
+def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
+    """Null policies and rules by name, for an evaluation; unless named those that the run's task has."""
+    from guiderail.tools.guidance import is_demonstrated
+    from guiderail.tools.learning.run_folder import RunFolder
+    from guiderail.tools.studies.scripted import RULES, untrained
+
+    config = RunFolder(run).config()
+    where = config.environment | dict(environment)
+    if names is None:
+        zero = [] if is_demonstrated(where.get("guidance")) else ["zero"]
+        rule = ["rule"] if config.task in RULES and where.get("observation") != "image" else []
+        chosen = [*zero, "white", "constant", *rule]
+    else:
+        chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
+    return {name: untrained(config.task, name, config.seed) for name in chosen}
+
+
 def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int) -> Any:
     """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
     from guiderail.tools.viewing import shown as showing
@@ -540,7 +585,7 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
 
 
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
-    """A result for a program or for a person; what the demonstration came to stands beside it."""
+    """A result for a program or for a person; what others came to in the same episodes stands beside it."""
     if as_json:
         # JSON knows no infinity: what is unbounded, such as the slack of no constraint at all, is null there.
         known = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
@@ -548,12 +593,14 @@ def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
         return
     from guiderail.tools.tables import cell
 
-    beside = "demonstration_"
+    columns = [*result.get("beside", ())]
     width = max(len(key) for key in result)
-    if any(beside + key in result for key in result):
-        typer.echo(f"{'':<{width}}  {'policy':<12}  demonstration alone")
+    titles = ["policy", *("demonstration alone" if name == "demonstration" else name for name in columns)]
+    if columns:
+        typer.echo("  ".join([" " * width, *(f"{title:<{COLUMN}}" for title in titles)]).rstrip())
     for key, value in result.items():
-        if key.startswith(beside):
+        if key == "beside" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
             continue
-        other = f"{cell(value):<12}  {cell(result[beside + key])}" if beside + key in result else cell(value)
-        typer.echo(f"{key if ' ' in key else key.replace('_', space):<{width}}  {other}")
+        cells = [cell(value), *(cell(result[f"{name}_{key}"]) for name in columns if f"{name}_{key}" in result)]
+        words = key if " " in key else key.replace("_", space)
+        typer.echo("  ".join([f"{words:<{width}}", *(f"{one:<{COLUMN}}" for one in cells)]).rstrip())

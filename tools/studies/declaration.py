@@ -83,6 +83,7 @@ class Study(_Strict):
     statistics: tuple[str, ...] = ()  # of training, besides the usual ones
     ratios: tuple[Ratio, ...] = ()
     folder: str = "{method}-{seed}"  # of a run
+    imports: tuple[str, ...] = ()  # modules or files (.py) that register what is not installed
 
     @field_validator("statistics")
     @classmethod

@@ -1,7 +1,7 @@
 """`guiderail study`: trains where it has to, judges after every mark, and writes a row for each.
 
 Each seed has rows of its own: what failed on one is not averaged away. A study that was interrupted goes on where it
-was, and figures use the same runs.
+was, and figures use the same runs. An engine runs the jobs; the rows are the same from each.
 """
 
 from __future__ import annotations
@@ -9,12 +9,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +18,24 @@ import gymnasium
 import numpy as np
 import pandas as pd
 from rich.console import Console
-from rich.progress import track
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.models.policy import Policy
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.rollouts.evaluate import cached, evaluate_run
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.null_policies import always
 from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.studies.attempts import Attempt
+from guiderail.tools.studies.board import Board
 from guiderail.tools.studies.declaration import LEARNED, JudgedOn, Ratio, Study
+from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
 from guiderail.tools.tables import write_table
-from guiderail.tools.tasks import make_environment
+from guiderail.tools.tasks import import_modules, make_environment
 
-PROCESSES = 2
 BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
 
@@ -96,7 +93,8 @@ class Job:
         given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
         environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
         settings = {**study.learner.settings, **method.learner.settings}
-        return configure(study.task, environment, settings=settings, episodes=max(episodes, 1), seed=self.seed, **given)
+        given |= {"imports": study.imports, "settings": settings, "seed": self.seed}
+        return configure(study.task, environment, episodes=max(episodes, 1), **given)
 
     @property
     def folder(self) -> RunFolder:
@@ -105,45 +103,59 @@ class Job:
         words = {"method": self.method, "seed": self.seed, "episodes": config.episodes}
         return RunFolder(self.out / self.study.folder.format(**words, algorithm=config.learner.algorithm))
 
+    @property
+    def log(self) -> Path:
+        """Who worked on it, and why it failed."""
+        return self.out / "logs" / f"{self.study.name}-{self.method}-{self.seed}.txt"
 
-def run_study(
-    study: Study,
-    out: Path,
-    *,
-    processes: int = PROCESSES,
-    say: Callable[[str], None] = lambda words: None,
-) -> pd.DataFrame:
+
+def run_study(study: Study, out: Path, engine: Engine | None = None, console: Console | None = None) -> pd.DataFrame:
     """Runs what is not there yet and returns a row for each method, seed, mark and what is judged on, in this order.
 
     Args:
         study: what to run.
         out: the folder; runs in it are used again, and those that were interrupted go on.
-        processes: side by side, each with one thread.
-        say: is told of every job that is done.
+        engine: what runs them; two processes unless given.
+        console: is told how far it is; standard error unless given.
 
     Raises:
         InputError: before anything is written, if something makes no sense or a folder holds another run.
+        RunsFailedError: at the end, if some failed.
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file: name a folder with --out")
+    # Workers may be elsewhere: what is relative to this process is made absolute.
+    study, out = study.model_copy(update={"imports": import_modules(study.imports)}), out.absolute()
     jobs = [
         Job(study, name, seed, out) for name, method in study.methods.items() for seed in method.seeds or study.seeds
     ]
     for job in jobs:
         _check(job)
-    done: dict[int, list[dict[str, Any]]] = {}
-    for index, rows in _finished(jobs, processes):
-        done[index] = rows
-        said = "".join(f": {row['judged_on']} {row['success_rate']:.0%}" for row in rows[-1:] if row["judged_on"])
-        say(f"{len(done)}/{len(jobs)} {jobs[index].method}, seed {jobs[index].seed}{said}")
-    return pd.DataFrame([row for index in range(len(jobs)) for row in done[index]], dtype=object)
+    outcomes = _outcomes(jobs, engine or make_engine(), console)
+    rows = pd.DataFrame([row for index in range(len(jobs)) for row in outcomes[index].rows], dtype=object)
+    failed = [
+        f"{job.method}, seed {job.seed}, failed: {outcomes[index].failure}"
+        for index, job in enumerate(jobs)
+        if outcomes[index].failure
+    ]
+    if failed:
+        raise RunsFailedError(failed, rows)
+    return rows
 
 
-def study_command(study: Study, out: Path, processes: int = PROCESSES) -> dict[str, Any]:
-    """Runs a study, writes `<name>.csv` and `.md`, and says what the rows come to, each seed by itself."""
-    say = partial(Console(stderr=True).print, soft_wrap=True, highlight=False)
-    rows = run_study(study, out, processes=processes, say=say)
-    result: dict[str, Any] = {"table": str(write_table(out / study.name, rows.drop(columns="folder")))}
+def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict[str, Any]:
+    """Runs a study, writes `<name>.csv` and `.md`, and says what the rows come to, each seed by itself.
+
+    Where runs failed, the table has the others, and `failed` says what became of these.
+    """
+    result: dict[str, Any] = {}
+    try:
+        rows = run_study(study, out, engine)
+    except RunsFailedError as error:
+        rows, result["failed"] = error.rows, error.sentences
+        if not len(rows):
+            return result
+    result["table"] = str(write_table(out / study.name, rows.drop(columns="folder")))
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
         after = f" after {mark} episodes" if mark else ""
         if judged:
@@ -161,10 +173,11 @@ def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
 
 
 def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
-    """A column of one method as a part of another's, each seed and all together; nothing where either is missing."""
-    part, whole = (rows[rows["method"] == m][wanted.of].to_numpy(float) for m in (wanted.method, wanted.against))
-    if not len(part) or len(part) != len(whole):
+    """A column of one method as a part of another's, each seed and all together; nothing where any is missing."""
+    of, against = (rows[rows["method"] == method] for method in (wanted.method, wanted.against))
+    if not len(of) or of["seed"].tolist() != against["seed"].tolist():
         return {}
+    part, whole = (one[wanted.of].to_numpy(float) for one in (of, against))
     words = f"{wanted.of.replace('_', ' ')} of {wanted.method} as a part of {wanted.against}'s"
     return {
         f"{words}, each seed": ", ".join(f"{value:.2f}" for value in part / whole),
@@ -172,25 +185,29 @@ def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
     }
 
 
-def _finished(jobs: Sequence[Job], processes: int) -> Iterator[tuple[int, list[dict[str, Any]]]]:
-    """The jobs' indices and rows as they are done, and a bar that says how far it is."""
-    here = [index for index, job in enumerate(jobs) if processes == 1 or _is_done(job)]
-    yield from ((index, run_job(jobs[index])) for index in here)
-    open_jobs = {index: job for index, job in enumerate(jobs) if index not in here}
-    if not open_jobs:
-        return
-    console = Console(stderr=True)
-    # Fresh processes: a forked one would inherit the threads and random generators of this one.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(open_jobs)), mp_context=context, initializer=_one_thread) as pool:
-        waiting = {pool.submit(run_job, job): index for index, job in open_jobs.items()}
-        bar: dict[str, Any] = {"total": len(open_jobs), "console": console, "disable": not console.is_terminal}
-        for future in track(as_completed(waiting), "runs", **bar):
-            yield waiting[future], future.result()
+def _outcomes(jobs: list[Job], engine: Engine, console: Console | None) -> dict[int, Outcome]:
+    """What became of each job; those that only have to be read are read here."""
+    done = {index: job for index, job in enumerate(jobs) if _is_done(job)}
+    to_run = {index: job for index, job in enumerate(jobs) if index not in done}
+    outcomes: dict[int, Outcome] = {}
+    with Board(to_run, len(jobs), console) as board:
+        for index, job in done.items():
+            outcomes[index] = Outcome(tuple(run_job(job)))
+            board.end(index, job, outcomes[index])
+        if to_run:
+            with engine:
+                _make_log_folder(jobs[0])
+                for index, outcome in engine.run(Attempt(run_job, installed_versions()), to_run):
+                    outcomes[index] = outcome
+                    board.end(index, jobs[index], outcome)
+    return outcomes
 
 
-def _one_thread() -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
+def _make_log_folder(job: Job) -> None:
+    try:
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{job.out} cannot be written ({error.strerror}): name another folder with --out") from error
 
 
 def _check(job: Job) -> None:
@@ -203,12 +220,26 @@ def _check(job: Job) -> None:
         configure(job.study.task, config.environment | extra, episodes=1)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
+        for mark in job.marks:
+            if not all(_evaluated_file(job, mark, judged).exists() for judged in job.study.judged_on):
+                _refuse_gone(job, mark)
     elif job.learns:
         job.folder.refuse_existing()
 
 
+def _refuse_gone(job: Job, mark: int) -> None:
+    """A policy that was learned on, and of which no copy was made, can't be judged any more."""
+    table = job.folder.path / "episodes.csv"
+    if table.exists() and len(job.folder.episodes()) > mark and not _policy_folder(job, mark).exists():
+        raise InputError(
+            f"the run in {job.folder.path} went on learning after episode {mark}, and its policy of then is gone: "
+            "leave that mark out, or train anew in another folder"
+        )
+
+
 def run_job(job: Job) -> list[dict[str, Any]]:
     """The rows of a job; it is trained and judged where it isn't yet."""
+    import_modules(job.study.imports)
     rows = []
     for mark in job.marks:
         trained = _train(job, mark).iloc[:mark]
@@ -293,13 +324,8 @@ def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], Act]:
     """What acts, for an environment."""
     name = job.study.methods[job.method].policy
     if name == LEARNED:
-        folder = _policy_folder(job, mark)
-        if not folder.exists():
-            raise InputError(
-                f"the run in {job.folder.path} went on learning after episode {mark}, and its policy of then is gone: "
-                "leave that mark out, or train anew in another folder"
-            )
-        learned = Policy.load(folder)
+        _refuse_gone(job, mark)
+        learned = Policy.load(_policy_folder(job, mark))
         return lambda env: learned
     if name == BEST_CONSTANT:
         best = _best_constant(job)
