@@ -63,12 +63,11 @@ def survival_curve(gathered: Gathered, task: str) -> str:
 
 def held_out(gathered: Gathered) -> str:
     """The success of each seed on held-out episodes, with its Wilson interval; what learned nothing is grey."""
-    rows = gathered.held_out.sort_values("mark").drop_duplicates(
-        ["study", "method", "policy", "seed", "judged_on"], keep="last"
-    )
+    judged, keys = gathered.held_out, ["study", "method", "policy", "seed", "judged_on"]
+    rows = judged[judged["mark"] == judged.groupby(keys)["mark"].transform("max")]  # after the last training episode
     groups = list(rows.groupby(["study", "method", "policy", "judged_on"], sort=False))
     with matplotlib.rc_context(STYLE):
-        figure, axes = new_figure(1, 1, (2 * SIZE[0], 0.5 + 0.13 * len(rows) + 0.2 * len(groups)))
+        figure, axes = new_figure(1, 1, (1.35 * SIZE[0], 0.6 + 0.13 * len(rows) + 0.2 * len(groups)))
         axis, place, ticks = axes[0, 0], 0.0, []
         several = rows["study"].nunique() > 1, rows["judged_on"].nunique() > 1
         for (study, method, policy, judged), group in groups:
@@ -84,7 +83,11 @@ def held_out(gathered: Gathered) -> str:
             ticks.append((0.5 * (first + place + 1.0), ", ".join(dict.fromkeys(words))))
             place -= 1.5
         axis.set_yticks([at for at, _ in ticks], [words for _, words in ticks])
-        axis.set(xlim=(-0.02, 1.02), xlabel="success on held-out episodes, each seed with its 95 % interval")
+        axis.set(
+            xlim=(-0.02, 1.02),
+            ylim=(place + 1.5, 1.0),
+            xlabel="success on held-out episodes, each seed with its 95 % interval",
+        )
         axis.grid(axis="x", color="0.9")
         axis.set_axisbelow(True)
         return _svg(figure, "success on held-out episodes, each seed with its Wilson interval")
