@@ -343,6 +343,23 @@ def report(
     typer.echo(write_report(runs, out, episodes=episodes))
 
 
+@command("results studies --out docs/results")
+def results(
+    studies: Annotated[
+        list[Path] | None, _arg("Folders of finished studies; none: the stored ones.", "STUDY...")
+    ] = None,
+    out: Annotated[Path, _opt("The folder of results: a table for each study, and the page.")] = Path("docs/results"),
+) -> None:
+    """Write what was reproduced as a page, from the tables that studies left.
+
+    It keeps their tables, so that the page can be written anew without them: each study with what the thesis says,
+    every seed, the time it took, and in what its setting differs.
+    """
+    from guiderail.tools.studies.results import write_results
+
+    typer.echo(write_results(studies or [], out))
+
+
 @command("reproduce 5.6 --seeds 3")
 def reproduce(
     figure: Annotated[str, _arg("A figure of the thesis: {figures}.", "FIGURE", "figures")],
