@@ -11,6 +11,7 @@ from pydrake.geometry import (
     DepthRenderCamera,
     MakeRenderEngineVtk,
     Meshcat,
+    MeshcatAnimation,
     MeshcatParams,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
@@ -118,3 +119,16 @@ def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> tuple[Meshcat, Me
     visualizer = builder.AddNamedSystem("meshcat", MeshcatVisualizer(meshcat, parameters))
     builder.Connect(query, visualizer.query_object_input_port())
     return meshcat, visualizer
+
+
+def clear_meshcat(meshcat: Meshcat) -> None:
+    """Makes a browser view what it was when it was opened; who is connected to it stays.
+
+    A view is closed only with the diagram that publishes to it. So is its port, and whoever needs a view next gets it.
+    """
+    meshcat.Delete("/drake")
+    meshcat.Delete("/guiderail")
+    meshcat.DeleteRecording()
+    meshcat.SetAnimation(MeshcatAnimation())
+    meshcat.DeleteAddedControls()
+    meshcat.ResetRenderMode()

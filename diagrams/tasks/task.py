@@ -139,7 +139,11 @@ class Task(ABC):
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Draws an episode's conditions and writes them into the root context; returns what `info` says of them."""
+        """Draws an episode's conditions and writes them into the root context; returns what `info` says of them.
+
+        They go nowhere else: rewards and conditions read signals, and may belong to a diagram that was built for an
+        earlier environment with the same options. What is remembered in the task is for its next reset.
+        """
 
     # How it is drawn.
 
