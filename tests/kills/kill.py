@@ -36,7 +36,7 @@ RUNS = {
     "GridClamp": ["--episodes", "6", *SMALL],
     "Pouring": ["--episodes", "8", *SMALL],
 }
-KILLS_OF_A_RUN = 5
+KILLS_OF_A_RUN = 7
 STUDY = {
     "name": "killed",
     "task": "NarrowPassage",
