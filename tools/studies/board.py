@@ -77,7 +77,7 @@ class Board:
     def _watch(self) -> None:
         while not self._over.wait(self._period):
             if self._live is None:
-                self._say("; ".join(map(" ".join, self._running())) + f"; {self._counts()}")
+                self._say("; ".join([*map(" ".join, self._running()), self._counts()]))
             else:
                 self._live.update(self._table(), refresh=True)
 

@@ -24,6 +24,15 @@ def test_a_cluster_says_how_many_run_side_by_side():
 
 
 @needs_ray
+def test_an_address_where_nobody_is_is_one_sentence():
+    with (
+        pytest.raises(InputError, match=r"there is no Ray at 127.0.0.1:9 \(.*refused\)"),
+        make_engine("ray", None, "127.0.0.1:9"),
+    ):
+        pass
+
+
+@needs_ray
 def test_a_cluster_that_loses_a_worker_and_a_machine_gives_what_processes_give(tmp_path):
     script = Path(__file__).with_name("ray_study.py")
     done = subprocess.run([sys.executable, script, "--bead", "--out", tmp_path], capture_output=True, text=True)
