@@ -112,4 +112,5 @@ class Board:
         for name, state in running[:SHOWN]:
             table.add_row(name, state)
         more = f"and {len(running) - SHOWN} more run; " if len(running) > SHOWN else ""
-        return Group(table, Text(more + self._counts()))
+        counts = Text(more + self._counts())
+        return Group(table, counts) if running else Group(counts)
