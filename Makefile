@@ -12,7 +12,7 @@ demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
 
 test: $(VENV)/.ready lint
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

@@ -44,6 +44,12 @@ class Camera:
     vertical_fov: float
     X_WC: RigidTransform
 
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Where points (n, 3) of the world are in its image: (n, 2), pixels from its upper left corner."""
+        p_C = self.X_WC.inverse() @ np.asarray(points, float).T
+        focal = 0.5 * self.size[1] / np.tan(0.5 * self.vertical_fov)
+        return (focal * p_C[:2] / p_C[2]).T + 0.5 * np.array(self.size)
+
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
     """The pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), the horizon level."""

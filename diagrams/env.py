@@ -15,6 +15,18 @@ from guiderail.models.errors import InputError
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.policy_system import PolicyError
 
+RECORDED = (
+    "commanded_violation",
+    "measured_violation",
+    "wrench",
+    "saturation",
+    "collision",
+    "holding",
+    "fallback",
+    "state",
+)
+"""Ports whose values the trace has for every control step, where a task's diagram has them."""
+
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
 # What Drake says when the physics, and not the wiring, went wrong. Its own assertions arrive in Python as SystemExit.
@@ -43,6 +55,7 @@ class GuidedEnv(DrakeGymEnv):
         task: the `TaskDiagram`.
         hold: control steps for which an action is held.
         trace: the `Trace` of the current episode.
+        drawn: what the task drew for it.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
@@ -88,14 +101,14 @@ class GuidedEnv(DrakeGymEnv):
         self._reward_port = diagram.GetOutputPort("reward")
         self._term_ports = [(name, diagram.GetOutputPort(name)) for name in task.reward_terms]
         self._termination_port = diagram.GetOutputPort("termination")
-        self._commanded_violation_port = diagram.GetOutputPort("commanded_violation")
-        self._measured_violation_port = diagram.GetOutputPort("measured_violation")
+        self._recorded = [(name, diagram.GetOutputPort(name)) for name in RECORDED if diagram.HasOutputPort(name)]
         self._force_port = diagram.GetOutputPort("contact_force")
-        self._fallback_port = diagram.GetOutputPort("fallback")
         self._ledger_port = diagram.GetOutputPort("ledger")
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
         self._pose_port = diagram.GetOutputPort("pose")
-        self.trace = Trace(task.num_steps, self._pose_port.size(), task.control_period)
+        sizes = {name: port.size() for name, port in self._recorded}
+        self.trace = Trace(task.num_steps, self._pose_port.size(), task.control_period, sizes)
+        self.drawn: dict[str, Any] = {}
         self._control_steps = 0
         self._running = False
         self._observation: np.ndarray | None = None
@@ -109,18 +122,16 @@ class GuidedEnv(DrakeGymEnv):
         context = self.simulator.get_mutable_context()
         context.SetTimeStateAndParametersFrom(self._pristine)
         self._action_value.GetMutableData().set_value(self._neutral)
-        drawn = self.task.randomize(context, self.np_random, dict(options or {}))
+        self.drawn = self.task.randomize(context, self.np_random, dict(options or {}))
         self.simulator.Initialize()
         self._control_steps = 0
         self.trace.clear()
         self._running = True
         self._observation = self._observe(context)
-        self._violations = (
-            float(self._commanded_violation_port.Eval(context)[0]),
-            float(self._measured_violation_port.Eval(context)[0]),
-        )
+        now = {name: port.Eval(context) for name, port in self._recorded}
+        self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
         info = self._info(0, *self._violations, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
-        info.update(drawn)
+        info.update(self.drawn)
         return self._observation, info
 
     def step(self, action):
@@ -162,12 +173,13 @@ class GuidedEnv(DrakeGymEnv):
             force = float(self._force_port.Eval(context)[0])
             total += reward
             peak_force = max(peak_force, force)
-            commanded_violation = max(commanded_violation, float(self._commanded_violation_port.Eval(context)[0]))
-            measured_violation = max(measured_violation, float(self._measured_violation_port.Eval(context)[0]))
-            fallback = fallback or bool(self._fallback_port.Eval(context)[0])
+            now = {name: port.Eval(context) for name, port in self._recorded}
+            commanded_violation = max(commanded_violation, float(now["commanded_violation"][0]))
+            measured_violation = max(measured_violation, float(now["measured_violation"][0]))
+            fallback = fallback or bool(now["fallback"][0])
             for name, port in self._term_ports:
                 terms[name] += float(port.Eval(context)[0])
-            self.trace.append(self._desired_pose_port.Eval(context), pose, force, reward)
+            self.trace.append(self._desired_pose_port.Eval(context), pose, force, reward, now)
             termination = int(self._termination_port.Eval(context)[0])
             if termination or self._control_steps == self.task.num_steps:
                 break

@@ -78,6 +78,10 @@ class TaskDiagram:
     ``desired_pose``        (O,) what is commanded
     ``pose``                (O,) what is measured
     ``fallback``            (1,) 1 where guidance commanded something safe instead of what was asked for
+    ``wrench``              of the surroundings on the tool, where the diagram has one; as are the next three
+    ``saturation``          (A,) the demand on each actuator beyond its limit
+    ``collision``           (1,) positive while the robot touches what it must not
+    ``holding``             (1,) 1 while the last safe pose is held, as commands stopped or are no numbers
     ``rgb_image``           an abstract `ImageRgba8U`; only where the task was built with a camera
     ======================= ================================================================================
 

@@ -1,20 +1,23 @@
 """What happened in an episode, control step by control step."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 
 class Trace:
-    """Commanded and measured pose, contact force and reward of every control step of an episode.
+    """Commanded and measured pose, contact force and reward of every control step of an episode, and further signals.
 
     The arrays are views of storage that the next episode writes into: copy what should outlive a reset.
     """
 
-    def __init__(self, num_steps: int, num_outputs: int, period: float):
+    def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int] | None = None):
         """
         Args:
             num_steps: control steps that an episode can have.
             num_outputs: O, the size of a pose.
             period: seconds between control steps.
+            signals: the sizes of further signals by name.
         """
         self.period = period
         self._length = 0
@@ -22,6 +25,7 @@ class Trace:
         self._measured = np.empty((num_steps, num_outputs))
         self._force = np.empty(num_steps)
         self._reward = np.empty(num_steps)
+        self._signals = {name: np.empty((num_steps, size)) for name, size in (signals or {}).items()}
 
     def __len__(self) -> int:
         """Control steps recorded so far."""
@@ -47,17 +51,31 @@ class Trace:
         """The reward of each control step, (n,)."""
         return self._reward[: self._length]
 
+    @property
+    def signals(self) -> dict[str, np.ndarray]:
+        """The further signals by name, (n, size) each."""
+        return {name: values[: self._length] for name, values in self._signals.items()}
+
     def clear(self) -> None:
         """Forgets the episode."""
         self._length = 0
 
-    def append(self, commanded: np.ndarray, measured: np.ndarray, force: float, reward: float) -> None:
-        """Records one more control step."""
+    def append(
+        self,
+        commanded: np.ndarray,
+        measured: np.ndarray,
+        force: float,
+        reward: float,
+        signals: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Records one more control step; `signals` has a value for each further one."""
         n = self._length
         self._commanded[n] = commanded
         self._measured[n] = measured
         self._force[n] = force
         self._reward[n] = reward
+        for name, values in self._signals.items():
+            values[n] = signals[name] if signals is not None else np.nan
         self._length = n + 1
 
 

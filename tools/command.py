@@ -40,7 +40,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "studies": _known("tools.studies.declaration", "shipped_studies"),
     "engines": _known("tools.studies.engines.engine", "ENGINES"),
     "figures": _known("tools.figures", "FIGURES"),
-    "stressed": _known("tools.stress", "STRESSED"),
+    "stressed": _known("tools.stress", "stressed"),
     "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
     "generated": _known("tools.recording.generate", "GENERATED"),
     "pictures": _known("tools.files", "PICTURES"),
@@ -138,14 +138,18 @@ def train(
     observation: Annotated[str | None, _opt("state or image.")] = None,
     uncertainty: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
     station: Annotated[str | None, _opt("rails or arm, where a task has both.")] = None,
+    ledger: Annotated[
+        bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
+    ] = None,
     resume: Annotated[bool, _opt("Go on with the run in --out.", "--resume")] = False,
     imports: Imports = None,
     as_json: Json = False,
 ) -> None:
     """Train a policy and leave a run folder.
 
-    The folder holds the configuration, a table with a row for every episode, a checkpoint, the policy, a learning
-    curve and a replay. A run that was stopped goes on with --resume to the result it would have had.
+    The folder holds the configuration, a table with a row for every episode, a ledger with one for every control step,
+    a checkpoint, the policy, a learning curve and a replay. A run that was stopped goes on with --resume to the result
+    it would have had.
     """
     from guiderail.tools.learning import configure
 
@@ -162,6 +166,7 @@ def train(
         seed=seed,
         resume=resume,
         imports=imports or (),
+        ledger=ledger,
     )
     _print(summary, as_json)
 
@@ -172,15 +177,26 @@ def evaluate(
     episodes: Annotated[int, _opt("How many, each with held-out initial conditions.")] = 100,
     seed: Seed = 1_000_000,
     env: Env = None,
+    beside: Annotated[
+        str | None,
+        _opt("Who else meets the same episodes, or none.  [default: zero, white and constant actions, and the rule]"),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Evaluate a run's policy on what training never met.
+    """Evaluate a run's policy on what training never met, beside policies that learned nothing.
 
-    It acts deterministically, and the demonstration alone meets the same episodes.
+    It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
+    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again.
     """
     from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 
-    _print(evaluate_run(run, episodes=episodes, seed=seed, environment=_environment(env)), as_json)
+    environment = _environment(env)
+    others = _beside(run, environment, beside)
+    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others)
+    for name in others:
+        if name not in found["beside"]:
+            _say(f"{name} is left out: it sees or moves other things than this environment")
+    _print(found, as_json)
 
 
 @command("replay runs/passage --html replay.html")
@@ -338,16 +354,20 @@ def bench(
 @command("stress BncConnector --episodes 1000 --out stress.csv")
 def stress(
     task: Annotated[str, _arg("The task: {stressed}.", "TASK", "stressed")],
-    episodes: Annotated[int | None, _opt("How many in all.  [default: 1000]")] = None,
+    episodes: Annotated[int | None, _opt("How many in all, of one task.  [default: 1000]")] = None,
     steps: Annotated[int | None, _opt("Control steps in all, instead of --episodes.")] = None,
     seed: Annotated[int, _opt("The seed of the first episode; each has its own.")] = 0,
-    out: Annotated[Path | None, _opt("A table (.csv); a campaign that was stopped goes on in it.")] = None,
+    out: Annotated[
+        Path | None,
+        _opt("A table (.csv), and of all tasks a folder; a campaign that was stopped goes on in it."),
+    ] = None,
     env: Env = None,
 ) -> None:
     """Try to make a task fail by actions that no policy sends.
 
-    It prints what came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction
-    failed, constrained guidance commanded a violation, or a limit of the task's own was passed.
+    With "all" it tries every task through every guidance, and leaves a ledger of every control step too. It prints what
+    came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction failed,
+    constrained guidance commanded a violation (recomputed from the commands), or a limit of the task's own was passed.
     """
     from guiderail.tools.stress.campaign import stress as stress_task
 
@@ -402,6 +422,9 @@ def generate(
     from guiderail.tools.recording.generate import generate as write
 
     write(what, out)
+
+
+COLUMN = 19  # characters of a number that others stand beside
 
 
 LISTED: dict[str, Callable[[], Any]] = {
@@ -531,6 +554,23 @@ def _environment(given: list[str] | None) -> dict[str, Any]:
     return {key: as_value(value) for key, value in _pairs(given, "--env", "station=arm").items()}
 
 
+def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
+    """Null policies and rules by name, for an evaluation; unless named those that the run's task has."""
+    from guiderail.tools.guidance import is_demonstrated
+    from guiderail.tools.learning.run_folder import RunFolder
+    from guiderail.tools.studies.scripted import RULES, untrained
+
+    config = RunFolder(run).config()
+    where = config.environment | dict(environment)
+    if names is None:
+        zero = [] if is_demonstrated(where.get("guidance")) else ["zero"]
+        rule = ["rule"] if config.task in RULES and where.get("observation") != "image" else []
+        chosen = [*zero, "white", "constant", *rule]
+    else:
+        chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
+    return {name: untrained(config.task, name, config.seed) for name in chosen}
+
+
 def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int) -> Any:
     """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
     from guiderail.tools.viewing import shown as showing
@@ -545,7 +585,7 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
 
 
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
-    """A result for a program or for a person; what the demonstration came to stands beside it."""
+    """A result for a program or for a person; what others came to in the same episodes stands beside it."""
     if as_json:
         # JSON knows no infinity: what is unbounded, such as the slack of no constraint at all, is null there.
         known = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
@@ -553,12 +593,14 @@ def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
         return
     from guiderail.tools.tables import cell
 
-    beside = "demonstration_"
+    columns = [*result.get("beside", ())]
     width = max(len(key) for key in result)
-    if any(beside + key in result for key in result):
-        typer.echo(f"{'':<{width}}  {'policy':<12}  demonstration alone")
+    titles = ["policy", *("demonstration alone" if name == "demonstration" else name for name in columns)]
+    if columns:
+        typer.echo("  ".join([" " * width, *(f"{title:<{COLUMN}}" for title in titles)]).rstrip())
     for key, value in result.items():
-        if key.startswith(beside):
+        if key == "beside" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
             continue
-        other = f"{cell(value):<12}  {cell(result[beside + key])}" if beside + key in result else cell(value)
-        typer.echo(f"{key if ' ' in key else key.replace('_', space):<{width}}  {other}")
+        cells = [cell(value), *(cell(result[f"{name}_{key}"]) for name in columns if f"{name}_{key}" in result)]
+        words = key if " " in key else key.replace("_", space)
+        typer.echo("  ".join([f"{words:<{width}}", *(f"{one:<{COLUMN}}" for one in cells)]).rstrip())

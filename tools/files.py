@@ -27,6 +27,12 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise InputError(f"{path} cannot be written ({error.strerror}): choose a folder with room to write") from error
 
 
+def remove_parts(folder: Path) -> None:
+    """Removes what `write_atomically` left where it was killed; call it where nobody else is writing."""
+    for part in folder.rglob(".*.part"):
+        part.unlink(missing_ok=True)
+
+
 def check_picture(path: Path) -> None:
     """Refuses a picture that cannot be written, before anything is run for it.
 

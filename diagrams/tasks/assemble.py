@@ -199,6 +199,9 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         "desired_pose": guidance.GetOutputPort("desired_pose"),
         "pose": station.get_pose_output_port(),
         "wrench": station.get_wrench_output_port(),
+        "saturation": station.get_saturation_output_port(),
+        "collision": too_much.get_output_port(),
+        "holding": station.get_holding_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
     # What this guidance has beyond the contract, such as the state of a template.

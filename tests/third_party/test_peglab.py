@@ -13,7 +13,6 @@ import pytest
 
 PACKAGE = Path(__file__).parent / "peglab"
 LINES = 150
-pytestmark = pytest.mark.xdist_group("peglab")
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +137,7 @@ def test_a_file_that_is_not_installed_serves_too(lab):
     )
     guiderail(
         lab, "train", "mine/Passage", "--import", "mine.py", "--episodes", "2", "--guidance", "kgrl",
-        "--preset", "quick", "--out", "mine",
+        "--algorithm", "peglab_hill_climbing", "--out", "mine",
     )  # fmt: skip
     # The run remembers what it needs.
     assert json.loads(guiderail(lab, "evaluate", "mine", "--episodes", "2", "--json"))["episodes"] == 2

@@ -9,7 +9,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 
 Item = TypeVar("Item")
-BENCHMARKS = ("primitive", "simulation")
+BENCHMARKS = ("primitive", "simulation", "saving")
 
 
 def run_benchmark(what: str) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:

@@ -8,28 +8,30 @@ from typing import Any
 
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
+from guiderail.tools.figures.thesis import THESIS
 
 # What makes each figure; imported when asked for, so that a list of figures costs nothing.
 FIGURES = {
-    "table 3.3": "table_3_3",
-    **{f"3.{n}": f"figure_3_{n}" for n in (5, 6, 8, 10, 11)},
-    **{f"4.{n}": f"figure_4_{n}" for n in (2, 4, 5, 6, 7, 8)},
-    **{f"5.{n}": f"figure_5_{n}" for n in (2, 4, 5, 6, 8, 9, 10)},
+    **{f"table {n}": f"table_{n.replace('.', '_')}" for n in ("3.2", "3.3", "4.1")},
+    "2.2": "figure_2_2",
+    **{f"3.{n}": f"figure_3_{n}" for n in (4, 5, 6, 7, 8, 10, 11)},
+    **{f"4.{n}": f"figure_4_{n}" for n in range(2, 9)},
+    **{f"5.{n}": f"figure_5_{n}" for n in range(2, 11)},
 }
 
 
 def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: Path = Path("reproductions")) -> dict:
-    """Makes one figure.
+    """Makes one figure or table.
 
     Args:
-        figure: its number in the thesis, or "table 3.3".
+        figure: its number in the thesis, such as "4.2" or "table 3.3".
         seeds: runs of each method, where the figure is about learning.
         episodes: of each run; the figure's own number unless given.
         out: where pictures, tables and runs go. Runs that are there and finished are used again, so that figures which
             share runs share them.
 
     Returns:
-        `figure`, `picture`, `table`, and what the numbers say, claim by claim.
+        `figure`, `picture`, `table`, what the numbers say, claim by claim, and what the thesis says.
 
     Raises:
         InputError: for an unknown figure or a number out of range.
@@ -44,7 +46,8 @@ def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: 
     make = find_figure(number)
     given: dict[str, Any] = {"seeds": seeds, "episodes": episodes}
     taken = inspect.signature(make).parameters
-    return {"figure": number} | make(out, **{k: v for k, v in given.items() if k in taken and v is not None})
+    found = make(out, **{k: v for k, v in given.items() if k in taken and v is not None})
+    return {"figure": number, **found, "the thesis": THESIS[number]}
 
 
 def find_figure(number: str) -> Callable[..., dict[str, Any]]:

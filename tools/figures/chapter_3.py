@@ -1,20 +1,31 @@
-"""Figures 3.5, 3.6 and 3.8 and table 3.3 (pouring), 3.10 and 3.11 (the grid clamp): with and without a template."""
+"""Figures 3.4 to 3.8 and table 3.3 (pouring), 3.10 and 3.11 (the grid clamp): with and without a template."""
 
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring_rewards import APPROACH, NEAR, NEAR_BONUS, TERMINAL, TILT
 from guiderail.diagrams.tasks.pouring_template import make_skill
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.skills.drawing import draw, state_lines
-from guiderail.tools.figures.runs import episodes_of, figure_study, learning_curves, leave, said
+from guiderail.tools.figures.runs import (
+    episodes_of,
+    figure_study,
+    learning_curves,
+    leave,
+    said,
+    settings_table,
+)
+from guiderail.tools.figures.thesis import TABLE_3_2
 from guiderail.tools.studies.study import Job, ratio, run_study
 from guiderail.tools.tables import write_table
+from guiderail.tools.tasks import make_environment
 from guiderail.tools.viewing.style import draw_runs, legend, new_figure
 
 METHODS = {
@@ -35,6 +46,42 @@ CLAMP = (
     "in simulation, on rails, SAC with the clamp preset; a hidden offset of the table of 1.8 to 2.2 mm per run and six "
     "grasp offsets of up to 1 mm; the thesis: a real robot, five sessions of 70 episodes"
 )
+
+
+def figure_3_4(out: Path) -> dict[str, Any]:
+    """The scene as its camera sees it, with the frames of the thermos's tip and of the mug's."""
+    env: Any = make_environment("Pouring", {"guidance": "sct"}, render_mode="rgb_array")
+    env.reset(seed=0)
+    diagram, task = env.unwrapped.task.diagram, env.unwrapped.task.declaration
+    X_WT = PouringConfig().X_WT
+    pose = diagram.GetOutputPort("pose").Eval(env.unwrapped.simulator.get_context())
+    frames = {"mug tip": X_WT, "thermos tip": X_WT @ pose_to_transform(pose)}
+    figure, ((axis,),) = new_figure(1, 1, (7.2, 5.4))
+    axis.imshow(env.render())
+    env.close()
+    rows = []
+    for name, X_WF in frames.items():
+        tips = [X_WF.translation() + 0.06 * X_WF.rotation().col(i) for i in range(3)]
+        (u, v), *ends = task.camera().project(np.stack([X_WF.translation(), *tips]))
+        for (x, y), colour in zip(ends, ("red", "green", "blue"), strict=True):
+            axis.annotate("", (x, y), (u, v), arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6})
+        axis.annotate(name, (u, v), xytext=(8, 10), textcoords="offset points", color="black", fontsize=9)
+        rows.append({"frame": name} | dict(zip("xyz", X_WF.translation().tolist(), strict=True)))
+    axis.set_axis_off()
+    return leave(out, "figure_3_4", figure, rows)
+
+
+def figure_3_7(out: Path, seeds: int = 5, episodes: int | None = None) -> dict[str, Any]:
+    """RL-SCT-Shaped with SAC alone, as on the thesis's robot: success, spills and return."""
+    rows = _pouring(out, "sac", seeds, episodes, ("rl_sct_shaped",))
+    figure, (axes,) = new_figure(1, 3, (13, 4.2))
+    runs, (name, shade) = episodes_of(rows, "rl_sct_shaped"), METHODS["rl_sct_shaped"]
+    values = {"success rate": [run["termination"] == "success" for run in runs]}
+    values |= {"spill rate": [run["termination"] == "spill" for run in runs], "return": [run["return"] for run in runs]}
+    for axis, (words, series) in zip(axes, values.items(), strict=True):
+        draw_runs(axis, series, colour=shade, label=f"{name} ({len(runs)} runs)")
+        axis.set(xlabel="episode", ylabel=f"{words} (mean of 10)")
+    return {**leave(out, "figure_3_7", figure, rows), **_poured(rows), "condition": POURING}
 
 
 def figure_3_5(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
@@ -74,6 +121,11 @@ def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
         **{f"{name}, {key}": value for name, rows in tables.items() for key, value in _poured(rows).items()},
         "condition": POURING,
     }
+
+
+def table_3_2(out: Path) -> dict[str, Any]:
+    """The learners' settings for templates: the thesis's, and those of the presets that are named after it."""
+    return settings_table(out / "table_3_2", TABLE_3_2, ("pouring", "clamp"))
 
 
 def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Figures 4.2, 4.4 to 4.7 and 4.8: what KGRL's null space is, and what it is for."""
+"""Figures 4.2 to 4.8 and table 4.1: what KGRL's null space is, and what it is for."""
 
 from pathlib import Path
 from typing import Any
@@ -7,10 +7,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.patches import Ellipse, Rectangle
 
+from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.models.primitives import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.models.primitives.mixture import fit_mixture
-from guiderail.tools.figures.runs import figure_study, learning_curves, leave, said
+from guiderail.tools.figures.runs import figure_study, learning_curves, leave, said, settings_table
+from guiderail.tools.figures.thesis import TABLE_4_1
 from guiderail.tools.guidance import colour, label
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.rollout import Paths, rollout
@@ -108,6 +110,27 @@ def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:
         angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
         centre = mean[1:] * scale + mixture.center[1:]
         axis.add_patch(Ellipse(tuple(centre), width, height, angle=angle, color="tab:blue", alpha=0.25, linewidth=0))
+
+
+def figure_4_3(out: Path, name: str = "figure_4_3") -> dict[str, Any]:
+    """The plane: walls, zone, obstacle, goal and demonstrations."""
+    figure, ((axis,),) = new_figure(1, 1, (4.6, 6.0))
+    draw_world(axis)
+    world = NarrowPassage()
+    for words, place in {
+        "restricted\nzone": (world.zone_x + 0.02, 0.1),
+        "obstacle": (world.obstacle[0] + world.obstacle_radius, world.obstacle[1]),
+        "goal": (world.goal[0] + world.goal_radius, world.goal[1]),
+    }.items():
+        axis.annotate(words, place, xytext=(4, 0), textcoords="offset points", fontsize=8, va="center")
+    fields = ("start", "goal", "goal_radius", "gap_x", "obstacle", "obstacle_radius", "zone_x")
+    rows = [{"what": field.replace("_", " "), "metres": str(getattr(world, field))} for field in fields]
+    return leave(out, name, figure, rows)
+
+
+def table_4_1(out: Path) -> dict[str, Any]:
+    """TQC's settings: the thesis's, and those of the presets that are named after it."""
+    return settings_table(out / "table_4_1", TABLE_4_1, ("quick", "robust"))
 
 
 def random_episodes(env: Any, seed: int, episodes: int) -> list[dict[str, Any]]:

@@ -1,6 +1,8 @@
-"""Figures 5.2, 5.4 to 5.6 and 5.8 to 5.10: how smoothly KGRL and sKGRL explore, and what they learn."""
+"""Figures 5.2 to 5.10: how smoothly KGRL and sKGRL explore, and what they learn."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,19 @@ from matplotlib.axes import Axes
 from guiderail.diagrams.make import known
 from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
 from guiderail.models.demonstrations import bnc_connector
+from guiderail.models.errors import InputError
 from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.models.primitives import LcNsKmp
 from guiderail.models.primitives.gains import rms_gains
-from guiderail.tools.figures.chapter_4 import CONNECTOR, FORCE, HOLD, LEARNED, TASK, random_episodes
+from guiderail.tools.figures.chapter_4 import (
+    CONNECTOR,
+    FORCE,
+    HOLD,
+    LEARNED,
+    TASK,
+    figure_4_3,
+    random_episodes,
+)
 from guiderail.tools.figures.runs import (
     episodes_of,
     figure_study,
@@ -25,17 +36,21 @@ from guiderail.tools.figures.runs import (
 )
 from guiderail.tools.guidance import colour, label
 from guiderail.tools.rollouts.metrics import summary
+from guiderail.tools.rollouts.null_policies import NullPolicy, white
 from guiderail.tools.rollouts.rollout import Paths, rollout
 from guiderail.tools.studies.declaration import LearnerChoice
 from guiderail.tools.studies.study import each, run_study
 from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.film import draw_frames, watch
 from guiderail.tools.viewing.passage import draw_world
+from guiderail.tools.viewing.shown import Shown
 from guiderail.tools.viewing.style import new_figure
 
 METHODS = ("kgrl", "skgrl")
 VARIANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # ρ, m²
 SHOWN = 1e-6  # ρ of the thesis
 HOLDS = (1, 5)  # control steps of an action: the thesis's, and what is learned with here
+EPISODES = 10  # tried at most, until one fails or succeeds as figure 5.7 shows
 # Where the robot is when it is pushed (y, m), and by how much in x (m). The last of each kind leads into the zone.
 PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10), (0.20, 0.15), (0.78, 0.20))
 
@@ -113,6 +128,11 @@ def _draw_spread(axis: Axes, primitive: LcNsKmp) -> None:
             alpha=0.08,
             linewidth=0,
         )
+
+
+def figure_5_3(out: Path) -> dict[str, Any]:
+    """The plane again."""
+    return figure_4_3(out, "figure_5_3")
 
 
 def figure_5_4(out: Path) -> dict[str, Any]:
@@ -310,6 +330,27 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
         **found,
         "condition": f"an action lasts {HOLD} control steps; the obstacle's cost is part of the return",
     }
+
+
+def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
+    """sKGRL at the connector: an episode before anything is learned, that fails, and one after; four moments each."""
+    found = run_study(
+        figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], judged=False), out
+    )
+    learned = Shown.of_run(Path(found["folder"].iloc[0]))
+    unlearned = replace(learned, policy=partial(NullPolicy, white), acting="before learning")
+    figure, axes = new_figure(2, 4, (13, 6.2))
+    rows = []
+    for shown, panels, letter in ((unlearned, axes[0], "A"), (learned, axes[1], "B")):
+        # White actions find the hole now and then: the first episode that shows what is meant.
+        tried = (watch(replace(shown, seed=shown.seed + k), len(panels)) for k in range(EPISODES))
+        row, frames = next((one for one in tried if bool(one[0]["success"]) == (shown is learned)), (None, None))
+        if row is None or frames is None:
+            raise InputError(f"{EPISODES} episodes {shown.acting} all ended alike: take more --episodes")
+        draw_frames(panels, frames, letter)
+        kept = ("success", "steps", "peak_force", "worst_violation")
+        rows.append({"episode": shown.acting} | {key: row[key] for key in kept})
+    return {**leave(out, "figure_5_7", figure, rows), "condition": CONNECTOR}
 
 
 def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from guiderail.tools.guidance import colour, label
+from guiderail.tools.learning.presets import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.studies.declaration import LearnerChoice, Method, Study, load_study
 from guiderail.tools.studies.study import each
@@ -93,6 +94,33 @@ def leave(out: Path, name: str, figure: Figure, rows: Any) -> dict[str, Any]:
     return {
         "picture": str(save_figure(figure, out / f"{name}.png")),
         "table": str(write_table(out / name, table)),
+    }
+
+
+def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], measured_with: Sequence[str]) -> dict[str, Any]:
+    """A table of learners' settings: the thesis's beside its preset's, and what was measured with here.
+
+    Args:
+        path: of the table, without its ending.
+        thesis: its values by preset and setting.
+        measured_with: further presets.
+    """
+    settings = dict.fromkeys(name for values in thesis.values() for name in values)
+    rows = []
+    for name in settings:
+        row: dict[str, Any] = {"setting": name.replace("_", " ")}
+        for preset, values in thesis.items():
+            row |= {f"thesis, {preset}": values.get(name), preset: getattr(PRESETS[preset], name)}
+        rows.append(row | {preset: getattr(PRESETS[preset], name) for preset in measured_with})
+    other = [
+        f"{preset}: {name} {getattr(PRESETS[preset], name)}, not {value}"
+        for preset, values in thesis.items()
+        for name, value in values.items()
+        if getattr(PRESETS[preset], name) != value
+    ]
+    return {
+        "table": str(write_table(path, rows)),
+        "the presets of that name have the thesis's values": "; ".join(other) or "yes, all",
     }
 
 

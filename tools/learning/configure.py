@@ -32,6 +32,7 @@ def configure(
     episodes: int = DEFAULTS["episodes"],
     seed: int = DEFAULTS["seed"],
     imports: Sequence[str] = (),
+    ledger: bool = True,
 ) -> RunConfig:
     """A checked configuration with everything resolved.
 
@@ -45,7 +46,7 @@ def configure(
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)
     return RunConfig(
-        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports)
+        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger
     )
 
 
@@ -61,6 +62,7 @@ def run(
     seed: int | None = None,
     resume: bool = False,
     imports: Sequence[str] = (),
+    ledger: bool | None = None,
 ) -> dict[str, Any]:
     """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
 
@@ -73,7 +75,7 @@ def run(
         raise InputError("where should the run go? name a folder with --out RUN")
     folder = RunFolder(out)
     imports = import_modules(imports)
-    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
+    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
     if resume:
         config = _continued(folder, task, environment, given, settings)
@@ -124,7 +126,7 @@ def _continued(
     """The configuration of the run that goes on; refuses what would make it another run."""
     config = folder.config()
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
-    stored |= config.environment
+    stored |= {"ledger": config.ledger} | config.environment
     wanted = {**environment, **given} | ({} if task is None else {"task": task})
     for key, value in wanted.items():
         if key != "episodes" and stored.get(key) != value:

@@ -1,25 +1,29 @@
 """What a run leaves behind: one folder, readable without the program that wrote it."""
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
 
+import filelock
 import pandas as pd
 import yaml
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from guiderail.models.errors import InputError
-from guiderail.tools.files import write_atomically
+from guiderail.tools.files import remove_parts, write_atomically
 from guiderail.tools.learning import older
 from guiderail.tools.learning.presets import Preset
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import check_environment, import_modules
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
+
+LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class RunConfig:
     seed: Annotated[int, Field(ge=0)]
     versions: dict[str, str] = field(default_factory=dict)
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
+    ledger: bool = True  # whether every control step is written down
 
     @property
     def hold(self) -> int:
@@ -49,8 +54,8 @@ def installed_versions() -> dict[str, str]:
 class RunFolder:
     """The files of one run.
 
-    `config.yaml` is there from the start, `episodes.csv` and `checkpoint/` grow together at the end of an episode, the
-    rest is written when the run ends. Every file is replaced whole.
+    `config.yaml` is there from the start, `ledger/` gets a file as each episode ends, `episodes.csv` and `checkpoint/`
+    grow together after it, the rest is written when the run ends. Every file is replaced whole.
     """
 
     def __init__(self, path: Path | str):
@@ -65,6 +70,37 @@ class RunFolder:
         """The file that `--resume` goes on from."""
         return self.path / "checkpoint" / "state.safetensors"
 
+    @property
+    def ledger(self) -> Path:
+        """The folder with every control step; see `guiderail.tools.rollouts.ledger`."""
+        return self.path / "ledger"
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keeps every other process from writing into the run; a killed one's lock holds nobody back.
+
+        Raises:
+            InputError: if another process writes into it, or nobody can.
+        """
+        lock = filelock.FileLock(self.path / LOCK, timeout=0)
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            lock.acquire()
+        except filelock.Timeout:
+            raise InputError(
+                f"another process is training the run in {self.path}: wait for it, or name another folder"
+            ) from None
+        except OSError as error:
+            raise InputError(
+                f"{self.path} cannot be written ({error.strerror}): choose a folder with room to write"
+            ) from error
+        try:
+            remove_parts(self.path)  # nobody else is writing one
+            yield
+        finally:
+            (self.path / LOCK).unlink(missing_ok=True)
+            lock.release()
+
     def create(self, config: RunConfig) -> None:
         """Starts a run.
 
@@ -76,7 +112,7 @@ class RunFolder:
 
     def refuse_existing(self) -> None:
         """Raises an InputError if the folder holds something already."""
-        if self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+        if self.path.exists() and (not self.path.is_dir() or any(path.name != LOCK for path in self.path.iterdir())):
             raise InputError(f"{self.path} already exists: name another folder, or go on with that run by --resume")
 
     def refuse_another(self, wanted: RunConfig, also: Sequence[str] = ()) -> None:
@@ -114,6 +150,7 @@ class RunFolder:
             # A setting that did not exist yet was off, as its default is, whatever the preset has become since.
             values["learner"] = Preset(**(asdict(Preset()) | older.settings(values["learner"])))
             values["environment"] = as_arguments(values["environment"])
+            values.setdefault("ledger", False)
             config = RunConfig(**values)
         except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
             raise InputError(f"{file} is damaged or of another version: restore it, or train anew") from error

@@ -11,12 +11,14 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.rollouts.rollout import rollout
+from guiderail.tools.rollouts.ledger import Ledger
+from guiderail.tools.rollouts.rollout import Observer, rollout
 from guiderail.tools.tables import table_text
 from guiderail.tools.tasks import make_environment
 
-# Checkpoints cost at most this part of the time: small ones are written after every episode, a large one now and then.
-CHECKPOINT_SHARE = 0.05
+# Ledger and checkpoints cost at most this part of the time: a small checkpoint is written after every episode, a large
+# one now and then. (The first and the last are written in any case.)
+SAVING_SHARE = 0.03
 
 
 def train(
@@ -29,7 +31,8 @@ def train(
     """Trains a run to its last episode and writes its folder.
 
     A run that was killed and resumed gives bit for bit what it would have given undisturbed: a checkpoint is taken at
-    an episode's end and holds every number and every random generator that the rest depends on.
+    an episode's end and holds every number and every random generator that the rest depends on. The ledger is written
+    before it, and what is beyond it is written again.
 
     Args:
         folder: where it is written; with `resume`, where it goes on.
@@ -38,6 +41,9 @@ def train(
 
     Returns:
         The rows of `episodes.csv`.
+
+    Raises:
+        InputError: if the folder holds another run, or another process writes into it.
     """
     torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
     env = make_environment(config.task, config.environment)
@@ -48,6 +54,23 @@ def train(
         config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=task.symmetry
     )
     env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
+    if not resume:
+        folder.refuse_existing()
+    try:
+        with folder.locked():
+            return _train(folder, config, env, learner, resume, report)
+    finally:
+        env.close()
+
+
+def _train(
+    folder: RunFolder,
+    config: RunConfig,
+    env: Any,
+    learner: Learner,
+    resume: bool,
+    report: Callable[[dict[str, Any]], None] | None,
+) -> list[dict[str, Any]]:
     if resume:
         rows = _resume(folder, learner, env)
         folder.write_config(config)
@@ -55,10 +78,12 @@ def train(
         rows = []
         folder.create(config)
 
-    spent_training, spent_saving = 0.0, 0.0
+    ledger = Ledger(env, folder.ledger)
+    watching: list[Observer] = [ledger] if config.ledger else []
+    spent_training, spent_saving, last_saving = 0.0, 0.0, 0.0
     for episode in range(len(rows), config.episodes):
         started = time.perf_counter()
-        row = rollout(env, learner.act, learner, index=episode)
+        row = rollout(env, learner.act, learner, *watching, index=episode)
         if learner.has_diverged():
             raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
         row["wall_time"] = time.perf_counter() - started
@@ -71,13 +96,14 @@ def train(
         spent_training += time.perf_counter() - started
         if report is not None:
             report(rows[-1])
-        if spent_saving <= CHECKPOINT_SHARE * spent_training or episode + 1 == config.episodes:
+        with_another = ledger.seconds + spent_saving + last_saving
+        if with_another <= SAVING_SHARE * spent_training or episode + 1 in (1, config.episodes):
             started = time.perf_counter()
             _save(folder, rows, learner, env)
-            spent_saving += time.perf_counter() - started
+            last_saving = time.perf_counter() - started
+            spent_saving += last_saving
     policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
     policy.save(folder.path, write=write_atomically)
-    env.close()
     return rows
 
 

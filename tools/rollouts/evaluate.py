@@ -1,18 +1,22 @@
 """`guiderail evaluate`: what a policy achieves on held-out conditions, beside the demonstration alone."""
 
+import hashlib
+import json
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pandas as pd
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.files import write_atomically
 from guiderail.tools.guidance import is_demonstrated
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.rollouts.metrics import converged_after, summary
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.progress import EpisodeProgress
@@ -97,18 +101,22 @@ def evaluate(
     episodes: int = 100,
     seed: int = HELD_OUT_SEED,
     environment: Mapping[str, Any] | None = None,
+    beside: Mapping[str, Callable[[gymnasium.Env], Act]] | None = None,
 ) -> dict[str, Any]:
-    """Evaluates the policy that a run left.
+    """Evaluates the policy that a run left, beside policies that learned nothing.
 
     Args:
         run: the run's folder.
         episodes: how many, each with held-out initial conditions and offsets.
         seed: of the first; the policy and the demonstration meet the same ones.
         environment: arguments of the environment that are other ones than where it learned, such as the station.
+        beside: what else acts in the same episodes, by a name: null policies and rules by hand. Their rows are kept in
+            the run's folder and used again.
 
     Returns:
         The statistics `COMPARED`, each also as `demonstration_<name>` (the same episodes before anything was learned;
-        None where guidance has no demonstration); `episodes` and `seed`; `converged_after` and `trained_episodes` of
+        None where guidance has no demonstration) and as `<policy>_<name>` for those beside it; `beside`, the names of
+        those that can act in this environment; `episodes` and `seed`; `converged_after` and `trained_episodes` of
         the training.
 
     Raises:
@@ -122,11 +130,39 @@ def evaluate(
     alone = pd.DataFrame()
     if is_demonstrated(where.get("guidance")):
         alone = evaluate_run(config, still, where, words="demonstration alone", **how)
+    others: dict[str, Any] = {}
+    names = ["demonstration"] * bool(len(alone))
+    for name, acts in (beside or {}).items():
+        told = json.dumps([where, how, config.seed, installed_versions()], sort_keys=True, default=str)
+        digest = hashlib.blake2b(told.encode(), digest_size=6).hexdigest()
+        judged = partial(evaluate_run, config, partial(_suited, acts), where, words=name, **how)
+        try:
+            others |= summary(cached(folder.path / "beside" / f"{name}-{digest}.csv", judged), COMPARED, f"{name}_")
+        except _NotSuitedError:
+            continue
+        names.append(name)
     return {
         **summary(rows, COMPARED),
         **summary(alone, COMPARED, "demonstration_"),
+        **others,
+        "beside": names,
         "episodes": episodes,
         "seed": seed,
         "converged_after": converged_after(trained),
         "trained_episodes": len(trained),
     }
+
+
+class _NotSuitedError(Exception):
+    """A policy whose observations or actions are not an environment's."""
+
+
+def _suited(policy: Callable[[gymnasium.Env], Act], env: gymnasium.Env) -> Act:
+    """What acts, if its observations and actions are the environment's."""
+    try:
+        found = np.shape(policy(env)(np.zeros(env.observation_space.shape or (), np.float32)))
+    except (IndexError, ValueError):
+        found = None
+    if found != env.action_space.shape:
+        raise _NotSuitedError
+    return policy(env)

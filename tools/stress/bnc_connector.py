@@ -57,7 +57,7 @@ class Penetration(EnvObserver):
 
 def campaign() -> Campaign:
     """Guidance, uncertainty and explored outputs, everything with everything; each episode is a run of its own."""
-    kinds = itertools.product(("kgrl", "skgrl", "residual"), ("calibration", "disc"), EXPLORED)
+    kinds = itertools.product(("kgrl", "skgrl", "residual", "safe_residual"), ("calibration", "disc"), EXPLORED)
     cases = [
         Case(
             name=f"{guidance}, {uncertainty}, {outputs}",
@@ -69,7 +69,9 @@ def campaign() -> Campaign:
             },
             constrained=guidance != "residual",
             options={"new_run": True},
+            waits=guidance == "safe_residual",
         )
         for guidance, uncertainty, outputs in kinds
     ]
+    cases.append(Case("kmp, disc", {"guidance": "kmp", "uncertainty": "disc"}, False, {"new_run": True}))
     return Campaign("BncConnector", cases, LIMITS, witness=Penetration)

@@ -18,10 +18,12 @@ import pandas as pd
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 from guiderail.tools.files import write_atomically
+from guiderail.tools.rollouts.ledger import Ledger
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NULL_POLICIES, Choose
 from guiderail.tools.rollouts.rollout import Decision, EnvObserver, Observer, rollout
-from guiderail.tools.stress import STRESSED
+from guiderail.tools.stress import EVERY, STRESSED
+from guiderail.tools.stress.recompute import Frames, RecomputedViolation, nothing_moves
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import make_environment
 
@@ -61,6 +63,8 @@ class Case:
     environment: Mapping[str, Any]  # its arguments
     constrained: bool  # whether no action may lead to a command that violates the constraints
     options: Mapping[str, Any] = field(default_factory=dict)  # of every reset
+    waits: bool = False  # whether its fallback is to wait, or to stop before a wall, and no failure
+    limits: Mapping[str, float] | None = None  # the campaign's unless given
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,7 @@ class Campaign:
     # Makes what watches an environment's episodes for what their rows don't tell, in numbers: the greater, the worse.
     witness: Callable[[gymnasium.Env], Observer] | None = None
     actions: Mapping[str, Choose] = field(default_factory=lambda: ACTIONS)
+    frames: Frames = nothing_moves  # where a template's objects are, by what a reset drew
 
 
 def run_campaign(
@@ -85,6 +90,7 @@ def run_campaign(
     *,
     seed: int = 0,
     out: Path | None = None,
+    ledger: Path | None = None,
     environment: Mapping[str, Any] | None = None,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
@@ -95,11 +101,13 @@ def run_campaign(
         enough: is asked before each episode, and told the rows so far.
         seed: of the first episode; episode i has seed + i.
         out: a table that grows with every round of the cases; episodes in it are not run again.
+        ledger: a folder for every control step, a file an episode; none unless given.
         environment: arguments that every case has besides its own.
         say: is told what each round came to.
 
     Returns:
-        A row an episode: case, actions, seed, constrained, `COLUMNS`, `not_finite`, and what the witness saw.
+        A row an episode: case, actions, seed, constrained, waits, `COLUMNS`, `not_finite`, `recomputed_violation`, and
+        what the witness saw.
 
     Raises:
         InputError: if `out` holds another campaign.
@@ -108,7 +116,9 @@ def run_campaign(
     rows: list[dict[str, Any]] = read_table(out).to_dict("records") if out is not None and out.exists() else []
     for index, row in enumerate(rows):
         case, name = kinds[index % len(kinds)]
-        if (row.get("case"), row.get("actions"), row.get("seed")) != (case.name, name, seed + index):
+        if (row.get("case"), row.get("actions"), row.get("seed")) != (case.name, name, seed + index) or (
+            "recomputed_violation" not in row
+        ):
             raise InputError(f"{out} holds another campaign: name another file")
     environments: dict[str, tuple[gymnasium.Env, list[Observer]]] = {}
     said, began = len(rows), time.process_time()
@@ -116,13 +126,16 @@ def run_campaign(
         case, name = kinds[len(rows) % len(kinds)]
         if case.name not in environments:
             env = make_environment(campaign.task, {**case.environment, **(environment or {})})
-            watching = [Finite(env), *([campaign.witness(env)] if campaign.witness else [])]
+            watching: list[Observer] = [Finite(env), RecomputedViolation(env, campaign.frames)]
+            watching += [campaign.witness(env)] if campaign.witness else []
+            watching += [Ledger(env, ledger)] if ledger is not None else []
             environments[case.name] = env, watching
         env, watching = environments[case.name]
         own = seed + len(rows)
         act = campaign.actions[name](np.random.default_rng([own, 1]), int(np.prod(env.action_space.shape or ())))
-        found = rollout(env, act, *watching, seed=own, options=case.options)
-        row = {"case": case.name, "actions": name, "seed": own, "constrained": int(case.constrained)}
+        found = rollout(env, act, *watching, index=len(rows), seed=own, options=case.options)
+        row = {"case": case.name, "actions": name, "seed": own}
+        row |= {"constrained": int(case.constrained), "waits": int(case.waits)}
         known = [*COLUMNS, *list(found)[list(found).index("not_finite") :]]
         rows.append(row | {column: found[column] for column in known})
         if len(rows) % len(campaign.cases) == 0 or enough(rows):
@@ -136,22 +149,32 @@ def run_campaign(
 
 
 def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What episodes came to: counts, and the worst of everything; a violation is of constrained guidance's commands."""
+    """What episodes came to: counts, and the worst of everything; a violation is of constrained guidance's commands.
+
+    `worst_violation` is the greater of what the environment says and what was recomputed from the commands;
+    `disagreement` is the greatest difference of the two.
+    """
     table = pd.DataFrame(rows)
-    witnessed = table.columns.drop(["case", "actions", "seed", "constrained", *COLUMNS, "not_finite"], errors="ignore")
+    own = ["case", "actions", "seed", "constrained", "waits", *COLUMNS, "not_finite", "recomputed_violation"]
+    witnessed = table.columns.drop(own, errors="ignore")
+    said, recomputed = (table[name].to_numpy(float) for name in ("worst_violation", "recomputed_violation"))
+    constrained, bounded = table["constrained"].to_numpy() == 1, recomputed > -np.inf
 
-    def worst(constrained: int) -> float | None:
-        violations = table["worst_violation"][table["constrained"] == constrained]
-        return float(violations.max(skipna=False)) if len(violations) else None
+    def worst(of: np.ndarray) -> float | None:
+        violations = np.maximum(said, recomputed)[of]
+        return float(violations.max()) if len(violations) else None
 
+    failed = table[table["waits"] == 0]
     return {
         "episodes": len(table),
         "control_steps": int(table["steps"].sum()),
         "endings": dict(Counter(table["termination"])),
         "not_finite": int(table["not_finite"].sum()),
-        "fallbacks": int(table["fallbacks"].sum()),
-        "worst_violation": worst(1),
-        "worst_violation_unconstrained": worst(0),
+        "fallbacks": int(failed["fallbacks"].sum()),
+        "waits": int(table["fallbacks"].sum() - failed["fallbacks"].sum()),
+        "worst_violation": worst(constrained),
+        "worst_violation_unconstrained": worst(~constrained),
+        "disagreement": float(np.abs(said - recomputed)[constrained & bounded].max(initial=0.0)),
         "collisions": int(table["collisions"].sum()),
         "peak_force": float(table["peak_force"].max(skipna=False)),
         **{name: float(table[name].max(skipna=False)) for name in witnessed},
@@ -169,6 +192,8 @@ def complaints(found: Mapping[str, Any], limits: Mapping[str, float]) -> list[st
         wrong.append("a prediction failed")
     if found["worst_violation"] is not None and not found["worst_violation"] <= TOLERANCE:
         wrong.append("a command violated the constraints")
+    if not found["disagreement"] <= TOLERANCE:
+        wrong.append("what was said of a command is not what it was")
     wrong += [f"{name} beyond {limit:g}" for name, limit in limits.items() if not found[name] <= limit]
     return wrong
 
@@ -183,16 +208,66 @@ def stress(
     environment: Mapping[str, Any] | None = None,
     say: Callable[[str], None] | None = None,
 ) -> dict[str, Any]:
-    """Stresses a task for so many episodes or control steps; `cases` and `all` of what came of it, and `wrong`.
+    """Stresses a task, or all of them, for so many episodes or control steps.
+
+    Args:
+        task: one of `STRESSED`, or "all": each gets the same part of the control steps.
+        episodes: how many; 1000 unless given, and not for all tasks.
+        steps: control steps, instead.
+        seed: of the first episode of each task.
+        out: of one task a table; of all a folder with a table for each, and a ledger of every control step. What is in
+            it is not run again.
+        environment: arguments that every case has besides its own.
+        say: is told what each round came to.
+
+    Returns:
+        `cases` and `all` of what came of it, and `wrong`; of all tasks `tasks`, `control_steps` and `wrong`.
 
     Raises:
         InputError: for a task without a campaign, or a number out of range.
     """
-    episodes = 1000 if episodes is None else episodes
-    if episodes < 1 or (steps is not None and steps < 1) or seed < 0:
+    if (episodes is not None and episodes < 1) or (steps is not None and steps < 1) or seed < 0:
         raise InputError("a stress campaign has at least one episode or control step, and a seed from 0")
+    if task == EVERY:
+        if steps is None or episodes is not None or environment:
+            raise InputError("all tasks are stressed for a number of control steps, without --env: give --steps")
+        if out is not None and out.suffix == ".csv":
+            raise InputError(f"all tasks leave a folder, not the table {out}: name a folder with --out")
+        return _stress_all(-(-steps // len(STRESSED)), seed=seed, out=out, say=say)
     if task not in STRESSED:
-        raise InputError(f"nobody wrote down how to stress {task!r}: {did_you_mean(task, STRESSED)}")
+        raise InputError(f"nobody wrote down how to stress {task!r}: {did_you_mean(task, [*STRESSED, EVERY])}")
+    return _stress(task, 1000 if episodes is None else episodes, steps, seed, out, None, environment, say)
+
+
+def _stress_all(steps: int, *, seed: int, out: Path | None, say: Callable[[str], None] | None) -> dict[str, Any]:
+    found = {}
+    for task in STRESSED:
+        table, ledger = (None, None) if out is None else (out / f"{task}.csv", out / "ledger" / task)
+        told = None if say is None else _told(say, task)
+        found[task] = _stress(task, 0, steps, seed, table, ledger, None, told)
+    return {
+        "tasks": found,
+        "control_steps": sum(one["all"]["control_steps"] for one in found.values()),
+        "worst_violation": max(one["all"]["worst_violation"] for one in found.values()),
+        "disagreement": max(one["all"]["disagreement"] for one in found.values()),
+        "wrong": [f"{task}: {words}" for task, one in found.items() for words in one["wrong"]],
+    }
+
+
+def _told(say: Callable[[str], None], task: str) -> Callable[[str], None]:
+    return lambda words: say(f"{task}: {words}")
+
+
+def _stress(
+    task: str,
+    episodes: int,
+    steps: int | None,
+    seed: int,
+    out: Path | None,
+    ledger: Path | None,
+    environment: Mapping[str, Any] | None,
+    say: Callable[[str], None] | None,
+) -> dict[str, Any]:
     campaign = import_module(f"guiderail.tools.stress.{STRESSED[task]}").campaign()
 
     def enough(rows: list[dict[str, Any]]) -> bool:
@@ -200,8 +275,11 @@ def stress(
             return sum(row["steps"] for row in rows) >= steps
         return len(rows) >= episodes
 
-    rows = run_campaign(campaign, enough, seed=seed, out=out, environment=environment, say=say)
-    by_case = {case.name: [row for row in rows if row["case"] == case.name] for case in campaign.cases}
-    total = outcome(rows)
-    cases = {name: outcome(some) for name, some in by_case.items() if some}
-    return {"cases": cases, "all": total, "wrong": complaints(total, campaign.limits)}
+    rows = run_campaign(campaign, enough, seed=seed, out=out, ledger=ledger, environment=environment, say=say)
+    cases, wrong = {}, []
+    for case in campaign.cases:
+        if some := [row for row in rows if row["case"] == case.name]:
+            cases[case.name] = outcome(some)
+            limits = campaign.limits if case.limits is None else case.limits
+            wrong += [f"{case.name}: {words}" for words in complaints(cases[case.name], limits)]
+    return {"cases": cases, "all": outcome(rows), "wrong": wrong}

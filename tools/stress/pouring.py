@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from pydrake.math import RigidTransform
 
 from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES, Inputs
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.tools.rollouts.metrics import TOLERANCE
-from guiderail.tools.rollouts.null_policies import Choose
+from guiderail.tools.rollouts.null_policies import Choose, corners
 from guiderail.tools.rollouts.rollout import Decision, EnvObserver
 from guiderail.tools.stress.campaign import Campaign, Case
 
@@ -40,15 +41,20 @@ class EarlyTilt(EnvObserver):
 
 
 def _three_inputs(make: Callable[[np.random.Generator], Inputs]) -> Choose:
-    return lambda rng, size: make(rng)
+    """The adversary where there are its three inputs; where there are six velocities, full deflection."""
+    return lambda rng, size: make(rng) if size == 3 else corners(rng, size)
 
 
 def campaign() -> Campaign:
-    """The template with a mug that is moved, and everyone who is careless or worse."""
+    """The template with a mug that is moved, and everyone who is careless or worse; and none, for the physics."""
     return Campaign(
         "Pouring",
-        [Case("sct", {"guidance": "sct", "mug_offset": MAX_MUG_OFFSET}, constrained=True)],
+        [
+            Case("sct", {"guidance": "sct", "mug_offset": MAX_MUG_OFFSET}, constrained=True),
+            Case("none", {"guidance": "none", "mug_offset": MAX_MUG_OFFSET}, constrained=False, limits={}),
+        ],
         {"collisions": 0, "early_tilt": TOLERANCE},
         witness=EarlyTilt,
         actions={name: _three_inputs(make) for name, make in ADVERSARIES.items()},
+        frames=lambda drawn: {"mug_tip": RigidTransform([*drawn["mug_position"], 0.0])},
     )

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from guiderail.tools.files import check_picture
 from guiderail.tools.rollouts.rollout import Decision, EnvObserver, rollout
@@ -50,16 +52,31 @@ def write_film(picture: Path, episode: Shown) -> dict[str, Any]:
         InputError: if nothing can be rendered on this machine, or no such picture be written.
     """
     check_picture(picture)
+    row, frames = watch(episode, ROWS * COLUMNS)
+    figure, axes = new_figure(ROWS, COLUMNS, (3.6 * COLUMNS, 2.95 * ROWS))
+    figure.suptitle(f"{episode.heading}: {outcome(row)}", fontsize=10)
+    draw_frames(axes.flat, frames)
+    save_figure(figure, picture)
+    return row
+
+
+def watch(episode: Shown, moments: int) -> tuple[dict[str, Any], list[Any]]:
+    """Runs an episode; its row, and what the task's camera sees at so many moments: (time, force, image) each.
+
+    Raises:
+        InputError: if nothing can be rendered on this machine.
+    """
     env = make_environment(episode.task, episode.environment, render_mode="rgb_array")
     env.reset(seed=episode.run_seed)
     frames = Frames(env)
     row = rollout(env, episode.policy(env), frames, seed=episode.seed, held_out=True)
     env.close()
-    figure, axes = new_figure(ROWS, COLUMNS, (3.6 * COLUMNS, 2.95 * ROWS))
-    figure.suptitle(f"{episode.heading}: {outcome(row)}", fontsize=10)
-    for axis, (time, force, image) in zip(axes.flat, frames.spread(ROWS * COLUMNS), strict=True):
+    return row, frames.spread(moments)
+
+
+def draw_frames(axes: Iterable[Axes], frames: list[Any], letter: str = "") -> None:
+    """A moment in each of the axes, numbered where a letter is given."""
+    for number, (axis, (time, force, image)) in enumerate(zip(axes, frames, strict=True), start=1):
         axis.imshow(image)
-        axis.set_title(f"{time:.1f} s, {force:.0f} N", fontsize=9)
+        axis.set_title(f"{letter}{number}: " * bool(letter) + f"{time:.1f} s, {force:.0f} N", fontsize=9)
         axis.set_axis_off()
-    save_figure(figure, picture)
-    return row

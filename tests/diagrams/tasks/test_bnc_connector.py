@@ -67,19 +67,19 @@ def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
 
 
 def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
-    """On the whole at most one in five; here, none of three."""
-    assert evaluate_policy(skgrl, still(skgrl), episodes=3, options=NEW_RUN)["success"].sum() == 0
+    """On the whole at most one in five; here, none of two."""
+    assert evaluate_policy(skgrl, still(skgrl), episodes=2, options=NEW_RUN)["success"].sum() == 0
 
 
 def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
-    rows = evaluate_policy(skgrl, reactive_rule, episodes=3, options=NEW_RUN)
-    assert rows["success"].sum() == 3
+    rows = evaluate_policy(skgrl, reactive_rule, episodes=2, options=NEW_RUN)
+    assert rows["success"].sum() == 2
     assert rows["worst_violation"].max() <= 1e-9
 
 
 def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
-    rows = evaluate_policy(kgrl, reactive_rule, episodes=3, options=NEW_RUN)
-    assert rows["success"].sum() == 3
+    rows = evaluate_policy(kgrl, reactive_rule, episodes=2, options=NEW_RUN)
+    assert rows["success"].sum() == 2
     assert rows["worst_violation"].max() <= 1e-9
 
 

@@ -1,17 +1,44 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from guiderail.diagrams.cameras import Camera, look_at
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.figures import FIGURES, find_figure, reproduce
 from guiderail.tools.figures.chapter_3 import METHODS
+from guiderail.tools.figures.thesis import TABLE_3_2, TABLE_4_1, THESIS
 from guiderail.tools.studies.declaration import load_study
 from guiderail.tools.studies.study import JUDGED, TRAINING, Job
 from guiderail.tools.tables import read_table
+
+TABLES = {"table 3.2": TABLE_3_2, "table 4.1": TABLE_4_1}
 
 
 @pytest.mark.parametrize("figure", FIGURES)
 def test_every_figure_has_a_function(figure):
     assert callable(find_figure(figure))
+
+
+def test_every_figure_says_what_the_thesis_says():
+    assert set(THESIS) == set(FIGURES)
+
+
+@pytest.mark.parametrize("figure", ["2.2", "3.4", "5.3", "table 3.2", "table 4.1"])
+def test_a_figure_that_needs_no_learning_is_a_picture_or_a_table(figure, tmp_path):
+    result = reproduce(figure, out=tmp_path)
+    assert result["the thesis"] == THESIS[figure]
+    if "table" in figure:
+        assert result["the presets of that name have the thesis's values"] == "yes, all"
+        assert {"thesis, " + p for p in TABLES[figure]} <= set(read_table(Path(result["table"]).with_suffix(".csv")))
+    else:
+        assert Path(result["picture"]).stat().st_size > 10_000
+
+
+def test_a_camera_projects_where_it_looks():
+    camera = Camera((640, 480), np.pi / 2, look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3)))
+    there = camera.project(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]]))
+    np.testing.assert_allclose(there, [[320.0, 240.0], [560.0, 240.0], [320.0, 0.0]], atol=1e-9)
 
 
 def test_figure_4_2_shows_a_primitive_that_keeps_its_constraints(tmp_path):

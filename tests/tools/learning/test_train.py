@@ -44,6 +44,11 @@ def assert_same_run(first, second):
     assert a.keys() == b.keys()
     for key in a:
         np.testing.assert_array_equal(a[key], b[key])
+    assert ledger_bytes(first) == ledger_bytes(second) != {}
+
+
+def ledger_bytes(folder):
+    return {path.name: path.read_bytes() for path in folder.ledger.iterdir()}
 
 
 def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
@@ -77,6 +82,35 @@ def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
     train(extended, bead_config, resume=True)
     assert_same_run(long, extended)
     assert extended.config() == bead_config
+
+
+def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    holds = "import sys; from guiderail.tools.learning.run_folder import RunFolder\n"
+    holds += f"with RunFolder({str(folder.path)!r}).locked(): print('held', flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", holds], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(InputError, match="another process is training"):
+            train(folder, bead_config)
+        other.kill()  # its lock file stays, and holds nobody back
+    (folder.path / ".episodes.csv.1.part").write_text("from a process that was killed while writing")
+    with folder.locked():
+        pass
+    train(folder, replace(bead_config, episodes=2))
+    assert {path.name for path in folder.path.iterdir() if path.name.startswith(".")} == set()
+
+
+def test_the_ledger_can_be_turned_off_and_a_run_goes_on_as_it_began(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, replace(bead_config, episodes=2, ledger=False))
+    assert not folder.ledger.exists()
+    with pytest.raises(InputError, match="ledger False, not True"):
+        run(None, folder.path, environment={}, ledger=True, resume=True)
+    # One of a version without ledgers does not get half of one.
+    text = (folder.path / "config.yaml").read_text()
+    (folder.path / "config.yaml").write_text(text.replace("ledger: false\n", ""))
+    assert folder.config().ledger is False
 
 
 def test_a_run_never_replaces_another(bead_config, tmp_path):

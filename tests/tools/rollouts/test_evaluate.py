@@ -1,3 +1,5 @@
+from functools import partial
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -6,6 +8,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import train
 from guiderail.tools.rollouts.evaluate import COMPARED, cached, evaluate, evaluate_policy
+from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
 from guiderail.tools.tasks import make_environment
 
 
@@ -46,3 +49,22 @@ def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_config, tm
     elsewhere = evaluate(tmp_path / "run", episodes=3, environment={"wall": -0.5})
     assert elsewhere["success_rate"] == elsewhere["demonstration_success_rate"] == 0.0
     assert elsewhere["mean_return"] != result["mean_return"]
+
+
+def test_what_learned_nothing_meets_the_same_episodes_once(bead_config, tmp_path, capsys):
+    train(RunFolder(tmp_path / "run"), bead_config)
+    policies = {
+        "zero": still,
+        "white": partial(NullPolicy, white),
+        "other": lambda env: lambda observation: np.zeros(7),
+    }
+    first = evaluate(tmp_path / "run", episodes=3, beside=policies)
+    assert first["beside"] == ["demonstration", "zero", "white"]
+    for name in COMPARED:
+        assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
+    assert first["white_mean_return"] != first["zero_mean_return"]
+    assert "white 3/3" in capsys.readouterr().err
+    again = evaluate(tmp_path / "run", episodes=3, beside=policies)
+    assert "white" not in capsys.readouterr().err
+    assert again == first
+    assert evaluate(tmp_path / "run", episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]

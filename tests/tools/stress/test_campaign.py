@@ -3,9 +3,12 @@ import numpy as np
 import pytest
 
 from guiderail.models.errors import InputError
+from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.rollout import Observer, rollout
 from guiderail.tools.stress import STRESSED, bnc_connector, narrow_passage
+from guiderail.tools.stress import campaign as campaign_module
 from guiderail.tools.stress.campaign import ACTIONS, Campaign, Case, Finite, complaints, outcome, run_campaign, stress
+from guiderail.tools.stress.recompute import RecomputedViolation
 from guiderail.tools.tables import read_table
 from guiderail.tools.tasks import make_environment
 
@@ -75,16 +78,19 @@ def test_numbers_that_are_none_are_counted():
         assert row["not_finite"] == count * row["steps"]
 
 
+MISLED = "what was said of a command is not what it was"
 SOUND = {
     "case": "one",
     "actions": "white",
     "seed": 0,
     "constrained": 1,
+    "waits": 0,
     "termination": "success",
     "steps": 3,
     "not_finite": 0,
     "fallbacks": 0,
     "worst_violation": -0.1,
+    "recomputed_violation": -0.1,
     "collisions": 0,
     "peak_force": 5.0,
     "depth": 0.1,
@@ -98,8 +104,11 @@ SOUND = {
         ({"termination": "simulation_failure"}, ["the simulation failed"]),
         ({"not_finite": 2}, ["something was not finite"]),
         ({"fallbacks": 1}, ["a prediction failed"]),
-        ({"worst_violation": 1e-6}, ["a command violated the constraints"]),
-        ({"worst_violation": float("nan")}, ["a command violated the constraints"]),
+        ({"fallbacks": 1, "waits": 1}, []),
+        ({"worst_violation": 1e-6, "recomputed_violation": 1e-6}, ["a command violated the constraints"]),
+        ({"recomputed_violation": 1e-6}, ["a command violated the constraints", MISLED]),
+        ({"worst_violation": float("nan")}, ["a command violated the constraints", MISLED]),
+        ({"recomputed_violation": -0.2}, [MISLED]),
         ({"worst_violation": 1e-6, "constrained": 0}, []),
         ({"depth": 0.3}, ["depth beyond 0.2"]),
     ],
@@ -124,6 +133,33 @@ def test_the_narrow_passage_withstands_actions_that_turn_and_actions_that_do_not
     assert found["wrong"] == []
     assert found["all"]["episodes"] == 8
     assert set(found["cases"]) == {case.name for case in narrow_passage.campaign().cases}
+
+
+@pytest.mark.parametrize("lie", [0.0, 1e-8])
+def test_a_violation_is_recomputed_from_what_was_commanded(lie):
+    """Commands that are beside what the environment says of them are seen."""
+    (case,) = (case for case in narrow_passage.campaign().cases if case.name == "skgrl, hold 5")
+    env = make_environment("NarrowPassage", case.environment)
+    base, recorded = env.unwrapped, env.unwrapped.trace.append
+    base.trace.append = lambda commanded, *rest: recorded(commanded + [lie, 0.0], *rest)
+    row = rollout(env, lambda observation: np.ones(2), RecomputedViolation(env), seed=0)
+    assert row["worst_violation"] > -1e-9, "it never came to the zone's edge"
+    assert row["recomputed_violation"] == pytest.approx(row["worst_violation"] + lie, abs=1e-15)
+
+
+def test_all_tasks_are_stressed_in_one_folder_and_go_on_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign_module, "STRESSED", {"NarrowPassage": "narrow_passage", "GridClamp": "grid_clamp"})
+    found = stress("all", steps=20, seed=5, out=tmp_path)
+    assert found["wrong"] == []
+    assert found["worst_violation"] <= 1e-9
+    assert found["control_steps"] == sum(
+        len(read_ledger(tmp_path / "ledger" / task)) for task in ("NarrowPassage", "GridClamp")
+    )
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.csv")}
+    assert stress("all", steps=20, seed=5, out=tmp_path) == found
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.csv")}
+    with pytest.raises(InputError, match="give --steps"):
+        stress("all", episodes=3)
 
 
 def test_pouring_withstands_somebody_with_shaking_hands():

@@ -1,0 +1,33 @@
+"""Insertion is simulated with pressure fields throughout: no contact of one falls back to a single point."""
+
+import numpy as np
+import pytest
+
+from guiderail import make_env
+
+DOWN = np.array([0.0, 0.0, -1.0])
+CASES = {
+    "connector": ("BncConnector", {"guidance": "kmp", "uncertainty": "known"}, np.zeros(2), {}),
+    "connector on an arm": ("BncConnector", {"guidance": "kmp", "station": "arm"}, np.zeros(2), {"offset": (0.0, 0.0)}),
+    "clamp": ("GridClamp", {"uncertainty": "known"}, DOWN, {}),
+    "clamp on an arm": ("GridClamp", {"station": "arm", "uncertainty": "known"}, DOWN, {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_contact_of_an_insertion_is_a_point(case):
+    task, options, action, drawn = CASES[case]
+    env = make_env(task, **options)
+    env.reset(seed=0, options=drawn)
+    plant = env.task.diagram.GetSubsystemByName("station").plant
+    context = plant.GetMyContextFromRoot(env.simulator.get_context())
+    surfaces, points, ended = 0, 0, False
+    while not ended:
+        *_, terminated, truncated, info = env.step(action)
+        ended = terminated or truncated
+        results = plant.get_contact_results_output_port().Eval(context)
+        surfaces += results.num_hydroelastic_contacts()
+        points += results.num_point_pair_contacts()
+    assert points == 0
+    assert surfaces > 0
+    assert info["termination"] == "success"

@@ -1,0 +1,57 @@
+"""What the thesis says of each figure and table, in few words: it is printed beside what comes out here."""
+
+THESIS = {
+    "2.2": "three states, Translational, Tilt and Pour; three inputs",
+    "3.4": "a simulated iiwa with a thermos, a mug on a table, two balls of 4 cm",
+    "3.5": "SAC, 10 sessions: RL-Sparse does not learn within 1400 episodes, RL-Shaped converges within 1200 with many "
+    "spills and collisions, RL-SCT-Sparse within 600 and RL-SCT-Shaped within 250, both without collisions",
+    "3.6": "TQC, 10 sessions: RL-Sparse does not learn within 1400 episodes, RL-Shaped converges within 700, "
+    "RL-SCT-Sparse within 1000 and RL-SCT-Shaped within 250, both without collisions",
+    "3.7": "RL-SCT-Shaped with SAC, a real robot, 5 sessions: a success rate of 1 within 65 episodes, 9700 time steps",
+    "3.8": "no session of RL-Sparse converged within 1400 episodes; 12 and 20 episodes of RL-Sparse and RL-Shaped "
+    "involved a collision, none with a template",
+    "3.10": "a real robot: 100 % success in 70 episodes, 9820 time steps, with and without the cost of force",
+    "3.11": "both rewards converge in about 70 episodes",
+    "4.2": "one action at 3.2 s changes the motion nearby, smoothly and inside the bounds; random ones do more where "
+    "demonstrations differ more",
+    "4.3": "a passage, an obstacle in the robot's way, a restricted zone beyond x = 0.6 m",
+    "4.4": "residual RL explores in all directions alike, KGRL hardly in the passage",
+    "4.5": "KGRL succeeds from the first episode on; both kinds of residual RL are unstable and often get stuck",
+    "4.6": "KGRL: no collision and no violation; residual RL: many of both; safe residual RL: none",
+    "4.7": "the obstacle is avoided within 30 episodes",
+    "4.8": "a real robot: a success rate of 1 in 45 episodes, with less force and shorter episodes",
+    "5.2": "KGRL's motion jumps from window to window, sKGRL's goes on smoothly",
+    "5.3": "as figure 4.3",
+    "5.4": "after a push the robot returns as fast as the demonstrations' variance says, never into the zone",
+    "5.5": "one motion of KGRL is erratic, five of sKGRL are smooth",
+    "5.6": "sKGRL has the higher return, by a lower cost of actions, and takes longer to avoid the obstacle",
+    "5.7": "a real robot: an unsuccessful episode while learning, and a successful one after it",
+    "5.8": "a real robot: KGRL's positions jump, sKGRL's do not",
+    "5.9": "a real robot: a success rate of 1 in 42 episodes (KGRL) and 44 (sKGRL); KGRL's return is higher in the end",
+    "5.10": "a real robot: sKGRL's jerk is orders of magnitude below KGRL's",
+    "table 3.2": "learning rates, discounts and batches of SAC and TQC on two robots",
+    "table 3.3": "what is known about pouring, as a reward and as a template",
+    "table 4.1": "TQC in simulation and on the real robot",
+}
+
+# Hyperparameters by the preset that holds them; `discount` is of a decision, which lasts one control step there.
+TABLE_3_2 = {
+    "table_3_2_iiwa": {
+        "learning_rate": 8e-4, "buffer_size": 1_000_000, "discount": 0.95, "soft_update": 0.02, "train_every": 8,
+        "gradient_steps": 8, "learning_starts": 1000, "batch_size": 256,
+    },
+    "table_3_2_sara": {
+        "learning_rate": 1e-3, "buffer_size": 1_000_000, "discount": 0.98, "soft_update": 0.02, "train_every": 8,
+        "gradient_steps": 8, "learning_starts": 1000, "batch_size": 256,
+    },
+}  # fmt: skip
+TABLE_4_1 = {
+    "table_4_1_simulation": {
+        "learning_rate": 1e-3, "soft_update": 0.02, "discount": 0.99, "train_every": 8, "gradient_steps": 8,
+        "entropy": "auto", "units": (256, 256),
+    },
+    "table_4_1_robot": {
+        "learning_rate": 1e-3, "soft_update": 0.01, "discount": 0.995, "train_every": 8, "gradient_steps": 8,
+        "entropy": "auto_0.1", "units": (256, 256),
+    },
+}  # fmt: skip
