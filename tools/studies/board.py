@@ -29,7 +29,7 @@ class Board:
         """
         Args:
             jobs: that are to be run, by their keys.
-            total: of the whole study; those that are not among `jobs` were finished before.
+            total: of the whole study; those that are not among `jobs` were finished before, and end too.
             console: where it is drawn; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)
@@ -37,8 +37,7 @@ class Board:
             key: (job, job.folder.path / "episodes.csv", job.log.stat().st_size if job.log.exists() else 0)
             for key, job in jobs.items()
         }
-        self._total, self._ended = total, total - len(jobs)
-        self._failed = 0
+        self._total, self._ended, self._failed = total, 0, 0
         terminal = self._console.is_terminal
         self._period = TERMINAL_PERIOD if terminal else LOG_PERIOD
         self._live = Live(console=self._console, auto_refresh=False, transient=True) if terminal and jobs else None

@@ -193,7 +193,10 @@ def _outcomes(jobs: list[Job], engine: Engine, console: Console | None) -> dict[
     outcomes: dict[int, Outcome] = {}
     with Board(to_run, len(jobs), console) as board:
         for index, job in done.items():
-            outcomes[index] = Outcome(tuple(run_job(job)))
+            try:
+                outcomes[index] = Outcome(tuple(run_job(job)))
+            except InputError as error:
+                outcomes[index] = Outcome(failure=str(error))
             board.end(index, job, outcomes[index])
         if to_run:
             with engine:

@@ -30,9 +30,11 @@ def test_it_shows_what_runs_how_far_it_is_and_what_has_ended(tmp_path):
         begin(jobs[0], 3)
         begin(jobs[1], 4, workers=2)
         begin(jobs[2], 0)
+        board.end(5, job(tmp_path, 5), Outcome())  # finished before
         board.end(2, jobs[2], Outcome(failure="learning diverged"))
         console.print(board._table())
     shown = console.file.getvalue()
+    assert "1/6 kgrl, seed 5\r" in shown or "1/6 kgrl, seed 5\n" in shown
     assert "2/6 kgrl, seed 2: failed: learning diverged" in shown
     assert [line.split() for line in shown.splitlines() if "episodes" in line] == [
         ["kgrl,", "seed", "0", "3/4", "episodes"]

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.tools.command import main
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import evaluate_policy
@@ -89,6 +89,13 @@ def test_a_run_that_fails_stops_no_other_and_is_named_at_the_end(tmp_path, capsy
     assert json.loads(said.out)["failed"][0].startswith(sentence)
     assert read_table(out / "beads.csv")["seed"].tolist() == [6, 6]
     assert "damaged" in (out / "logs" / "beads-learner-5.txt").read_text()
+    (judged,) = (out / "learner-6").glob("held_out-4-*.csv")
+    table = judged.read_bytes()
+    judged.write_text("a,b\n1\n")
+    with pytest.raises(RunsFailedError) as failed:
+        run(study(), out)
+    assert [sentence.partition(",")[2][:7] for sentence in failed.value.sentences] == [" seed 5", " seed 6"]
+    judged.write_bytes(table)
     checkpoint.write_bytes(whole)
     assert without_clock(run(study(), out)) == without_clock(expected)
 
