@@ -1,7 +1,9 @@
 """Cameras for image observations and for people, and the browser view."""
 
 import ctypes
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 from pydrake.geometry import (
@@ -72,6 +74,10 @@ def add_camera(
         InputError: if this machine lacks the library that renders without a display.
     """
     check_rendering()
+    # Mesa renders with an LLVM, and Triton, which PyTorch with CUDA brings, has another one: loaded second, that of
+    # Triton ends the process in a segmentation fault, as it would when PyTorch imports its compiler after a render.
+    with suppress(ImportError):
+        import_module("triton")
     if not scene_graph.HasRenderer(_RENDERER):
         scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     clipping = ClippingRange(0.01, 10.0)
