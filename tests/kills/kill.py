@@ -1,6 +1,6 @@
 """Kills training runs at random instants, and a study, and asks whether what they leave is as if nobody had.
 
-    python tests/kills/kill.py --kills 40                       # about ten minutes on two idle cores
+    python tests/kills/kill.py --kills 40                       # some ten minutes where nothing else runs
     python tests/kills/kill.py --kills 12 --tasks GridClamp     # some of them
 
 A run is begun, killed (SIGKILL), gone on with, killed again, and so on, and at last left alone. Half of the kills come

@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ from guiderail.tools.studies.engines.engine import ENGINES, make_engine
 from oracles.work import die, work
 
 PARENT = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 from oracles.work import wait
 from guiderail.tools.studies.engines.engine import make_engine
 if __name__ == "__main__":
@@ -71,11 +74,15 @@ def test_no_worker_outlives_a_study_however_it_ends(how, tmp_path):
         text=True,
     ) as parent:
         assert parent.stdout is not None
+        alarm = threading.Timer(60, parent.kill)
+        alarm.start()
         workers = {int(parent.stdout.readline()) for _ in range(2)}
         assert len(workers - {parent.pid}) == 2
         parent.send_signal(how)
         # The workers write to the same pipe: it ends when the last of them does.
-        assert parent.communicate(timeout=60) == ("", None)
+        assert parent.communicate() == ("", None)
+        alarm.cancel()
+        assert parent.returncode == -how
 
 
 def test_an_engine_refuses_what_it_has_no_use_for():
