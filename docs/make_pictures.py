@@ -75,12 +75,13 @@ def multiples(values: Sequence[Any], vary: Callable[[Any], tuple[Any, int]], lab
     """A picture with a panel for each value of one parameter, all else alike."""
 
     def picture(path: Path) -> None:
-        figure, axes = new_figure(1, len(values), (7.2, 2.1))
+        figure, axes = new_figure(1, len(values), (5.8, 2.0))
         for axis, value in zip(axes[0], values, strict=True):
             skill, hold = vary(value)
+            axis.set_xticks([0, 4, 8])
             primitive = skill.primitive(history=history)
             _panel(axis, primitive, skill.null_space_gains(primitive), hold, GREEN if history else BLUE)
-            axis.set_title(label.format(value), fontsize=9)
+            axis.set_title(label.format(f"{value:g}".replace("0.0001", "1e-04").replace("e-0", "e-")), fontsize=9)
             axis.label_outer()
         axes[0, 0].set_ylabel("x [m]")
         save_figure(figure, path)
@@ -132,29 +133,34 @@ def smoothness_picture(path: Path) -> None:
         axes[0, 0].plot(skill.reference.times, way[:, 0], color=colours[name], linewidth=1, label=name)
         jerks[name] = float(np.mean(np.linalg.norm(np.diff(way, 3, axis=0), axis=1)) / period**3)
     axes[0, 0].set(xlabel="time [s]", ylabel="x [m]")
-    axes[0, 1].barh(list(jerks), list(jerks.values()), color=list(colours.values()))
-    axes[0, 1].set(xscale="log", xlabel="mean jerk of the command [m/s³]")
+    axes[0, 1].hlines(list(jerks), 10, list(jerks.values()), color="0.85", linewidth=1)
+    axes[0, 1].scatter(list(jerks.values()), list(jerks), color=list(colours.values()), zorder=3)
+    axes[0, 1].set(xscale="log", xlim=(10, 10_000), xlabel="mean jerk of the command [m/s³]")
     axes[0, 1].invert_yaxis()
     save_figure(figure, path)
 
 
 def safety_picture(path: Path) -> None:
-    """The violation that is commanded, and the one that is measured, where a policy pushes at the constraint."""
-    env = make_env("NarrowPassage", guidance="kgrl", kappa=3.0, hold=5)
+    """What is commanded and what is measured, where a policy pushes at the constraint and the connector at the jack."""
+    env = make_env("BncConnector", guidance="kgrl", kappa=3.0, hold=1)
     env.reset(seed=0)
-    over = False
+    over, rows = False, []
     while not over:
-        *_, terminated, truncated, _ = env.step(np.array([1.0, 0.0], np.float32))
+        *_, terminated, truncated, info = env.step(np.ones(2, np.float32))
         over = terminated or truncated
-    trace = env.unwrapped.trace
-    times = trace.period * np.arange(1, len(trace) + 1)
-    figure, axes = new_figure(1, 1, (5.4, 2.6))
-    zone = NarrowPassage().zone_x
-    for name, colour, style in (("measured", "#ff7f0e", "-"), ("commanded", BLUE, "--")):
-        axes[0, 0].plot(times, 1000 * (getattr(trace, name)[:, 0] - zone), style, color=colour, label=name)
-    axes[0, 0].axhline(0, color=RED, linewidth=0.8)
-    axes[0, 0].set(xlabel="time [s]", ylabel="violation [mm]")
-    axes[0, 0].legend(frameon=False)
+        rows.append([info["constraint_violation"], info["measured_violation"], info["contact_force"]])
+    commanded, measured, force = np.array(rows).T
+    times = env.unwrapped.trace.period * np.arange(1, len(rows) + 1)
+    figure, axes = new_figure(2, 1, (5.4, 3.6))
+    upper, lower = axes[:, 0]
+    for values, name, colour in ((measured, "measured", "#ff7f0e"), (commanded, "commanded", BLUE)):
+        upper.plot(times, 1000 * values, color=colour, linewidth=1, label=name)
+    upper.axhline(0, color=RED, linewidth=0.8, linestyle="--")
+    upper.set(ylabel="violation [mm]", ylim=(-0.2, 0.1))
+    upper.label_outer()
+    upper.legend(frameon=False, loc="lower left")
+    lower.plot(times, force, color="0.3", linewidth=1)
+    lower.set(xlabel="time [s]", ylabel="contact force [N]")
     save_figure(figure, path)
 
 
@@ -200,10 +206,10 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "state_machine": state_machine,
     "projection": projection_picture,
     "primitive": primitive_picture,
-    "kappa": multiples((0.5, 1.0, 2.0), lambda v: (replace(_passage(), kappa=v), 5), "κ = {:g}", False),
-    "rho": multiples((1e-4, 1e-6, 1e-8), lambda v: (replace(_passage(), history_variance=v), 5), "ρ = {:g} m²", True),
+    "kappa": multiples((0.5, 1.0, 2.0), lambda v: (replace(_passage(), kappa=v), 5), "κ = {}", False),
+    "rho": multiples((1e-4, 1e-6, 1e-8), lambda v: (replace(_passage(), history_variance=v), 5), "ρ = {} m²", True),
     "history": multiples((2, 10, 20), lambda v: (replace(_passage(), history=v), 5), "P = {}", True),
-    "hold": multiples((1, 5, 20), lambda v: (_passage(), v), "hold = {}", False),
+    "hold": multiples((1, 5, 20), lambda v: (_passage(), v), "hold = {}", True),
     "smoothness": smoothness_picture,
     "safety": safety_picture,
 }

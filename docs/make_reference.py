@@ -7,6 +7,7 @@ import dataclasses
 import inspect
 import re
 import textwrap
+import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -144,12 +145,31 @@ def field_words(kind: type) -> dict[str, str]:
 
 
 def field_types(kind: type) -> dict[str, str]:
-    """The annotation of each field, as it is written."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(kind)))
-    nodes = tree.body[0].body  # type: ignore[attr-defined]
-    words = {n.target.id: ast.unparse(n.annotation) for n in nodes if isinstance(n, ast.AnnAssign)}
-    # What is checked beside the type is said in a sentence when it is wrong.
-    return {name: re.sub(r"Annotated\[(\w+), .*?\)\]", r"\1", text) for name, text in words.items()}
+    """The type of each field and its range, in words."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    bounds = {n: _bounds(f.metadata) for n, f in getattr(kind, "model_fields", {}).items()}
+    return {name: f"{_typed(hint)}{bounds.get(name, '')}" for name, hint in hints.items()}
+
+
+def _typed(hint: Any) -> str:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        metadata = [m for one in arguments[1:] for m in getattr(one, "metadata", [one])]
+        return _typed(arguments[0]) + _bounds(metadata)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join("nothing" if one is type(None) else _typed(one) for one in arguments)
+    if origin is typing.Literal:
+        return " or ".join(map(repr, arguments))
+    if origin is tuple:
+        return f"list of {_typed(arguments[0])}"
+    if origin is dict:
+        return f"mapping to {_typed(arguments[1])}"
+    return {typing.Any: "anything"}.get(hint) or getattr(hint, "__name__", str(hint))
+
+
+def _bounds(metadata: Iterable[Any]) -> str:
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    return "".join(f" {sign} {getattr(one, name):g}" for one in metadata for name, sign in signs.items() if hasattr(one, name))
 
 
 # --- pages ---
@@ -395,11 +415,11 @@ def templates() -> str:
         page += f"## {title}\n\nEach entry of `{where}` has `kind` and the fields of that kind.\n\n"
         for name, kind in registry.items():
             page += f"### {name}\n\n{paragraphs(inspect.getdoc(kind) or '')}\n\n"
-            words, types = field_words(kind), field_types(kind)
+            words, kinds_of = field_words(kind), field_types(kind)
             rows = []
             for one in dataclasses.fields(kind):
                 missing = one.default is dataclasses.MISSING
-                rows.append((code(one.name), code(types.get(one.name, "")), cell(words.get(one.name, "")), "" if missing else code(one.default)))
+                rows.append((code(one.name), cell(kinds_of.get(one.name, "")), cell(words.get(one.name, "")), "" if missing else code(one.default)))
             page += table(["field", "type", "what it is", "unless given"], rows)
     return page
 
@@ -415,12 +435,12 @@ def studies() -> str:
     )
     kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.JudgedOn, declaration.Ratio)
     for kind in (*kinds, declaration.Smoothness):
-        words, types = field_words(kind), field_types(kind)
+        words, kinds_of = field_words(kind), field_types(kind)
         page += f"## {kind.__name__}\n\n{prose(inspect.getdoc(kind) or '')}\n\n"
         rows = []
         for name, field in kind.model_fields.items():
             default = "" if field.is_required() else code(_model_default(field.default))
-            rows.append((code(field.alias or name), code(types[name]), cell(words[name]), default))
+            rows.append((code(field.alias or name), cell(kinds_of[name]), cell(words[name]), default))
         page += table(["field", "type", "what it is", "unless given"], rows)
     return page
 
@@ -470,11 +490,11 @@ def files() -> str:
 
 
 def _fields(kind: type) -> str:
-    words, types = field_words(kind), field_types(kind)
+    words, kinds_of = field_words(kind), field_types(kind)
     rows = []
     for one in dataclasses.fields(kind):
         default = "" if one.default is dataclasses.MISSING else code(one.default)
-        rows.append((code(one.name), code(types[one.name]), cell(words[one.name]), default))
+        rows.append((code(one.name), cell(kinds_of[one.name]), cell(words[one.name]), default))
     return table(["field", "type", "what it is", "unless given"], rows)
 
 
