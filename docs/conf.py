@@ -15,7 +15,7 @@ import guiderail  # noqa: E402
 project = "guiderail"
 release = version = guiderail.__version__
 author = "the authors of guiderail"
-copyright = "BSD-3-Clause"  # noqa: A001
+copyright = "BSD-3-Clause"
 
 extensions = ["myst_parser"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]

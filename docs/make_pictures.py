@@ -14,7 +14,7 @@ import numpy as np
 from guiderail.diagrams.make import known, make_env
 from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.models.primitives import LcNsKmp
-from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
+from guiderail.models.primitives.gains import rms_gains
 from guiderail.models.skills import load_skill
 from guiderail.models.skills.drawing import draw
 from guiderail.tools.viewing.style import new_figure, save_figure
@@ -97,10 +97,20 @@ def primitive_picture(path: Path) -> None:
     figure, axes = new_figure(1, 1, (5.4, 3.2))
     axis = axes[0, 0]
     mean, wide = reference.means[:, 0], 2 * reference.standard_deviations[:, 0]
-    axis.fill_between(reference.times, mean - wide, mean + wide, color=GREY, alpha=0.35, linewidth=0, label="±2 σ of the demonstrations")
+    axis.fill_between(
+        reference.times,
+        mean - wide,
+        mean + wide,
+        color=GREY,
+        alpha=0.35,
+        linewidth=0,
+        label="±2 σ of the demonstrations",
+    )
     right = np.tile([1.0, 0.0], (reference.num_steps, 1))
     axis.plot(reference.times, motion(free, gains, 0 * right)[:, 0], color="0.3", label="no action")
-    axis.plot(reference.times, motion(free, gains, right)[:, 0], color=BLUE, linestyle=":", label="action +1, no constraint")
+    axis.plot(
+        reference.times, motion(free, gains, right)[:, 0], color=BLUE, linestyle=":", label="action +1, no constraint"
+    )
     axis.plot(reference.times, motion(primitive, gains, right)[:, 0], color=BLUE, label="action +1, constrained")
     axis.plot(reference.times, motion(primitive, gains, -right)[:, 0], color=GREEN, label="action −1, constrained")
     axis.axhline(NarrowPassage().zone_x, color=RED, linestyle="--", linewidth=0.8, label="x ≤ 0.6 m")
@@ -124,7 +134,9 @@ def smoothness_picture(path: Path) -> None:
     filtered = np.zeros_like(actions)
     for n in range(1, steps):
         filtered[n] = filtered[n - 1] + weight * (actions[n] - filtered[n - 1])
-    filtered *= np.sqrt(np.mean((paths["KGRL"] - still) ** 2)) / np.sqrt(np.mean(((motion(kgrl, gains, filtered)) - still) ** 2))
+    filtered *= np.sqrt(np.mean((paths["KGRL"] - still) ** 2)) / np.sqrt(
+        np.mean(((motion(kgrl, gains, filtered)) - still) ** 2)
+    )
     paths = {"KGRL": paths["KGRL"], "KGRL, low-pass 0.5 Hz": motion(kgrl, gains, filtered), "sKGRL": paths["sKGRL"]}
     figure, axes = new_figure(1, 2, (7.2, 2.8))
     colours = dict(zip(paths, (BLUE, "#ff7f0e", GREEN), strict=True))
@@ -166,11 +178,11 @@ def safety_picture(path: Path) -> None:
 
 def projection_picture(path: Path) -> None:
     """Random inputs through a template, and the same without its active constraints."""
-    from pydrake.math import RigidTransform, RollPitchYaw
+    from pydrake.math import RigidTransform
 
     skill, period, steps = load_skill("pouring"), 0.05, 240
     frames = {"mug_tip": RigidTransform()}
-    start = RigidTransform(RollPitchYaw(0, 0, -np.pi), [0.0, -0.30, 0.15])
+    start = RigidTransform([0.0, -0.30, 0.15])
     figure, axes = new_figure(1, 2, (7.2, 2.9))
     for axis, template, title in (
         (axes[0, 0], skill, "with active constraints"),

@@ -47,7 +47,7 @@ def cell(text: Any) -> str:
 
 def code(text: Any) -> str:
     """Code, in a table too."""
-    return f"`{str(text)}`".replace("|", "\\|") if str(text) else ""
+    return f"`{text}`".replace("|", "\\|") if str(text) else ""
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -169,7 +169,9 @@ def _typed(hint: Any) -> str:
 
 def _bounds(metadata: Iterable[Any]) -> str:
     signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
-    return "".join(f" {sign} {getattr(one, name):g}" for one in metadata for name, sign in signs.items() if hasattr(one, name))
+    return "".join(
+        f" {sign} {getattr(one, name):g}" for one in metadata for name, sign in signs.items() if hasattr(one, name)
+    )
 
 
 # --- pages ---
@@ -208,7 +210,13 @@ def ports(system: type) -> list[tuple[str, str, str]]:
             words = inspect.getdoc(own) if own else more.rstrip(")")
             text, found = sections(words or "")
             is_name = name.isidentifier()
-            rows.append((kind, code(name) if is_name else cell(name), cell(text or " ".join(w for _, w in sum(found.values(), [])))))
+            rows.append(
+                (
+                    kind,
+                    code(name) if is_name else cell(name),
+                    cell(text or " ".join(words for rows_of in found.values() for _, words in rows_of)),
+                )
+            )
     return rows
 
 
@@ -219,8 +227,8 @@ def api() -> str:
     from guiderail.models import primitives
 
     page = (
-        "# Names to import\n\nWhat `guiderail`, `guiderail.models.primitives` and `guiderail.diagrams.guidance` export. "
-        "Systems have [a page of their own](systems.md).\n\n"
+        "# Names to import\n\nWhat `guiderail`, `guiderail.models.primitives` and `guiderail.diagrams.guidance` "
+        "export. Systems have [a page of their own](systems.md).\n\n"
     )
     seen: set[str] = set()
     for module in (guiderail, primitives, guidance):
@@ -271,8 +279,8 @@ def command() -> str:
         for command in app.registered_commands
     }
     page = (
-        "# The command\n\n`guiderail COMMAND --help` says the same. Where a program may read the result, `--json` prints "
-        "one object.\n\n"
+        "# The command\n\n`guiderail COMMAND --help` says the same. Where a program may read the result, "
+        "`--json` prints one object.\n\n"
     )
     for name, one in group.commands.items():
         page += f"## guiderail {name}\n\n{prose(inspect.cleandoc(one.help or ''))}\n\n"
@@ -292,7 +300,9 @@ def command() -> str:
             is_flag = getattr(parameter, "is_flag", False)
             if is_option and not is_flag:
                 shown += f" {parameter.metavar or kinds[parameter.name]}"
-            default = "" if is_flag or parameter.default in (None, "", inspect.Parameter.empty) else code(parameter.default)
+            default = (
+                "" if is_flag or parameter.default in (None, "", inspect.Parameter.empty) else code(parameter.default)
+            )
             rows.append((code(shown), cell(words), default))
         page += table(["", "what it is", "unless given"], rows)
     return page
@@ -314,8 +324,8 @@ def options() -> str:
 
     known = everything()
     page = (
-        "# Tasks, guidance and their options\n\n`make_env(task, …)`, `gymnasium.make`, and `--env key=value` take them; "
-        "`guiderail list --json` has the same.\n\n## Of every environment\n\n"
+        "# Tasks, guidance and their options\n\n`make_env(task, …)`, `gymnasium.make`, and `--env key=value` take "
+        "them; `guiderail list --json` has the same.\n\n## Of every environment\n\n"
     )
     page += _options(known["options"]["of every environment"])
     for whose in ("guidance made of demonstrations", "guidance made of a template"):
@@ -323,13 +333,18 @@ def options() -> str:
     for name, task in known["tasks"].items():
         page += f"## Task {name}\n\n{prose(task['is'])}\n\n"
         rows = [("environment", code(task["environment"]))]
-        rows += [(key, _listed(task[key])) for key in ("guidance", "stations", "rewards", "observations", "difficulties")]
+        rows += [
+            (key, _listed(task[key])) for key in ("guidance", "stations", "rewards", "observations", "difficulties")
+        ]
         rows += [("defaults", _listed([f"{k}={v}" for k, v in task["defaults"].items()]))]
         page += table(["", ""], rows) + _options(task["options"])
         page += "Options of `reset`:\n\n" + _options(task["reset_options"])
     page += "## Guidance\n\n" + table(
         ["name", "what it is", "needs"],
-        [(code(n), cell(g["is"]), cell(" or ".join(" and ".join(x) for x in g["needs"]))) for n, g in known["guidance"].items()],
+        [
+            (code(n), cell(g["is"]), cell(" or ".join(" and ".join(x) for x in g["needs"])))
+            for n, g in known["guidance"].items()
+        ],
     )
     page += "## Stations\n\n" + table(
         ["name", "what it is", "world"],
@@ -350,10 +365,13 @@ def _listed(values: Iterable[Any]) -> str:
 
 
 def _options(rows: list[Mapping[str, Any]]) -> str:
-    return table(
-        ["option", "what it is", "type and range", "unless given"],
-        [(code(r["name"]), cell(r["description"]), _range(r), _shown(r["default"])) for r in rows],
-    ) or "None.\n\n"
+    return (
+        table(
+            ["option", "what it is", "type and range", "unless given"],
+            [(code(r["name"]), cell(r["description"]), _range(r), _shown(r["default"])) for r in rows],
+        )
+        or "None.\n\n"
+    )
 
 
 def _shown(default: Any) -> str:
@@ -370,7 +388,7 @@ def _range(row: Mapping[str, Any]) -> str:
 SKILL_WORDS = {
     "name": "of the skill, in messages and pictures",
     "inputs": "how many numbers a person or a policy gives, 1 to 6, each in [−1, 1]",
-    "frames": "names of the objects that it is about; the task says where they are; `world` and `tool` are always there",
+    "frames": "names of the objects that it is about; a task says where they are; `world` and `tool` are always there",
     "parameters": "names with numbers that a task can replace; any number below may be arithmetic on them",
     "initial_state": "the first state unless given",
     "max_speed_m_per_s": "of what is commanded [m/s]",
@@ -403,8 +421,8 @@ def templates() -> str:
     page += table(["field", "what it is"], [(code(n), cell(w)) for n, w in SKILL_WORDS.items()])
     page += "## A state\n\n" + table(["field", "what it is"], [(code(n), cell(w)) for n, w in STATE_WORDS.items()])
     page += (
-        f"At most {loader.MOST_STATES} states, {loader.MOST_PARTS} entries in a list, and {loader.LARGEST_NUMBER:g} for "
-        "any number.\n\n"
+        f"At most {loader.MOST_STATES} states, {loader.MOST_PARTS} entries in a list, and {loader.LARGEST_NUMBER:g} "
+        "for any number.\n\n"
     )
     kinds = (
         ("Input mappings", "input_mapping", INPUT_MAPPINGS),
@@ -419,7 +437,14 @@ def templates() -> str:
             rows = []
             for one in dataclasses.fields(kind):
                 missing = one.default is dataclasses.MISSING
-                rows.append((code(one.name), cell(kinds_of.get(one.name, "")), cell(words.get(one.name, "")), "" if missing else code(one.default)))
+                rows.append(
+                    (
+                        code(one.name),
+                        cell(kinds_of.get(one.name, "")),
+                        cell(words.get(one.name, "")),
+                        "" if missing else code(one.default),
+                    )
+                )
             page += table(["field", "type", "what it is", "unless given"], rows)
     return page
 
@@ -430,8 +455,8 @@ def studies() -> str:
 
     page = (
         "# Study files\n\n`guiderail study FILE --out D` runs methods × seeds × marks × what is judged on. "
-        f"{', '.join(f'`{n}`' for n in declaration.shipped_studies())} come along. A field of two words is written with "
-        "a space: `judged on`. What is unknown is refused.\n\n"
+        f"{', '.join(f'`{n}`' for n in declaration.shipped_studies())} come along. A field of two words is written "
+        "with a space: `judged on`. What is unknown is refused.\n\n"
     )
     kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.JudgedOn, declaration.Ratio)
     for kind in (*kinds, declaration.Smoothness):
@@ -481,8 +506,8 @@ def files() -> str:
     page += (
         f"## Demonstrations\n\n{paragraphs(inspect.getdoc(Demonstrations.load) or '').split('Raises:')[0]}\n"
         f"{paragraphs(inspect.getdoc(Demonstrations.save) or '').split('Raises:')[0]}\n"
-        "An `.npz` that `save` writes has `times` and `outputs` with all samples one after the other, `lengths` with how "
-        f"many each demonstration has, and `names`. At most {limits.MOST_DEMONSTRATIONS} demonstrations, "
+        "An `.npz` that `save` writes has `times` and `outputs` with all samples one after the other, `lengths` with "
+        f"how many each demonstration has, and `names`. At most {limits.MOST_DEMONSTRATIONS} demonstrations, "
         f"{limits.MOST_NUMBERS:,} numbers and {limits.LARGEST_FILE:,} bytes.\n\n"
         "## Templates and studies\n\n[Template files](templates.md) and [study files](studies.md) are YAML.\n"
     )

@@ -46,5 +46,7 @@ def test_a_page_that_says_something_else_is_found(tmp_path):
 def test_prose_is_about_what_there_is():
     """Files that pages name in code are there."""
     for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "concepts").glob("*.md"), *PAGES]:
-        for name in re.findall(r"`((?:examples|models|diagrams|tests|systems|tools)/[\w./]+)`", page.read_text("utf-8")):
+        for name in re.findall(
+            r"`((?:examples|models|diagrams|tests|systems|tools)/[\w./]+)`", page.read_text("utf-8")
+        ):
             assert (ROOT / name).exists(), f"{page.name} names {name}"
