@@ -471,7 +471,7 @@ def studies() -> str:
 
 
 def _model_default(value: Any) -> str:
-    if isinstance(value, tuple) and value and hasattr(value[0], "model_fields"):
+    if isinstance(value, tuple) and value and hasattr(type(value[0]), "model_fields"):
         return f"[{type(value[0]).__name__}]"
     return f"{type(value).__name__}" if hasattr(type(value), "model_fields") else repr(value)
 
@@ -557,7 +557,20 @@ def errors() -> str:
     return page
 
 
+def examples() -> str:
+    """Every example, under the question that it answers."""
+    page = "# How do I …?\n\nEach answer is a file in `examples/`: at most 60 lines, and run by the tests as it stands.\n\n"
+    for path in sorted((Path(__file__).parents[1] / "examples").glob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        doc = ast.get_docstring(ast.parse(source)) or ""
+        question, _, answer = doc.partition("? ")
+        body = source.split('"""', 2)[2].strip()
+        page += f"## {question}?\n\n{prose(answer)}\n\n`examples/{path.name}`\n\n```python\n{body}\n```\n\n"
+    return page
+
+
 PAGES: dict[str, Callable[[], str]] = {
+    "examples": examples,
     "systems": systems,
     "names": api,
     "command": command,

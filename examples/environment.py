@@ -3,20 +3,21 @@
 import gymnasium
 import numpy as np
 
-env = gymnasium.make("guiderail.diagrams:guiderail/NarrowPassage-v0", guidance="kgrl", hold=10, reward="shaped")
+env = gymnasium.make("guiderail.diagrams:guiderail/GridClamp-v0", guidance="sct", hold=10, reward="shaped")
 print("observes", env.observation_space.shape, "acts", env.action_space.shape)
 rng = np.random.default_rng(0)
 observation, info = env.reset(seed=0)
 total, over = 0.0, False
-while not over:
+for _ in range(20):
     action = rng.uniform(-1, 1, env.action_space.shape)  # your learner's
     observation, reward, terminated, truncated, info = env.step(action)
     total += float(reward)
-    over = terminated or truncated
+    if terminated or truncated:
+        break
 
-print(f"ended as {info['termination']!r} with a return of {total:.1f}")
-for name in ("worst_commanded_violation", "worst_measured_violation", "peak_force", "collisions", "fallbacks"):
-    print(f"{name}: {info['ledger'][name]:.3f}")
+print(f"a return of {total:.2f} after {info['control_steps']} control steps, ended by {info['termination'] or 'us'}")
+print(f"worst violation, commanded: {info['constraint_violation']:.2g}, measured: {info['measured_violation']:.2g}")
+print(f"contact force now: {info['contact_force']:.1f} N")  # an episode's worst are in info["ledger"], at its end
 
 observation, info = env.reset(seed=1, options={"held_out": True})  # from where training never starts
 env.close()

@@ -12,7 +12,8 @@ guidance = diagram.GetSubsystemByName("guidance")
 mapping = guidance.GetSubsystemByName("input_mapping")
 print("in the guidance:", ", ".join(system.get_name() for system in guidance.GetSystems()))
 env.reset(seed=0)
-asked, commanded = [], []
+asked: list[float] = []
+commanded: list[float] = []
 
 
 def look(root_context):

@@ -1,7 +1,7 @@
 """How do I learn a motion in space? Poses become six outputs without jumps, in the frame of what is aimed at."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from pydrake.math import RollPitchYaw
 
 from guiderail import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives import pose_demonstrations, pose_rotation
@@ -14,10 +14,8 @@ for _ in range(4):  # what a robot recorded: p_WE and R_WE, each time from somew
     target = np.array([0.6, 0.1, 0.2])
     times.append(2.0 * s[:, 0])
     positions.append(start + (target - start) * s + 0.01 * rng.standard_normal(3) * np.sin(np.pi * s))
-    turn = Rotation.from_euler(
-        "ZYX", np.hstack([0.5 * s + 0.05 * rng.standard_normal() * (1 - s), 0 * s, np.pi + 0 * s])
-    )
-    quaternions.append(turn.as_quat(scalar_first=True))
+    yaw = 0.5 * s[:, 0] + 0.05 * rng.standard_normal() * (1 - s[:, 0])
+    quaternions.append(np.array([RollPitchYaw(np.pi, 0.0, angle).ToQuaternion().wxyz() for angle in yaw]))
 
 demonstrations = pose_demonstrations(times, positions, quaternions)  # relative to each one's own last pose
 print(", ".join(demonstrations.names))
