@@ -21,6 +21,7 @@ extensions = ["myst_parser"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
+smartquotes = False  # two dashes before an option stay two
 suppress_warnings = ["myst.header"]  # included sections begin at the second level
 
 html_theme = "furo"

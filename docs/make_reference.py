@@ -559,7 +559,7 @@ def errors() -> str:
 
 def examples() -> str:
     """Every example, under the question that it answers."""
-    page = "# How do I …?\n\nEach answer is a file in `examples/`: at most 60 lines, and run by the tests as it stands.\n\n"
+    page = "# How do I …?\n\nEach answer is a file in `examples/` that the tests run as it stands.\n\n"
     for path in sorted((Path(__file__).parents[1] / "examples").glob("*.py")):
         source = path.read_text(encoding="utf-8")
         doc = ast.get_docstring(ast.parse(source)) or ""
