@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench kills newest clean
+.PHONY: demo test lint bench docs kills newest clean
 
 demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
@@ -31,10 +31,20 @@ bench: $(VENV)/.ready
 	$(BIN)/guiderail bench primitive
 	$(BIN)/guiderail bench simulation
 
+# Nothing is fetched: pictures and the reference are made from the code, a warning and a broken link are errors.
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build
+	$(BIN)/python docs/check_links.py docs/_build
+	@echo docs/_build/index.html
+
+$(VENV)/.docs: $(VENV)/.ready
+	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	touch $@
+
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build dist docs/_build docs/pictures docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache

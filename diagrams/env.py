@@ -240,7 +240,14 @@ class GuidedEnv(DrakeGymEnv):
         return None
 
     def push(self, displacement) -> None:
-        """Moves the robot by `displacement` (O,), as a person would who pushes it between two control steps."""
+        """Moves the robot, as a person would who pushes it between two control steps.
+
+        Args:
+            displacement: (O,), in the units of a pose.
+
+        Raises:
+            InputError: if the task has no robot that can be pushed, or these are not O finite numbers.
+        """
         if self.task.push is None:
             raise InputError("this task has no robot that can be pushed")
         displacement = np.asarray(displacement, dtype=float)

@@ -9,6 +9,8 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram
 
+from guiderail.models.errors import InputError
+
 _GRID = 2.0**-40
 
 PORTS = (
@@ -33,9 +35,15 @@ def exact_period(seconds: float) -> float:
     fl(0.02 + k · 0.02) and fl(k · 0.02) often differ in the last bit: a plant would then step once more or once less
     between two control steps, or a history shift after the command it should have taken in. Take the plant's period
     from here and the control period as an integer multiple of it.
+
+    Args:
+        seconds: the period that is wanted, positive.
+
+    Raises:
+        InputError: if it is not positive and finite.
     """
     if not (np.isfinite(seconds) and seconds > _GRID):
-        raise ValueError(f"a period must be positive, not {seconds} s")
+        raise InputError(f"a period must be positive, not {seconds} s")
     return round(seconds / _GRID) * _GRID
 
 

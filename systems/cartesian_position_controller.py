@@ -31,7 +31,12 @@ from guiderail.systems.support.sampling import check_period
 
 @dataclass(frozen=True)
 class SpeedLimits:
-    """Greatest commanded speeds of the tool centre, [m/s] and [rad/s], positive."""
+    """Greatest commanded speeds of the tool centre.
+
+    Attributes:
+        translational: [m/s], positive.
+        rotational: [rad/s], positive.
+    """
 
     translational: float = 0.25
     rotational: float = 1.0

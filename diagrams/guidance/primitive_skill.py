@@ -118,7 +118,11 @@ class PrimitiveSkill:
         )
 
     def null_space_gains(self, primitive: LcNsKmp) -> np.ndarray:
-        """(O,): what an action of one is worth in raw null-space units."""
+        """(O,): what an action of one is worth in raw null-space units.
+
+        Raises:
+            InputError: if `gains` are not O finite numbers, or actions do nothing to this primitive.
+        """
         if self.gains is None:
             return authority_gains(primitive, self.kappa, outputs=np.array(self.explored_outputs))
         gains = np.array(self.gains, dtype=float)

@@ -110,6 +110,11 @@ def check_guidance(name: str, known: Collection[str], task: str = "this task") -
 def build_guidance(name: str, known: Known, task: str = "this task") -> Diagram:
     """The guidance of that name, made of what is known.
 
+    Args:
+        name: of the kind.
+        known: what it is made of.
+        task: of what, for a sentence.
+
     Raises:
         InputError: if there is no such kind, or something that it needs is missing.
     """

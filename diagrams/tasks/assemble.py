@@ -157,6 +157,12 @@ class Loop:
 def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None) -> TaskDiagram:
     """Wires a task: its loop, and reward, monitor and ledger beside it. The policy's `action` is an input.
 
+    Args:
+        task: the declaration.
+        station: where it is done.
+        guidance: a diagram with the ports of `Guidance`.
+        render_mode: None, "human" (a browser view) or "rgb_array".
+
     Raises:
         InputError: if a signal that the task names doesn't exist here, or a port has the wrong size.
     """

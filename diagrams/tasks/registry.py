@@ -18,7 +18,14 @@ TASKS: Registry[type[Task]] = Registry(
 
 
 def register_task(name: str) -> Callable[[AnyTask], AnyTask]:
-    """A decorator that adds a task; `name` may have a namespace of its own, as in "lab/Peg"."""
+    """A decorator that adds a task.
+
+    Args:
+        name: what it is called; it may have a namespace of its own, as in "lab/Peg".
+
+    Raises:
+        InputError: when it decorates, if another task has that name.
+    """
 
     def add(task: AnyTask) -> AnyTask:
         task.name = name

@@ -27,7 +27,12 @@ STANDARD = "standard"
 
 @dataclass(frozen=True)
 class Threshold:
-    """A signal that means a collision while it is above a limit."""
+    """A signal that means a collision while it is above a limit.
+
+    Attributes:
+        signal: its name.
+        above: the limit, in its unit.
+    """
 
     signal: str = "contact_force"
     above: float = 0.0
@@ -80,6 +85,11 @@ class Task(ABC):
     pushable: ClassVar[bool] = True
 
     def __init__(self, options: declared.Options, choice: Choice):
+        """
+        Args:
+            options: the task's own, checked.
+            choice: what every environment is made with.
+        """
         self.options = options
         self.choice = choice
 

@@ -43,6 +43,14 @@ class Prediction:
         v: np.ndarray | None = None,
         signed: np.ndarray | None = None,
     ):
+        """
+        Args:
+            output: (O,), what to execute.
+            factor: of the step.
+            x: the history and the null-space action that it was predicted from.
+            v: the correction, where some constraint had to be enforced.
+            signed: the solver's multipliers of the correction.
+        """
         self.output, self._factor, self._x, self._v, self._signed = output, factor, x, v, signed
 
     @property

@@ -61,7 +61,12 @@ def pose_outputs(
 
 
 def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "euler_zyx") -> Rotation:
-    """R_TE of the last three numbers of `pose_outputs`, (3,) or (N, 3)."""
+    """R_TE of the last three numbers of `pose_outputs`.
+
+    Args:
+        orientation_numbers: (3,) or (N, 3) [rad].
+        orientation: as in `pose_outputs`.
+    """
     if orientation == "euler_zyx":
         return Rotation.from_euler("ZYX", orientation_numbers)
     return Rotation.from_rotvec(orientation_numbers)

@@ -63,6 +63,15 @@ class Skill:
 
     States are numbered in the order of the file. `frames` are the names of the objects' frames; wherever a method
     takes `frames`, it is their poses X_WF by name.
+
+    Attributes:
+        name: of the skill.
+        inputs: how many numbers, each in [−1, 1], a person or a policy gives.
+        frames: the names of the objects' frames.
+        states: at least one, numbered from 0.
+        initial_state: its number.
+        max_speed_m_per_s, max_speed_rad_per_s: of what is commanded.
+        parameters: the numbers that the file's arithmetic was done with, by name.
     """
 
     name: str
@@ -75,7 +84,11 @@ class Skill:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
     def index(self, state: str) -> int:
-        """The number of the state called `state`."""
+        """The number of the state called `state`.
+
+        Raises:
+            InputError: if there is none.
+        """
         for number, candidate in enumerate(self.states):
             if candidate.name == state:
                 return number

@@ -34,16 +34,16 @@ Units = Annotated[
 class Preset:
     """How a learner learns. A decision is one action of the policy; it lasts `hold` control steps."""
 
-    algorithm: str = "tqc"
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-4
+    algorithm: str = "tqc"  # a learner's name
+    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-4  # of actor, critics and entropy
     discount: Factor = 0.995  # of one control step, so that it means the same whatever the hold, or of one decision
-    discount_of: Literal["control_step", "decision"] = "control_step"
-    soft_update: Factor = 0.02
+    discount_of: Literal["control_step", "decision"] = "control_step"  # what the discount is of
+    soft_update: Factor = 0.02  # how far the target critics follow at each gradient step
     train_every: Count = 8  # decisions between two trainings
     gradient_steps: Count = 24  # in one training
-    batch_size: Count = 64
+    batch_size: Count = 64  # decisions
     n_steps: Count = 1  # decisions after which a return is guessed, and until which it is known
-    buffer_size: Count = 1_000_000
+    buffer_size: Count = 1_000_000  # decisions that are remembered
     learning_starts: Count = 100  # decisions, uniformly random, before the first training
     entropy: Entropy = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     units: Units = (256, 256)  # of the hidden layers

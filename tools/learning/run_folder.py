@@ -30,13 +30,13 @@ LOCK = ".lock"
 class RunConfig:
     """Everything that decides how a run goes, resolved: the same file gives the same run."""
 
-    task: str
+    task: str  # its name
     environment: dict[str, Any]  # arguments of gymnasium.make
-    learner: Preset
+    learner: Preset  # every setting
     preset: str  # the learner's settings started from it
-    episodes: Annotated[int, Field(ge=1)]
-    seed: Annotated[int, Field(ge=0)]
-    versions: dict[str, str] = field(default_factory=dict)
+    episodes: Annotated[int, Field(ge=1)]  # how many in all
+    seed: Annotated[int, Field(ge=0)]  # of everything random
+    versions: dict[str, str] = field(default_factory=dict)  # that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
     ledger: bool = True  # whether every control step is written down
 

@@ -30,17 +30,17 @@ class _Strict(BaseModel):
 class LearnerChoice(_Strict):
     """How it is learned; what is left out is the task's own."""
 
-    algorithm: str | None = None
-    preset: str | None = None
-    settings: dict[str, Any] = {}
+    algorithm: str | None = None  # a learner's name
+    preset: str | None = None  # of the learner's settings
+    settings: dict[str, Any] = {}  # in place of the preset's
     episodes: int | None = Field(default=None, ge=1)  # of training; the last mark unless given
 
 
 class Method(_Strict):
     """Who acts, through what."""
 
-    env: dict[str, Any] = {}
-    learner: LearnerChoice = LearnerChoice()
+    env: dict[str, Any] = {}  # in place of the study's, or besides
+    learner: LearnerChoice = LearnerChoice()  # in place of the study's
     policy: str = LEARNED  # or a null policy, best_constant, rule, or a rule's name
     grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # of each number of an action, for best_constant
     seeds: tuple[int, ...] | None = None  # the study's unless given: what doesn't depend on them needs one
@@ -49,39 +49,39 @@ class Method(_Strict):
 class JudgedOn(_Strict):
     """Held-out episodes that a policy is judged on."""
 
-    name: str = "held out"
+    name: str = "held out"  # in the table
     env: dict[str, Any] = {}  # other arguments than where it learned
     sampled: dict[str, tuple[float, float]] = {}  # arguments that are uniform in a range, anew every few episodes
     every: int = Field(default=4, ge=1)
     options: dict[str, Any] = {}  # of each reset
-    episodes: int = Field(default=100, ge=1)
-    first_seed: int = Field(default=HELD_OUT_SEED, ge=0)
+    episodes: int = Field(default=100, ge=1)  # how many
+    first_seed: int = Field(default=HELD_OUT_SEED, ge=0)  # of the first episode; each has the next
     file: str = "{name}-{mark}-{digest}.csv"  # in the run's folder: what was evaluated already
 
 
 class Ratio(_Strict):
     """A column of one method as a part of another's."""
 
-    of: str
-    method: str
-    against: str
+    of: str  # the column
+    method: str  # whose part is stated
+    against: str  # of whose
 
 
 class Study(_Strict):
     """Methods × seeds × marks × what is judged on."""
 
-    name: FolderName
-    task: str
-    env: dict[str, Any] = {}
-    learner: LearnerChoice = LearnerChoice()
-    methods: dict[FolderName, Method] = Field(min_length=1)
-    seeds: tuple[int, ...] = Field(min_length=1)
+    name: FolderName  # of the tables
+    task: str  # of every method
+    env: dict[str, Any] = {}  # options of the environment, of every method
+    learner: LearnerChoice = LearnerChoice()  # of every method that learns
+    methods: dict[FolderName, Method] = Field(min_length=1)  # by name, of a folder and a legend
+    seeds: tuple[int, ...] = Field(min_length=1)  # of training
     marks: tuple[
         Annotated[int, Field(ge=1)], ...
     ] = ()  # training episodes after which a policy is judged; all of them unless given
-    judged_on: tuple[JudgedOn, ...] = (JudgedOn(),)
+    judged_on: tuple[JudgedOn, ...] = (JudgedOn(),)  # each of them, after every mark
     statistics: tuple[str, ...] = ()  # of training, besides the usual ones
-    ratios: tuple[Ratio, ...] = ()
+    ratios: tuple[Ratio, ...] = ()  # what is said beside the table
     folder: str = "{method}-{seed}"  # of a run
     imports: tuple[str, ...] = ()  # modules or files (.py) that register what is not installed
 
@@ -110,12 +110,12 @@ class Study(_Strict):
 class Smoothness(_Strict):
     """The benchmark of smoothness, which is a program of its own."""
 
-    program: Literal["smoothness"]
-    name: FolderName
-    episodes: int = Field(default=4, ge=1)
-    kappa: float = Field(default=1.0, gt=0.0)
-    outputs: Literal["all", "xy"] = "all"
-    seed: int = Field(default=0, ge=0)
+    program: Literal["smoothness"]  # what makes it this kind of study
+    name: FolderName  # of the tables
+    episodes: int = Field(default=4, ge=1)  # of each way to explore
+    kappa: float = Field(default=1.0, gt=0.0)  # κ of all of them
+    outputs: Literal["all", "xy"] = "all"  # which of them are explored
+    seed: int = Field(default=0, ge=0)  # of the actions
 
 
 def shipped_studies() -> list[str]:

@@ -1,0 +1,45 @@
+"""Checks every link of the built pages that leads to another page or file, and to a place on it."""
+
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+
+class _Page(HTMLParser):
+    def __init__(self, text: str):
+        super().__init__()
+        self.links: list[str] = []
+        self.places: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Collects what it leads to, and what leads to it."""
+        for name, value in attrs:
+            if name in ("href", "src") and value:
+                self.links.append(value)
+            elif name in ("id", "name") and value:
+                self.places.add(value)
+
+
+def broken(folder: Path) -> list[str]:
+    """One sentence for each link that leads nowhere, or fetches from elsewhere."""
+    pages = {path.resolve(): _Page(path.read_text(encoding="utf-8")) for path in folder.rglob("*.html")}
+    found = []
+    for path, page in pages.items():
+        for link in page.links:
+            parts = urlsplit(link)
+            if parts.scheme or parts.netloc:
+                continue
+            target = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if not target.is_file():
+                found.append(f"{path.relative_to(folder.resolve())}: {link} leads nowhere")
+            elif parts.fragment and target in pages and unquote(parts.fragment) not in pages[target].places:
+                found.append(f"{path.relative_to(folder.resolve())}: there is no place {link}")
+    return found
+
+
+if __name__ == "__main__":
+    sentences = broken(Path(sys.argv[1]))
+    print("\n".join(sentences), end="\n" if sentences else "")
+    sys.exit(bool(sentences))

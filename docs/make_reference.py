@@ -1,0 +1,583 @@
+"""Writes the reference from the code: it has nothing to say that the code doesn't."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import re
+import textwrap
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic_core import PydanticUndefined
+
+SECTION = re.compile(r"^(Args|Attributes|Raises|Returns|Yields):\s*(.*)$")
+ENTRY = re.compile(r"^(\*{0,2}[\w, /*]+):\s+(.*)$")
+DIAGRAM = re.compile(r"\.\. pydrake_system::\n\n(?:    .*\n?|\n)+")
+WORDS = {"Args": "Argument", "Attributes": "Attribute", "Raises": "Raises"}
+
+
+def make(folder: Path) -> None:
+    """Writes a page each; what did not change is left alone, so that a page is not built anew for nothing."""
+    folder.mkdir(exist_ok=True)
+    for name, page in PAGES.items():
+        text = page()
+        path = folder / f"{name}.md"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+# --- Markdown ---
+
+
+def prose(text: str) -> str:
+    """A docstring's text as Markdown: double backticks are code in both, asterisks and angles are meant as they are."""
+    parts = re.split(r"(``.*?``|`[^`]*`)", text)
+    return "".join(part if part.startswith("`") else re.sub(r"([*<$])", r"\\\1", part) for part in parts)
+
+
+def cell(text: Any) -> str:
+    """What a table's cell can hold."""
+    return " ".join(prose(str(text)).split()).replace("|", "\\|")
+
+
+def code(text: Any) -> str:
+    """Code, in a table too."""
+    return f"`{text}`".replace("|", "\\|") if str(text) else ""
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; nothing where there are no rows."""
+    rows = list(rows)
+    if not rows:
+        return ""
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n\n"
+
+
+# --- docstrings ---
+
+
+def sections(doc: str) -> tuple[str, dict[str, list[tuple[str, str]]]]:
+    """A docstring's text, and its sections as names with words."""
+    text: list[str] = []
+    found: dict[str, list[tuple[str, str]]] = {}
+    current = None
+    for line in inspect.cleandoc(doc).splitlines():
+        head = SECTION.match(line)
+        if head:
+            current = found.setdefault(head[1], [])
+        elif current is not None and (line.startswith("    ") or not line.strip()):
+            if not line.strip():
+                continue
+            entry = ENTRY.match(line[4:])
+            if entry and not line.startswith("     "):
+                current.append((entry[1], entry[2]))
+            elif current:
+                current[-1] = (current[-1][0], f"{current[-1][1]} {line.strip()}")
+            else:
+                current.append(("", line.strip()))
+        else:
+            current = None
+            text.append(line)
+    return "\n".join(text).strip(), found
+
+
+def documented(thing: Any) -> str:
+    """A docstring as Markdown: its text, and a table for each of its sections."""
+    text, found = sections(DIAGRAM.sub("", (inspect.getdoc(thing) or "") + "\n"))
+    page = paragraphs(text) + "\n\n"
+    for name, rows in found.items():
+        if name in WORDS:
+            page += table([WORDS[name], "meaning"], [(code(n), cell(words)) for n, words in rows])
+        else:
+            page += f"{name}: " + " ".join(cell(f"{n}: {words}" if n else words) for n, words in rows) + "\n\n"
+    return page
+
+
+def paragraphs(text: str) -> str:
+    """Text as Markdown; indented lines are a law or code."""
+    lines = []
+    for line in text.splitlines():
+        lines.append(line if line.startswith("    ") else prose(line))
+    return "\n".join(lines)
+
+
+def signature(name: str, thing: Callable[..., Any]) -> str:
+    """What it is called with."""
+    try:
+        parameters = inspect.signature(thing).parameters.values()
+    except (ValueError, TypeError):
+        return ""
+    words = []
+    for one in parameters:
+        if one.name == "self":
+            continue
+        stars = {one.VAR_POSITIONAL: "*", one.VAR_KEYWORD: "**"}.get(one.kind, "")
+        default = "" if one.default is one.empty else f"={_default(one.default)}"
+        if one.kind is one.KEYWORD_ONLY and "*" not in words and not any(word.startswith("*") for word in words):
+            words.append("*")
+        words.append(f"{stars}{one.name}{default}")
+    line = f"{name}({', '.join(words)})"
+    if len(line) > 88:
+        line = f"{name}(\n" + "".join(f"    {word},\n" for word in words) + ")"
+    return f"```python\n{line}\n```\n\n"
+
+
+def _default(value: Any) -> str:
+    text = repr(value)
+    return "..." if " at 0x" in text or text.startswith("<") else text
+
+
+def field_words(kind: type) -> dict[str, str]:
+    """What the comment behind each field of a class says."""
+    lines = textwrap.dedent(inspect.getsource(kind)).splitlines()
+    words = {}
+    for node in ast.parse("\n".join(lines)).body[0].body:  # type: ignore[attr-defined]
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            comment = re.search(r"#\s(.*)$", lines[(node.end_lineno or node.lineno) - 1])
+            words[node.target.id] = comment[1] if comment else ""
+    return words
+
+
+def field_types(kind: type) -> dict[str, str]:
+    """The type of each field and its range, in words."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    bounds = {n: _bounds(f.metadata) for n, f in getattr(kind, "model_fields", {}).items()}
+    return {name: f"{_typed(hint)}{bounds.get(name, '')}" for name, hint in hints.items()}
+
+
+def _typed(hint: Any) -> str:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        metadata = [m for one in arguments[1:] for m in getattr(one, "metadata", [one])]
+        return _typed(arguments[0]) + _bounds(metadata)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join("nothing" if one is type(None) else _typed(one) for one in arguments)
+    if origin is typing.Literal:
+        return " or ".join(map(repr, arguments))
+    if origin is tuple:
+        return f"list of {_typed(arguments[0])}"
+    if origin is dict:
+        return f"mapping to {_typed(arguments[1])}"
+    return {typing.Any: "anything"}.get(hint) or getattr(hint, "__name__", str(hint))
+
+
+def _bounds(metadata: Iterable[Any]) -> str:
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    return "".join(
+        f" {sign} {getattr(one, name):g}" for one in metadata for name, sign in signs.items() if hasattr(one, name)
+    )
+
+
+# --- pages ---
+
+
+def systems() -> str:
+    """Every LeafSystem with its ports."""
+    from pydrake.systems.framework import LeafSystem
+
+    from guiderail import systems as module
+
+    page = (
+        "# Systems\n\nEvery law is a Drake `LeafSystem` with named ports: `from guiderail.systems import …`. "
+        "A port `x` has the getter `get_x_input_port()` or `get_x_output_port()`; ports whose names the constructor is "
+        "given have one getter, by name.\n\n"
+    )
+    for name in sorted(module.__all__):
+        system = getattr(module, name)
+        if not (inspect.isclass(system) and issubclass(system, LeafSystem)):
+            continue
+        page += f"## {name}\n\n{documented(system)}{table(['', 'port', 'what it is'], ports(system))}"
+        page += signature(name, system) + documented(system.__init__)
+    return page
+
+
+def ports(system: type) -> list[tuple[str, str, str]]:
+    """Kind, name and words of each port, as the docstring lists them."""
+    block = DIAGRAM.search((inspect.getdoc(system) or "") + "\n")
+    rows = []
+    for kind in ("input", "output"):
+        lines = re.search(rf"{kind}_ports:\n((?: *- .*\n)+)", block[0] if block else "")
+        for line in re.findall(r"- (.*)", lines[1]) if lines else []:
+            name, _, more = line.partition(" (")
+            getter = getattr(system, f"get_{name}_{kind}_port", None) or getattr(system, f"get_{kind}_port", None)
+            own = getter if getter is not None and getter.__qualname__.startswith(system.__name__) else None
+            words = inspect.getdoc(own) if own else more.rstrip(")")
+            text, found = sections(words or "")
+            is_name = name.isidentifier()
+            rows.append(
+                (
+                    kind,
+                    code(name) if is_name else cell(name),
+                    cell(text or " ".join(words for rows_of in found.values() for _, words in rows_of)),
+                )
+            )
+    return rows
+
+
+def api() -> str:
+    """The names that people import."""
+    import guiderail
+    from guiderail.diagrams import guidance
+    from guiderail.models import primitives
+
+    page = (
+        "# Names to import\n\nWhat `guiderail`, `guiderail.models.primitives` and `guiderail.diagrams.guidance` "
+        "export. Systems have [a page of their own](systems.md).\n\n"
+    )
+    seen: set[str] = set()
+    for module in (guiderail, primitives, guidance):
+        page += f"## {module.__name__}\n\n"
+        for name in sorted(module.__all__, key=str.lower):
+            thing = getattr(module, name)
+            if name.startswith("__") or name in seen or not callable(thing):
+                continue
+            seen.add(name)
+            page += f"### {name}\n\n" + exported(name, thing)
+    return page
+
+
+def exported(name: str, thing: Any) -> str:
+    """A class with its public methods, or a function."""
+    page = documented(thing)
+    if not inspect.isclass(thing):
+        return signature(name, thing) + page
+    own = "__init__" in vars(thing) and not dataclasses.is_dataclass(thing)
+    if own or dataclasses.is_dataclass(thing):
+        page = signature(name, thing) + page
+    if own and inspect.getdoc(thing.__init__):
+        page += documented(thing.__init__)
+    rows = []
+    for method, value in vars(thing).items():
+        function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
+        if method.startswith("_") or not (inspect.isfunction(function) or isinstance(function, property)):
+            continue
+        text, _ = sections(inspect.getdoc(function) or "")
+        call = method if isinstance(function, property) else f"{method}({_arguments(function)})"
+        rows.append((code(call), cell(text.split("\n\n")[0])))
+    return page + table(["has", "what it is"], rows)
+
+
+def _arguments(function: Callable[..., Any]) -> str:
+    return ", ".join(name for name in inspect.signature(function).parameters if name not in ("self", "cls"))
+
+
+def command() -> str:
+    """The command with all its options."""
+    import typer
+
+    from guiderail.tools.command import CHOICES, app
+
+    group: Any = typer.main.get_command(app)
+    functions = {
+        command.name or command.callback.__name__.replace("_", "-"): command.callback  # type: ignore[union-attr]
+        for command in app.registered_commands
+    }
+    page = (
+        "# The command\n\n`guiderail COMMAND --help` says the same. Where a program may read the result, "
+        "`--json` prints one object.\n\n"
+    )
+    for name, one in group.commands.items():
+        page += f"## guiderail {name}\n\n{prose(inspect.cleandoc(one.help or ''))}\n\n"
+        page += f"```sh\n{(one.epilog or '').removeprefix('Example: ')}\n```\n\n"
+        kinds = _kinds(functions[name])
+        rows = []
+        for parameter in one.params:
+            if parameter.name == "help":
+                continue
+            words = parameter.help or ""
+            for choice, names in CHOICES.items():
+                if f"{{{choice}}}" in words:
+                    words = words.replace(f"{{{choice}}}", ", ".join(names()))
+            given = parameter.opts + parameter.secondary_opts
+            is_option = given[0].startswith("-")
+            shown = ", ".join(given) if is_option else parameter.metavar or parameter.name.upper()
+            is_flag = getattr(parameter, "is_flag", False)
+            if is_option and not is_flag:
+                shown += f" {parameter.metavar or kinds[parameter.name]}"
+            default = (
+                "" if is_flag or parameter.default in (None, "", inspect.Parameter.empty) else code(parameter.default)
+            )
+            rows.append((code(shown), cell(words), default))
+        page += table(["", "what it is", "unless given"], rows)
+    return page
+
+
+def _kinds(function: Any) -> dict[str, str]:
+    """What kind of value each parameter of a command is."""
+    words = {str: "TEXT", int: "NUMBER", float: "NUMBER", Path: "PATH"}
+    found = {}
+    for name, annotation in typing.get_type_hints(function).items():
+        kinds = [one for one in typing.get_args(annotation) or (annotation,) if one is not type(None)]
+        found[name] = words.get(kinds[0], "TEXT") if kinds else ""
+    return found
+
+
+def options() -> str:
+    """Tasks, guidance, stations, robots and learners, and what each of them takes."""
+    from guiderail.tools.listing import everything
+
+    known = everything()
+    page = (
+        "# Tasks, guidance and their options\n\n`make_env(task, …)`, `gymnasium.make`, and `--env key=value` take "
+        "them; `guiderail list --json` has the same.\n\n## Of every environment\n\n"
+    )
+    page += _options(known["options"]["of every environment"])
+    for whose in ("guidance made of demonstrations", "guidance made of a template"):
+        page += f"## Of {whose}\n\n" + _options(known["options"][f"of {whose}"])
+    for name, task in known["tasks"].items():
+        page += f"## Task {name}\n\n{prose(task['is'])}\n\n"
+        rows = [("environment", code(task["environment"]))]
+        rows += [
+            (key, _listed(task[key])) for key in ("guidance", "stations", "rewards", "observations", "difficulties")
+        ]
+        rows += [("defaults", _listed([f"{k}={v}" for k, v in task["defaults"].items()]))]
+        page += table(["", ""], rows) + _options(task["options"])
+        page += "Options of `reset`:\n\n" + _options(task["reset_options"])
+    page += "## Guidance\n\n" + table(
+        ["name", "what it is", "needs"],
+        [
+            (code(n), cell(g["is"]), cell(" or ".join(" and ".join(x) for x in g["needs"])))
+            for n, g in known["guidance"].items()
+        ],
+    )
+    page += "## Stations\n\n" + table(
+        ["name", "what it is", "world"],
+        [(code(n), cell(s["is"]), cell(s["world"])) for n, s in known["stations"].items()],
+    )
+    for name, station in known["stations"].items():
+        if station["options"]:
+            page += f"### Station {name}\n\n" + _options(station["options"])
+    page += "## Robots and end effectors\n\n" + table(
+        ["name", "what it is"],
+        [(code(n), cell(r["is"])) for part in ("robots", "end_effectors") for n, r in known[part].items()],
+    )
+    return page + "## Learners\n\n" + _listed(known["learners"]) + "\n"
+
+
+def _listed(values: Iterable[Any]) -> str:
+    return ", ".join(code(value) for value in values)
+
+
+def _options(rows: list[Mapping[str, Any]]) -> str:
+    return (
+        table(
+            ["option", "what it is", "type and range", "unless given"],
+            [(code(r["name"]), cell(r["description"]), _range(r), _shown(r["default"])) for r in rows],
+        )
+        or "None.\n\n"
+    )
+
+
+def _shown(default: Any) -> str:
+    return "" if default in (None, "") or default is PydanticUndefined else code(default)
+
+
+def _range(row: Mapping[str, Any]) -> str:
+    signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+    bounds = [f"{sign} {row[key]:g}" for key, sign in signs.items() if key in row]
+    among = [_listed(row["choices"])] if row.get("choices") else [cell(row["type"])]
+    return ", ".join(among + bounds)
+
+
+SKILL_WORDS = {
+    "name": "of the skill, in messages and pictures",
+    "inputs": "how many numbers a person or a policy gives, 1 to 6, each in [−1, 1]",
+    "frames": "names of the objects that it is about; a task says where they are; `world` and `tool` are always there",
+    "parameters": "names with numbers that a task can replace; any number below may be arithmetic on them",
+    "initial_state": "the first state unless given",
+    "max_speed_m_per_s": "of what is commanded [m/s]",
+    "max_speed_rad_per_s": "of what is commanded [rad/s]",
+    "states": "by name: see below",
+}
+STATE_WORDS = {
+    "input_mapping": "a list: what the inputs move; what several of them say is added",
+    "active_constraints": "a list: what the requested pose is projected on, one after the other",
+    "transition_distance": "how far it is to the end of this state, in metres or degrees, which `…` stands for",
+    "starts_at_…": "the distance at which the state's progress is 0",
+    "ends_at_…": "the distance at which it is over; unless given the first transition's",
+    "weight_per_…": "how much of the reward's progress a metre or a degree is worth; 1 unless given",
+    "transitions": "a list of `to`, `below_…` and, where there is a way back, `hysteresis_…`",
+}
+
+
+def templates() -> str:
+    """The YAML of shared control templates."""
+    from guiderail.models.skills import loader
+    from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+
+    if set(SKILL_WORDS) != loader.SKILL_FIELDS:
+        raise ValueError(f"a skill's fields changed: {set(SKILL_WORDS) ^ loader.SKILL_FIELDS} have no words here")
+    page = (
+        "# Template files\n\nA shared control template is a YAML file; `load_skill(path)` reads it and "
+        "`guiderail check FILE` says what is wrong with it, in a sentence. "
+        "[Write a template](../tutorials/write_a_template.md) makes one.\n\n"
+    )
+    page += table(["field", "what it is"], [(code(n), cell(w)) for n, w in SKILL_WORDS.items()])
+    page += "## A state\n\n" + table(["field", "what it is"], [(code(n), cell(w)) for n, w in STATE_WORDS.items()])
+    page += (
+        f"At most {loader.MOST_STATES} states, {loader.MOST_PARTS} entries in a list, and {loader.LARGEST_NUMBER:g} "
+        "for any number.\n\n"
+    )
+    kinds = (
+        ("Input mappings", "input_mapping", INPUT_MAPPINGS),
+        ("Active constraints", "active_constraints", ACTIVE_CONSTRAINTS),
+        ("Transition distances", "transition_distance", TRANSITION_DISTANCES),
+    )
+    for title, where, registry in kinds:
+        page += f"## {title}\n\nEach entry of `{where}` has `kind` and the fields of that kind.\n\n"
+        for name, kind in registry.items():
+            page += f"### {name}\n\n{paragraphs(inspect.getdoc(kind) or '')}\n\n"
+            words, kinds_of = field_words(kind), field_types(kind)
+            rows = []
+            for one in dataclasses.fields(kind):
+                missing = one.default is dataclasses.MISSING
+                rows.append(
+                    (
+                        code(one.name),
+                        cell(kinds_of.get(one.name, "")),
+                        cell(words.get(one.name, "")),
+                        "" if missing else code(one.default),
+                    )
+                )
+            page += table(["field", "type", "what it is", "unless given"], rows)
+    return page
+
+
+def studies() -> str:
+    """The YAML of studies."""
+    from guiderail.tools.studies import declaration
+
+    page = (
+        "# Study files\n\n`guiderail study FILE --out D` runs methods × seeds × marks × what is judged on. "
+        f"{', '.join(f'`{n}`' for n in declaration.shipped_studies())} come along. A field of two words is written "
+        "with a space: `judged on`. What is unknown is refused.\n\n"
+    )
+    kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.JudgedOn, declaration.Ratio)
+    for kind in (*kinds, declaration.Smoothness):
+        words, kinds_of = field_words(kind), field_types(kind)
+        page += f"## {kind.__name__}\n\n{prose(inspect.getdoc(kind) or '')}\n\n"
+        rows = []
+        for name, field in kind.model_fields.items():
+            default = "" if field.is_required() else code(_model_default(field.default))
+            rows.append((code(field.alias or name), cell(kinds_of[name]), cell(words[name]), default))
+        page += table(["field", "type", "what it is", "unless given"], rows)
+    return page
+
+
+def _model_default(value: Any) -> str:
+    if isinstance(value, tuple) and value and hasattr(type(value[0]), "model_fields"):
+        return f"[{type(value[0]).__name__}]"
+    return f"{type(value).__name__}" if hasattr(type(value), "model_fields") else repr(value)
+
+
+def files() -> str:
+    """What files there are, and what is in them."""
+    from guiderail.models.primitives import demonstration_files as limits
+    from guiderail.models.primitives.demonstrations import Demonstrations
+    from guiderail.tools.learning.presets import PRESETS, Preset
+    from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+    from guiderail.tools.rollouts.ledger import MEANINGS
+    from guiderail.tools.rollouts.metrics import COLUMNS
+
+    page = (
+        f"# Files\n\n## A run\n\n{prose(inspect.getdoc(RunFolder) or '')}\n\n"
+        "| file | what is in it |\n|---|---|\n"
+        "| `config.yaml` | everything resolved: the fields below |\n"
+        "| `episodes.csv` | one row an episode: see below |\n"
+        "| `ledger/*.parquet` | one row a control step: see below |\n"
+        "| `checkpoint/` | what `--resume` goes on from |\n"
+        "| `policy.safetensors`, `policy.json` | the policy's weights, and its shape; loading them runs no code |\n"
+        "| `learning_curve.png`, `replay.html` | to look at |\n\n"
+    )
+    page += "### config.yaml\n\n" + _fields(RunConfig)
+    page += f"### learner, in config.yaml\n\n{prose(inspect.getdoc(Preset) or '')} "
+    page += f"Presets are {', '.join(code(name) for name in PRESETS)}; `--set name=value` changes one setting.\n\n"
+    page += _fields(Preset)
+    page += "### episodes.csv\n\nAnd `reward_…`, the sum of each of the reward's terms.\n\n"
+    page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.words)) for m in COLUMNS])
+    page += "### ledger\n\n`…_i` stands for a column for every number of a pose or a wrench.\n\n"
+    page += table(["column", "unit", "meaning"], [(code(n), cell(u), cell(w)) for n, (u, w) in MEANINGS.items()])
+    page += (
+        f"## Demonstrations\n\n{paragraphs(inspect.getdoc(Demonstrations.load) or '').split('Raises:')[0]}\n"
+        f"{paragraphs(inspect.getdoc(Demonstrations.save) or '').split('Raises:')[0]}\n"
+        "An `.npz` that `save` writes has `times` and `outputs` with all samples one after the other, `lengths` with "
+        f"how many each demonstration has, and `names`. At most {limits.MOST_DEMONSTRATIONS} demonstrations, "
+        f"{limits.MOST_NUMBERS:,} numbers and {limits.LARGEST_FILE:,} bytes.\n\n"
+        "## Templates and studies\n\n[Template files](templates.md) and [study files](studies.md) are YAML.\n"
+    )
+    return page
+
+
+def _fields(kind: type) -> str:
+    words, kinds_of = field_words(kind), field_types(kind)
+    rows = []
+    for one in dataclasses.fields(kind):
+        default = "" if one.default is dataclasses.MISSING else code(one.default)
+        rows.append((code(one.name), cell(kinds_of[one.name]), cell(words[one.name]), default))
+    return table(["field", "type", "what it is", "unless given"], rows)
+
+
+def metrics() -> str:
+    """What each number means."""
+    from guiderail.tools.rollouts.metrics import COLUMNS, STATISTICS
+
+    heads = ["name", "unit", "meaning"]
+    page = (
+        "# Numbers\n\nEach is defined once, in `guiderail.tools.rollouts.metrics`, and comes from the trace and the "
+        "safety ledger. `guiderail list metrics` prints them.\n\n## Of an episode\n\n"
+    )
+    page += table(heads, [(code(m.name), cell(m.unit), cell(m.words)) for m in COLUMNS])
+    page += "## Of many episodes\n\nOf training, a study's table has them with `training_` before the name.\n\n"
+    return page + table(heads, [(code(m.name), cell(m.unit), cell(m.words)) for m in STATISTICS.values()])
+
+
+def errors() -> str:
+    """What is raised, and what the command ends with."""
+    from guiderail.models.errors import InputError, RunsFailedError
+    from guiderail.models.primitives import UnsolvableError
+    from guiderail.systems import PolicyError
+
+    page = (
+        "# Errors\n\n| the command ends with | when |\n|---|---|\n"
+        "| 0 | it did what was asked |\n"
+        "| 1 | runs of a study failed, a stress test found something wrong, or commands to a robot stopped coming |\n"
+        "| 2 | something given is wrong: one sentence, before anything moves or is written |\n"
+        "| 130 | it was stopped by Ctrl-C; what can go on says how |\n\n"
+        "In Python these are raised, and nothing else is meant to be caught:\n\n"
+    )
+    for error in (InputError, UnsolvableError, PolicyError, RunsFailedError):
+        bases = ", ".join(base.__name__ for base in error.__bases__)
+        page += f"## {error.__name__}\n\nA `{bases}`, from `{error.__module__}`. {documented(error)}"
+    return page
+
+
+def examples() -> str:
+    """Every example, under the question that it answers."""
+    page = "# How do I …?\n\nEach answer is a file in `examples/` that the tests run as it stands.\n\n"
+    for path in sorted((Path(__file__).parents[1] / "examples").glob("*.py")):
+        source = path.read_text(encoding="utf-8")
+        doc = ast.get_docstring(ast.parse(source)) or ""
+        question, _, answer = doc.partition("? ")
+        body = source.split('"""', 2)[2].strip()
+        page += f"## {question}?\n\n{prose(answer)}\n\n`examples/{path.name}`\n\n```python\n{body}\n```\n\n"
+    return page
+
+
+PAGES: dict[str, Callable[[], str]] = {
+    "examples": examples,
+    "systems": systems,
+    "names": api,
+    "command": command,
+    "options": options,
+    "templates": templates,
+    "studies": studies,
+    "files": files,
+    "metrics": metrics,
+    "errors": errors,
+}

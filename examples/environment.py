@@ -1,0 +1,23 @@
+"""How do I use it with my own learner? As a Gymnasium environment; what was safe about it is in `info`."""
+
+import gymnasium
+import numpy as np
+
+env = gymnasium.make("guiderail.diagrams:guiderail/GridClamp-v0", guidance="sct", hold=10, reward="shaped")
+print("observes", env.observation_space.shape, "acts", env.action_space.shape)
+rng = np.random.default_rng(0)
+observation, info = env.reset(seed=0)
+total, over = 0.0, False
+for _ in range(20):
+    action = rng.uniform(-1, 1, env.action_space.shape)  # your learner's
+    observation, reward, terminated, truncated, info = env.step(action)
+    total += float(reward)
+    if terminated or truncated:
+        break
+
+print(f"a return of {total:.2f} after {info['control_steps']} control steps, ended by {info['termination'] or 'us'}")
+print(f"worst violation, commanded: {info['constraint_violation']:.2g}, measured: {info['measured_violation']:.2g}")
+print(f"contact force now: {info['contact_force']:.1f} N")  # an episode's worst are in info["ledger"], at its end
+
+observation, info = env.reset(seed=1, options={"held_out": True})  # from where training never starts
+env.close()

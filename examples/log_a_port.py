@@ -1,0 +1,31 @@
+"""How do I log a signal from inside? Any port of an environment's diagram can be looked at, at any time."""
+
+import numpy as np
+
+from guiderail import make_env
+
+env = make_env("GridClamp", guidance="sct", hold=5)
+diagram, simulator = env.task.diagram, env.simulator
+print("systems:", ", ".join(system.get_name() for system in diagram.GetSystems()))
+
+guidance = diagram.GetSubsystemByName("guidance")
+mapping = guidance.GetSubsystemByName("input_mapping")
+print("in the guidance:", ", ".join(system.get_name() for system in guidance.GetSystems()))
+env.reset(seed=0)
+asked: list[float] = []
+commanded: list[float] = []
+
+
+def look(root_context):
+    """Called after every step; it only reads."""
+    asked.append(mapping.get_requested_pose_output_port().Eval(mapping.GetMyContextFromRoot(root_context))[0])
+    commanded.append(guidance.get_desired_pose_output_port().Eval(guidance.GetMyContextFromRoot(root_context))[0])
+
+
+simulator.set_monitor(look)
+for _ in range(10):
+    env.step(np.array([1.0, 0.0, 0.0]))  # to the side, where the template's cuboid ends
+simulator.clear_monitor()
+print(
+    f"{len(asked)} looks, to the side: {1000 * max(asked):.1f} mm asked for, {1000 * max(commanded):.1f} mm commanded"
+)

@@ -1,0 +1,30 @@
+"""How do I change the reward of a task? By deriving from it; terms name signals, and each has a column of its own."""
+
+import numpy as np
+
+import guiderail as gr
+from guiderail.diagrams.tasks.grid_clamp import GridClamp
+
+
+@gr.register_task("examples/Hurry")
+class Hurry(GridClamp):
+    """The grid clamp, where time costs, and so does a command that jumps."""
+
+    def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
+        def jump(desired_pose: np.ndarray, last_desired_pose: np.ndarray) -> float:
+            return -10.0 * float(np.linalg.norm(desired_pose - last_desired_pose))
+
+        return [
+            *super().reward_terms(num_actions),
+            gr.RewardTerm("time_cost", {}, lambda: -0.01),
+            gr.RewardTerm("jump_cost", {"desired_pose": 6, "last_desired_pose": 6}, jump),
+        ]
+
+
+env = gr.make_env("examples/Hurry", guidance="sct", hold=10)
+env.reset(seed=0)
+sums = dict.fromkeys(("time_cost", "jump_cost"), 0.0)
+for _ in range(10):
+    *_, info = env.step(np.array([0.0, 0.0, -1.0]))
+    sums = {name: value + info[name] for name, value in sums.items()}
+print({name: round(value, 3) for name, value in sums.items()}, "of", sorted(name for name in info if "_cost" in name))

@@ -1,0 +1,26 @@
+"""How do I compare how smoothly two ways explore? At the same RMS: to move less is to be smoother, and no better."""
+
+import numpy as np
+
+from guiderail import LcNsKmp, ReferenceTrajectory
+from guiderail.models.primitives.gains import exploration_rms, rms_gains
+from guiderail.models.smoothness import log_dimensionless_jerk
+
+HOLD, STEPS, PERIOD = 5, 150, 0.02
+times = PERIOD * np.arange(STEPS)
+means = np.column_stack([times / 3, np.sin(np.pi * times / 3)])
+wide = 0.01 + 0.1 * np.sin(np.pi * times / 3)
+reference = ReferenceTrajectory(times, means, wide[:, None, None] ** 2 * np.eye(2))
+
+for name, history, variance in (("no history (KGRL)", 0, 1.0), ("rho = 1e-4", 10, 1e-4), ("rho = 1e-8", 10, 1e-8)):
+    primitive = LcNsKmp(reference, history=history, history_variance=variance)
+    gains = rms_gains(primitive, kappa=0.5, hold=HOLD)
+    actions = np.repeat(np.random.default_rng(0).uniform(-1, 1, (primitive.num_steps, 2)), HOLD, axis=0)
+    past = np.tile(primitive.reference.means[0], (primitive.history, 1))
+    path = []
+    for step in range(primitive.num_steps):
+        path.append(primitive.predict(step, gains * actions[step], past if primitive.history else None).output)
+        past = np.vstack([past, path[-1]])[1:] if primitive.history else past
+    jerk = log_dimensionless_jerk(np.array(path), PERIOD)
+    rms = exploration_rms(primitive, gains, HOLD).round(2)
+    print(f"{name}: RMS {rms} standard deviations, log dimensionless jerk {jerk:.1f} (higher is smoother)")

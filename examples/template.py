@@ -1,0 +1,32 @@
+"""How do I use a shared control template alone? As guidance in a diagram, here with inputs that someone holds."""
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from guiderail import load_skill
+from guiderail.diagrams.guidance.sct import SctGuidance
+from guiderail.models.pose_coordinates import transform_to_pose
+
+PERIOD = 0.02
+skill = load_skill("pouring", mug_radius_m=0.05)  # a wider mug than the file's own
+guidance = SctGuidance(skill, {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}, PERIOD)
+
+builder = DiagramBuilder()
+builder.AddNamedSystem("guidance", guidance)
+start = transform_to_pose(RigidTransform([0.6, -0.3, 0.45]))
+held = {"action": [0.0, 1.0, -1.0], "pose": start, "wrench": np.zeros(6)}  # towards the mug, and down
+for name, value in held.items():
+    source = builder.AddNamedSystem(name, ConstantVectorSource(np.array(value)))
+    builder.Connect(source.get_output_port(), guidance.GetInputPort(name))
+diagram = builder.Build()
+
+simulator = Simulator(diagram)
+context = guidance.GetMyContextFromRoot(simulator.get_context())
+for seconds in (0.5, 1.0, 2.0):
+    simulator.AdvanceTo(seconds)
+    state = skill.states[int(guidance.GetOutputPort("state").Eval(context)[0])].name
+    height = guidance.get_desired_pose_output_port().Eval(context)[2] - 0.3
+    print(f"after {seconds} s it is in {state}, {100 * height:.1f} cm above the mug")

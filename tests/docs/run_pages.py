@@ -1,0 +1,108 @@
+"""Runs the code of pages as a reader would, from top to bottom, and compares what it prints.
+
+A fenced block is one step. `python` is run, in one namespace a page; `sh` is a line of the command each; a block whose
+first line is `# file: NAME` is written to that file. A `text` block right after a step is what that step prints, where
+`...` stands for anything. Each page has an empty folder of its own. Prints one JSON object: page to what was wrong.
+"""
+
+import contextlib
+import doctest
+import io
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+import traceback
+from pathlib import Path
+
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+def steps(page: Path) -> list[tuple[str, str]]:
+    """Language and text of each block of a page."""
+    return FENCE.findall(page.read_text(encoding="utf-8"))
+
+
+def command(line: str) -> None:
+    """What a shell does with a line that begins with guiderail."""
+    from guiderail.tools.command import main
+
+    words = shlex.split(line)
+    if words[0] != "guiderail":
+        raise ValueError(f"a page may only call guiderail, not {words[0]}")
+    try:
+        main(words[1:])
+    except SystemExit as end:
+        if end.code:
+            raise RuntimeError(f"{line!r} ended with {end.code}") from None
+
+
+def shell(text: str) -> None:
+    """The same in a process of its own."""
+    program = [sys.executable, __file__, "--shell", text]
+    finished = subprocess.run(program, capture_output=True, text=True)
+    print(finished.stdout, end="")
+    print(finished.stderr, end="", file=sys.stderr)
+    if finished.returncode:
+        raise RuntimeError(f"{text!r} ended with {finished.returncode}")
+
+
+def run(page: Path) -> str:
+    """What is wrong with a page; nothing where all of it runs and prints what it says."""
+    namespace: dict = {"__name__": "page"}
+    printed = None
+    for language, text in steps(page):
+        try:
+            if language == "text":
+                if printed is None:
+                    raise ValueError("a text block follows what prints it")
+                if not doctest.OutputChecker().check_output(text, printed, FLAGS):
+                    raise ValueError(f"it prints\n{printed}\nand the page says\n{text}")
+                printed = None
+                continue
+            with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+                try:
+                    if text.startswith("# file: "):
+                        first, _, rest = text.partition("\n")
+                        Path(first.removeprefix("# file: ")).write_text(rest, encoding="utf-8")
+                    elif language == "python":
+                        exec(compile(text, str(page), "exec"), namespace)
+                    elif language == "sh" and "--import" in text:
+                        shell(text)  # what was imported here already would be there twice
+                    elif language == "sh":
+                        for line in text.splitlines():
+                            command(line)
+                    else:
+                        raise ValueError(f"nobody runs {language}")
+                except Exception as error:
+                    error.add_note(err.getvalue()[-2000:])
+                    raise
+            printed = out.getvalue()
+        except Exception:
+            return f"{text}\n{traceback.format_exc(limit=-3)}"
+    return ""
+
+
+def main(pages: list[Path]) -> None:
+    """Runs pages one after the other."""
+    found = {}
+    for page in pages:
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            sys.path.insert(0, folder)
+            found[page.stem] = run(page)
+            sys.path.remove(folder)
+    print(json.dumps(found))
+    sys.stdout.flush()
+    os._exit(0)  # threads of what was run end with it
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "--shell":
+        for line in sys.argv[2].splitlines():
+            command(line)
+        sys.exit()
+    main([Path(name).resolve() for name in sys.argv[1:]])

@@ -1,0 +1,52 @@
+"""Every block of every tutorial runs as it stands, and prints what the page says."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+SCREENS = 130  # lines: two screens
+
+
+@pytest.fixture(scope="module")
+def found():
+    """What is wrong with each page, all run in one process: importing costs more than most of them."""
+    environment = os.environ | {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
+    program = [sys.executable, str(Path(__file__).with_name("run_pages.py")), *map(str, PAGES)]
+    finished = subprocess.run(program, env=environment, capture_output=True, text=True)
+    assert finished.returncode == 0, finished.stderr
+    return json.loads(finished.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_a_tutorial_does_what_it_says(page, found):
+    assert not found[page.stem], found[page.stem]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
+def test_a_tutorial_is_short_and_in_the_contents(page):
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= SCREENS
+    assert f"tutorials/{page.stem}\n" in (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+
+
+def test_a_page_that_says_something_else_is_found(tmp_path):
+    page = tmp_path / "wrong.md"
+    page.write_text("```python\nprint(1 + 1)\n```\n\n```text\n3\n```\n", encoding="utf-8")
+    program = [sys.executable, str(Path(__file__).with_name("run_pages.py")), str(page)]
+    finished = subprocess.run(program, capture_output=True, text=True)
+    assert "it prints" in json.loads(finished.stdout)["wrong"]
+
+
+def test_prose_is_about_what_there_is():
+    """Files that pages name in code are there."""
+    for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "concepts").glob("*.md"), *PAGES]:
+        for name in re.findall(
+            r"`((?:examples|models|diagrams|tests|systems|tools)/[\w./]+)`", page.read_text("utf-8")
+        ):
+            assert (ROOT / name).exists(), f"{page.name} names {name}"
