@@ -22,7 +22,6 @@ from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
 
-
 OBSTACLE_Z = -0.035  # [m] below the robot: it is drawn, and the robot may be above it
 OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]
 
@@ -154,7 +153,6 @@ class PlaneStation(Station):
         """Puts the robot's centre at (x, y), at rest; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositionsAndVelocities(plant_context, self._robot, np.concatenate([pose, np.zeros(2)]))
-
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
         """Puts the obstacles to (n, 2), in a world where they move; `context` is the root context."""

@@ -34,7 +34,10 @@ class NarrowPassageOptions(Options):
     obstacle_radius: Number = Field(USUAL.obstacle_radius, ge=0.01, le=0.1, description="of the obstacles [m]")
     second_obstacle: bool = Field(False, description="whether there is another obstacle behind the passage")
     obstacle_beside: Number = Field(
-        0.0, ge=0, le=0.1, description="how far beside their places obstacles stand, in turn left and right, as drawn [m]"
+        0.0,
+        ge=0,
+        le=0.1,
+        description="how far beside their places obstacles stand, in turn left and right, as drawn [m]",
     )
     obstacles_end: bool = Field(False, description="whether touching an obstacle ends an episode, as a collision")
     start_deviation: Number = Field(

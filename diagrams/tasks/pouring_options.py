@@ -43,7 +43,9 @@ class PouringOptions(Options):
     )
     time_limit: Number = Field(15.0, ge=3.0, le=30.0, description="after which an episode ends [s]")
     aim: bool = Field(False, description="whether Pour can be aimed; the policy then sees error and template's state")
-    aim_speed: Number = Field(1.0, ge=0.1, le=1.0, description="part of the inputs' full speed with which Pour is aimed")
+    aim_speed: Number = Field(
+        1.0, ge=0.1, le=1.0, description="part of the inputs' full speed with which Pour is aimed"
+    )
     pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="part of the full tilt's with which an aimed Pour tips")
 
     def check(self) -> None:
