@@ -123,11 +123,12 @@ class NarrowPassage(Task):
             raise InputError(
                 f"the reset option 'start' is at most {FARTHEST_START:g} m along x and y, not {start.tolist()}"
             )
-        if self._obstacles is not None:
-            assert isinstance(station, PlaneStation)
-            self._obstacles.set(context, obstacles.ravel())
-            station.set_obstacles(context, obstacles)
         station.set_pose(context, start)
+        if self._obstacles is None:
+            return {"start": start}
+        assert isinstance(station, PlaneStation)
+        self._obstacles.set(context, obstacles.ravel())
+        station.set_obstacles(context, obstacles)
         return {"start": start, "obstacles": obstacles}
 
     def camera(self) -> Camera:

@@ -132,7 +132,7 @@ class Pouring(Task):
         # Turned as the template wants it, whether or not that guides: all kinds of guidance start alike.
         X_TP = self._skill.project(self._skill.initial_state, RigidTransform(believed @ p_MP), frames)
         station.set_pose(context, transform_to_pose(X_TP))
-        return {"start": p_MP, "mug_position": p_TMug, "mug_error": error}
+        return {"start": p_MP, "mug_position": p_TMug} | ({"mug_error": error} if error.any() else {})
 
     def camera(self) -> Camera:
         """From before the mug and a little above it."""
