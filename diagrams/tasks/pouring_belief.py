@@ -16,8 +16,8 @@ def draw_error(episode: np.random.Generator, options: PouringOptions, reset: Pou
         InputError: if the reset's option is farther than an aimed Pour leads.
     """
     error = in_ring(episode, options.mug_error_least, options.mug_error_most)
-    if reset.mug_error is not None:
-        error = np.array(reset.mug_error)
-    if np.linalg.norm(error) > MAX_MUG_ERROR:
-        raise InputError(f"the reset option 'mug_error' is at most {MAX_MUG_ERROR:g} m long, not {error.tolist()}")
-    return error
+    if reset.mug_error is None:
+        return error
+    if np.linalg.norm(reset.mug_error) > MAX_MUG_ERROR:
+        raise InputError(f"the reset option 'mug_error' is at most {MAX_MUG_ERROR:g} m long, not {reset.mug_error}")
+    return np.array(reset.mug_error)
