@@ -73,9 +73,9 @@ class Task(ABC):
     defaults: ClassVar[Mapping[str, Any]] = {}
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}}
     learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "robust"}
-    num_steps: ClassVar[int]
+    num_steps: int
     clip: ClassVar[float] = 3.0
-    collision: ClassVar[Threshold] = Threshold()
+    collision: Threshold = Threshold()
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
 
