@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -45,8 +45,8 @@ TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
 
 
-@lru_cache
-def reference_trajectory(demonstrations: str = "insert") -> ReferenceTrajectory:
+@cache
+def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
     """What five demonstrations have in common: Gaussian mixture and regression, fitted once a process."""
     loaded = DEMONSTRATIONS[demonstrations].load()
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR)
