@@ -132,16 +132,15 @@ def test_the_lever_says_where_to_go(connector):
 
 
 def test_at_its_hardest_the_rule_locks_and_the_demonstrations_do_not(connector):
-    rows = evaluate_policy(connector, lever_rule, episodes=3, **FRESH)
-    assert rows["success"].sum() >= 2
-    assert rows["worst_violation"].max() <= 1e-9
-    assert evaluate_policy(connector, still(connector), episodes=2, **FRESH)["success"].sum() == 0
+    row = evaluate_policy(connector, lever_rule, episodes=1, **FRESH).iloc[0]
+    assert row["success"]
+    assert row["worst_violation"] <= 1e-9
+    assert not evaluate_policy(connector, still(connector), episodes=1, **FRESH)["success"].any()
 
 
 def test_at_its_hardest_the_rule_snaps_the_clamp_in_and_the_straight_descent_does_not(clamp):
-    rows = evaluate_policy(clamp, gentle_rule, episodes=3, **FRESH)
-    assert rows["success"].sum() >= 2
-    assert evaluate_policy(clamp, straight_descent, episodes=2, **FRESH)["success"].sum() == 0
+    assert evaluate_policy(clamp, gentle_rule, episodes=1, **FRESH)["success"].all()
+    assert not evaluate_policy(clamp, straight_descent, episodes=1, **FRESH)["success"].any()
 
 
 def test_a_clamp_has_the_time_and_the_height_that_it_is_given():
