@@ -19,7 +19,7 @@ from guiderail.models.units import MM
 
 STEP = 0.5 * MM  # from decision to decision
 REACH = 3.1 * MM  # where an action of one leads while the demonstrations search
-ON_RIM = RIM - 1.2 * MM  # height from which the plug isn't in yet
+ON_RIM = RIM - 0.5 * MM  # height from which the plug isn't in yet
 # Where [time, pose, wrench, lever, command] lie in an observation.
 TIME, Z, LEVER, COMMAND = 0, 3, slice(13, 15), slice(15, 17)
 STANDS = SEARCH[0] - 0.2  # [s] when the plug may stand on the rim
