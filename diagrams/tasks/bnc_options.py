@@ -69,14 +69,14 @@ HARD: dict[str, Any] = {
     "demonstrations": "search",
     "hold": 5,
     "uncertainty": "disc",
-    "offset_range": (2.0 * MM, 3.0 * MM),
+    "offset_range": (2.6 * MM, 3.0 * MM),
     "bound": 3.5 * MM,
     "force_limit": 15.0,
     "mouth_chamfer": 0.1 * MM,
 }
 """A jack elsewhere in every episode, farther off than a lead-in catches, and less force than pressing on the rim takes.
 
-The search is short: whoever wanders over the rim at random covers a small part of where the jack may be, whoever feels
-on which side of it the plug stands arrives. What an action is worth does not change until the plug drops in, or a
+The search is short, and the jack as far off as an action reaches: whoever wanders over the rim at random is mostly
+nearer to its middle, whoever feels on which side of it the plug stands arrives. What an action is worth does not change until the plug drops in, or a
 constant one would sweep across the rim by itself.
 """

@@ -9,7 +9,7 @@ from guiderail.models.demonstrations.bnc_connector import NUM_DEMONSTRATIONS, NU
 from guiderail.models.objects.bnc_connector import MM
 from guiderail.tools.recording.generate.bnc_connector import TIMES, record_one
 
-SEARCHING = slice(0, round(bnc_search.HOLD_UNTIL / 0.02))
+SEARCHING = slice(0, round(bnc_search.SEARCH[1] / 0.02))
 
 
 def test_five_times_four_hundred_poses_that_end_locked():
@@ -23,7 +23,7 @@ def test_five_times_four_hundred_poses_that_end_locked():
 def test_an_action_is_worth_the_same_in_every_direction_until_the_plug_drops_in():
     reference = reference_trajectory("search")
     deviations = reference.standard_deviations[SEARCHING, :2]
-    assert deviations.max() < 1.25 * deviations.min()
+    assert deviations.max() < 1.15 * deviations.min()
     correlation = reference.covariances[SEARCHING, 0, 1] / deviations.prod(axis=1)
     assert np.abs(correlation).max() < 0.15
     assert np.abs(reference.means[SEARCHING, :2]).max() < 0.4 * MM
