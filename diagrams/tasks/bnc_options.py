@@ -77,6 +77,6 @@ HARD: dict[str, Any] = {
 """A jack elsewhere in every episode, farther off than a lead-in catches, and less force than pressing on the rim takes.
 
 The search is short, and the jack as far off as an action reaches: whoever wanders over the rim at random is mostly
-nearer to its middle, whoever feels on which side of it the plug stands arrives. What an action is worth does not change until the plug drops in, or a
-constant one would sweep across the rim by itself.
+nearer to its middle, whoever feels on which side of it the plug stands arrives. What an action is worth does not change
+until the plug drops in, or a constant one would sweep across the rim by itself.
 """
