@@ -71,7 +71,7 @@ HARD: dict[str, Any] = {
     "uncertainty": "disc",
     "offset_range": (2.6 * MM, 3.0 * MM),
     "bound": 3.5 * MM,
-    "force_limit": 15.0,
+    "force_limit": 20.0,
     "mouth_chamfer": 0.1 * MM,
 }
 """A jack elsewhere in every episode, farther off than a lead-in catches, and less force than pressing on the rim takes.

@@ -23,10 +23,9 @@ PATH = Path(__file__).with_name("bnc_search.npz")
 DEGREE = np.deg2rad(1.0)
 RADIUS = 2.5 * MM  # of the circle
 TURN = 0.3  # [s] for once around: much quicker than the search is long, so that no moment of it has a side
-SEARCH_PUSH = 1.0 * MM  # below the rim, against the impedance: a newton or two, too little to fall in while passing
-SEARCH = (1.2, 2.4)  # [s] from when the plug stands on the rim to when the demonstrator comes in
-COMING_IN = 0.25  # [s] that it takes: who is not in the bore by then presses on the rim
-HOLD_UNTIL, IN_BY = 2.7, 3.1  # [s] when the circle begins to shrink, and when it is gone
+SEARCH_PUSH = 1.5 * MM  # below the rim, against the impedance: a couple of newtons
+SEARCH = (1.2, 2.0)  # [s] from when the plug stands on the rim to when the demonstrator comes in
+HOLD_UNTIL, IN_BY = 2.6, 3.1  # [s] when the circle begins to shrink, and when it is gone
 
 # time [s], z [m], Rz [rad]
 WAYPOINTS = np.array(
@@ -34,8 +33,8 @@ WAYPOINTS = np.array(
         [0.0, CLEAR, QUARTER_TURN],
         [0.2, CLEAR, QUARTER_TURN],
         [SEARCH[0], RIM - SEARCH_PUSH, QUARTER_TURN],
-        [SEARCH[1], RIM - SEARCH_PUSH - 0.2 * MM, QUARTER_TURN],
-        [SEARCH[1] + COMING_IN, SEAT_COMMAND, QUARTER_TURN],
+        [SEARCH[1], RIM - SEARCH_PUSH - 0.3 * MM, QUARTER_TURN],
+        [SEARCH[1] + 0.8, SEAT_COMMAND, QUARTER_TURN],
         [4.6, SEAT_COMMAND, QUARTER_TURN],
         [6.8, LOCK_COMMAND, 0.0],
         [7.1, LOCK_COMMAND, 0.0],
