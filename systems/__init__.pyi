@@ -5,6 +5,7 @@ from .cartesian_position_controller import CartesianPositionController as Cartes
 from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
+from .contact_lever import ContactLever as ContactLever
 from .contact_watch import ContactWatch as ContactWatch
 from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import Condition as Condition

@@ -80,6 +80,8 @@ def options_in_words(name: str) -> dict[str, str]:
         for row in described(type(model)):
             allowed = row.get("choices") or choices.get(row["name"])
             among = f"one of {', '.join(map(str, allowed))}; " if allowed else ""
+            if {"minimum", "maximum"} <= row.keys():
+                among = f"from {row['minimum']:g} to {row['maximum']:g}; "
             words[row["name"]] = f"{row['description']}: {among}{resolved.values[row['name']]!r} unless given"
     reset = {f"reset: {row['name']}": row["description"] for row in described(declared.Reset)}
     return words | reset

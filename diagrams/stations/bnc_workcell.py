@@ -13,6 +13,8 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.bnc_connector import JACK_SDF, PLUG_SDF, BncDimensions
+from guiderail.models.objects.bnc_sdf import FRICTION
+from guiderail.models.objects.write_bnc import folder_of
 from guiderail.models.parsing import add_model
 
 # The pairs that never meet in a connector of these dimensions, or whose part of the contact another surface carries.
@@ -38,12 +40,14 @@ class BncWorkcell:
     """A jack in front of the robot's base, turned so that the target frame's axes are the world's.
 
     Args:
-        dimensions: of the connector; the files that are loaded were written from the default.
+        dimensions: of the connector.
         p_WJ: where the jack stands, (3,) [m].
+        friction: of the connector's metal.
     """
 
     dimensions: BncDimensions = field(default_factory=BncDimensions)
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)
+    friction: float = FRICTION
 
     @property
     def X_WJ(self) -> RigidTransform:
@@ -64,7 +68,7 @@ class BncWorkcell:
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Adds the jack, on a frame that `set_jack_offset` moves, and a board under it to look at."""
-        model = add_model(plant, JACK_SDF)
+        model = add_model(plant, folder_of(self.dimensions, self.friction) / JACK_SDF.name)
         mount = plant.AddFrame(FixedOffsetFrame("jack_mount", plant.world_frame(), self.X_WJ))
         plant.WeldFrames(mount, plant.GetFrameByName("jack", model))
         depth, width, thickness = BOARD
@@ -73,7 +77,7 @@ class BncWorkcell:
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
         """Adds the plug, on a frame that `set_grasp_offset` moves."""
-        model = add_model(plant, PLUG_SDF)
+        model = add_model(plant, folder_of(self.dimensions, self.friction) / PLUG_SDF.name)
         grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
         plug = plant.GetBodyByName("plug", model)
         plant.WeldFrames(grasp, plug.body_frame())

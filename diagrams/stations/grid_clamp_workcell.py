@@ -13,6 +13,8 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.grid_clamp import CLAMP_SDF, TABLE_SDF, GridClampDimensions
+from guiderail.models.objects.grid_clamp_sdf import FRICTION
+from guiderail.models.objects.write_grid_clamp import folder_of
 from guiderail.models.parsing import add_model
 
 STICTION_TOLERANCE = 1e-5
@@ -37,12 +39,14 @@ class GridClampWorkcell:
     """A table in front of the robot's base; the target frame's axes are the world's.
 
     Args:
-        dimensions: of clamp and table; the files that are loaded were written from the default.
+        dimensions: of clamp and table.
         p_WG: the middle hole's centre in the table's face, (3,) [m].
+        friction: of pegs, holes and the table's face.
     """
 
     dimensions: GridClampDimensions = field(default_factory=GridClampDimensions)
     p_WG: tuple[float, float, float] = (0.55, 0.0, 0.15)
+    friction: float = FRICTION
 
     @property
     def X_WG(self) -> RigidTransform:
@@ -62,13 +66,13 @@ class GridClampWorkcell:
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Adds the table, on a frame that `set_table_offset` moves; says how still a contact of the plant is."""
         plant.set_stiction_tolerance(STICTION_TOLERANCE)
-        model = add_model(plant, TABLE_SDF)
+        model = add_model(plant, folder_of(self.dimensions, self.friction) / TABLE_SDF.name)
         mount = plant.AddFrame(FixedOffsetFrame("table_mount", plant.world_frame(), self.X_WG))
         plant.WeldFrames(mount, plant.GetFrameByName("table", model))
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
         """Adds the clamp, on a frame that `set_grasp_offset` moves."""
-        model = add_model(plant, CLAMP_SDF)
+        model = add_model(plant, folder_of(self.dimensions, self.friction) / CLAMP_SDF.name)
         grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
         clamp = plant.GetBodyByName("clamp", model)
         plant.WeldFrames(grasp, clamp.body_frame())

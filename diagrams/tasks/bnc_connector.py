@@ -2,65 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.observation import Observed
-from guiderail.diagrams.options import Number, Options
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
-from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, HALF_TURN_OF_WRENCH, BncWorkcell
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, BncWorkcell
+from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import Symmetry
+from guiderail.diagrams.tasks.bnc_observation import LEAST_FORCE, OBSERVATIONS, half_turn, observed
+from guiderail.diagrams.tasks.bnc_options import HARD, BncOptions
 from guiderail.diagrams.tasks.bnc_rewards import reward_terms
-from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
+from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.offsets import in_ring
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Threshold
-from guiderail.models.demonstrations import bnc_connector as demonstrations
+from guiderail.diagrams.tasks.task import STANDARD, Choice, Threshold
+from guiderail.models.demonstrations import bnc_connector as inserting
+from guiderail.models.demonstrations import bnc_search as searching
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.units import DEGREE, MM
+from guiderail.systems.contact_lever import ContactLever
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
-NUM_STEPS, COMPONENTS = demonstrations.NUM_STEPS, 16
+NUM_STEPS, COMPONENTS = inserting.NUM_STEPS, 16
 # How well a hand repeats itself: added to the demonstrations' covariance as a standard deviation.
 FLOOR = np.array([0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE])
+DEMONSTRATIONS = {"insert": inserting, "search": searching}
 
 # ρ [m², rad²]. The thesis's 1e-8 is (0.1 mm)², much for demonstrations that vary by a millimetre.
 RHO = 1e-11
-ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
-COLLISION_FORCE = 35.0  # [N], of the impedance
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
 
-# What a policy sees, [time, pose, wrench], is centred and scaled by these. The wrench's torques are small, and they
-# are what tells on which side of the rim the plug sits: 0.02 Nm at 4 N.
-HALF = 0.5 * (NUM_STEPS * CONTROL_PERIOD)
-POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
-POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
-WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
-
-@lru_cache(maxsize=1)
-def reference_trajectory() -> ReferenceTrajectory:
-    """What the five demonstrations have in common: Gaussian mixture and regression, fitted once a process."""
-    return ReferenceTrajectory.from_demonstrations(demonstrations.load(), components=COMPONENTS, floor=FLOOR)
-
-
-class BncOptions(Options):
-    """Of the connector."""
-
-    uncertainty: Literal["calibration", "disc", "known"] = Field("calibration", description="where the jack may be")
-    grasp_angle: Number = Field(0.0, ge=0, le=LARGEST_GRASP_ANGLE, description="largest tilt of the plug [degrees]")
+@cache
+def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
+    """What five demonstrations have in common: Gaussian mixture and regression, fitted once a process."""
+    loaded = DEMONSTRATIONS[demonstrations].load()
+    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR)
 
 
 @register_task("BncConnector")
@@ -71,15 +60,18 @@ class BncConnector(InsertionTask):
     options: BncOptions
     workpiece, fixture = "plug", "jack"
     rewards = ("sparse", "shaped")
+    observations = OBSERVATIONS
+    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
     defaults = {"guidance": "skgrl", "station": "rails", "hold": 10, "explored": (0, 1), "history_variance": RHO}
     num_steps = NUM_STEPS
-    collision = Threshold("contact_force", COLLISION_FORCE)
     isotropic_groups = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
 
     def __init__(self, options: BncOptions, choice: Choice):
         super().__init__(options, choice)
-        self.offsets = BncUncertainty(options.uncertainty, options.grasp_angle)
-        self._workcell = BncWorkcell()
+        o = options
+        self.offsets = BncUncertainty(o.uncertainty, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn)
+        self.collision = Threshold("contact_force", o.force_limit)
+        self._workcell = o.workcell()
 
     def world(self) -> BncWorkcell:
         """A jack in the world, a plug in the tool."""
@@ -87,24 +79,26 @@ class BncConnector(InsertionTask):
 
     def reference(self) -> ReferenceTrajectory:
         """Of the five demonstrations."""
-        return reference_trajectory()
+        return reference_trajectory(self.options.demonstrations)
 
     def constraints(self) -> LinearConstraints:
-        """|x|, |y| ≤ 2 mm, equation 4.26."""
-        bound = np.array([ALIGNMENT, ALIGNMENT, np.inf, np.inf, np.inf, np.inf])
+        """|x|, |y| ≤ 2 mm, equation 4.26, or another bound."""
+        bound = np.array([self.options.bound, self.options.bound, np.inf, np.inf, np.inf, np.inf])
         return LinearConstraints.box(-bound, bound)
 
     def keep_out(self) -> KeepOut:
         """No walls are known: what safe residual learning is projected to is the alignment alone."""
         return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
 
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Beside where the plug is, the lever of what it stands on."""
+        lever = builder.AddNamedSystem("contact_lever", ContactLever(LEAST_FORCE))
+        builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
+        return {**super().signals(builder, station), "lever": lever.get_lever_output_port()}
+
     def observed(self) -> Sequence[Observed]:
-        """Time, pose and wrench."""
-        return (
-            Observed("time", HALF, HALF),
-            Observed("pose", POSE_CENTRE, POSE_SCALE),
-            Observed("wrench", 0.0, WRENCH_SCALE),
-        )
+        """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
+        return observed(self.choice.observation)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of actions, forces and the end; of depth where the reward is shaped."""
@@ -118,18 +112,22 @@ class BncConnector(InsertionTask):
         """Half a turn about the jack's axis."""
         explored = self.choice.values["explored"]
         action = HALF_TURN if explored is None else HALF_TURN[list(explored)]
-        return Symmetry((1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH), tuple(action))
+        return Symmetry(half_turn(self.choice.observation), tuple(action))
 
     def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Moves the jack by (x, y), and the plug by (x, y) and by its tilt about x and y where it has one."""
+        """Moves the jack by (x, y) and its turn, the plug by (x, y) and its tilt about x and y, where they have one."""
         plant_context = station.plant.GetMyMutableContextFromRoot(context)
         tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
-        self._workcell.set_jack_offset(station.plant, plant_context, RigidTransform([*fixture, 0.0]))
+        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
+        self._workcell.set_jack_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
         self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform(tilt, [*workpiece[:2], 0.0]))
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
-        """Where the demonstrations start, inside the constraints."""
-        return self.constraints().nearest(reference_trajectory().means[0])
+        """Where the demonstrations start, or somewhere beside it, inside the constraints."""
+        start = self.reference().means[0].copy()
+        if self.options.start_beside > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.options.start_beside)
+        return self.constraints().nearest(start)
 
     def camera(self) -> Camera:
         """Looks slightly down at the jack."""
@@ -142,8 +140,8 @@ class BncConnector(InsertionTask):
         near = viewpoint(*to_world(np.array([[0.025, -0.035, 0.026], [0.0, 0.0, 0.012]])))
         return Scene(
             to_world=to_world,
-            demonstrations=tuple(demonstrations.load().outputs),
-            constraint=tuple(to_world(edge) for edge in box_edges(ALIGNMENT, 0.0, 0.015)),
+            demonstrations=tuple(DEMONSTRATIONS[self.options.demonstrations].load().outputs),
+            constraint=tuple(to_world(edge) for edge in box_edges(self.options.bound, 0.0, 0.015)),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
             line_radius=0.0001,

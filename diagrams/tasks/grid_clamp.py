@@ -2,42 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.guidance.known import Approach, Template
 from guiderail.diagrams.observation import Observed
-from guiderail.diagrams.options import Options
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
-from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.diagrams.tasks.grid_clamp_options import HARD, GridClampOptions
 from guiderail.diagrams.tasks.grid_clamp_rewards import reward_terms
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.diagrams.tasks.task import STANDARD, Choice, Threshold
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.skills import Skill, load_skill
 from guiderail.models.units import MM
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
-# More than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m.
-COLLISION_FORCE = 35.0  # [N], of the impedance
 SEATED_STEPS = 3  # control steps for which it must be seated before that counts
 
 # The command waits while the clamp is farther than this from it: 12 N, twice what the snap asks for.
 LEASH = 8.0 * MM
 
-# The hand-designed skill before hands over a clamp above the hole, about here.
-START_HEIGHT = (0.015, 0.018)  # [m]: the tips 3 to 6 mm above the table
-START_BESIDE = 0.2 * MM  # along x and along y
+START_BESIDE = 0.2 * MM  # along x and along y, where a clamp is handed over
 
 # What a policy sees, [position, force], is centred and scaled by these.
 CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
@@ -47,14 +42,6 @@ SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 def make_skill() -> Skill:
     """The template of section 3.4.2."""
     return load_skill("grid_clamp")
-
-
-class GridClampOptions(Options):
-    """Of the clamp."""
-
-    uncertainty: Literal["calibration", "disc", "known"] = Field(
-        "calibration", description="where table and clamp may be"
-    )
 
 
 @register_task("GridClamp")
@@ -67,15 +54,17 @@ class GridClamp(InsertionTask):
     options: GridClampOptions
     workpiece, fixture = "clamp", "table"
     rewards = ("shaped", "no_force", "sparse")
+    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
     defaults = {"guidance": "sct", "station": "rails", "hold": 5, "active_constraints": True}
     learner = {"algorithm": "sac", "preset": "clamp"}
-    num_steps = 500  # 100 decisions at 10 Hz; the thesis's episodes take 140 on average
-    collision = Threshold("contact_force", COLLISION_FORCE)
 
     def __init__(self, options: GridClampOptions, choice: Choice):
         super().__init__(options, choice)
         self.offsets = GridClampUncertainty(options.uncertainty)
-        self._workcell = GridClampWorkcell()
+        self.collision = Threshold("contact_force", options.force_limit)
+        # 100 decisions at 10 Hz unless given; the thesis's episodes take 140 on average.
+        self.num_steps = round(options.seconds / CONTROL_PERIOD)
+        self._workcell = options.workcell()
 
     def world(self) -> GridClampWorkcell:
         """A table with holes, a clamp in the tool."""
@@ -89,7 +78,7 @@ class GridClamp(InsertionTask):
     def approach(self) -> Approach:
         """Straight down into the hole."""
         parameters = make_skill().parameters
-        heights = (max(START_HEIGHT), -parameters["push_m"])
+        heights = (max(self.options.start_height), -parameters["push_m"])
         return Approach(heights, speed=parameters["speed_m_per_s"], reach=parameters["width_m"] / 2)
 
     def observed(self) -> Sequence[Observed]:
@@ -114,8 +103,8 @@ class GridClamp(InsertionTask):
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """About where the skill before hands over."""
-        start = np.zeros(POSE_SIZE)
-        start[:3] = *rng.uniform(-START_BESIDE, START_BESIDE, 2), rng.uniform(*START_HEIGHT)
+        start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
+        start[:3] = *rng.uniform(-START_BESIDE, START_BESIDE, 2), rng.uniform(lowest, highest)
         return start
 
     def camera(self) -> Camera:

@@ -80,7 +80,7 @@ class Task(ABC):
     learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "robust"}
     num_steps: int
     clip: ClassVar[float] = 3.0
-    collision: ClassVar[Threshold] = Threshold()
+    collision: Threshold = Threshold()
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
 

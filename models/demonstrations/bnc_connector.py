@@ -47,10 +47,10 @@ def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
     script_times, script = insert_and_lock()
     scripted, curves = [], []
     for _ in range(NUM_DEMONSTRATIONS):
-        lead = _TEMPO_DEVIATION * _smooth(rng, times, _TEMPO_CORRELATION) * np.sin(np.pi * times / times[-1])
+        lead = _TEMPO_DEVIATION * correlated(rng, times, _TEMPO_CORRELATION) * np.sin(np.pi * times / times[-1])
         at = np.clip(times + lead, 0.0, script_times[-1])
         scripted.append(np.stack([np.interp(at, script_times, column) for column in script.T], axis=1))
-        curves.append(np.stack([_smooth(rng, times, _CORRELATION[name]) for name in _DEVIATIONS], axis=1))
+        curves.append(np.stack([correlated(rng, times, _CORRELATION[name]) for name in _DEVIATIONS], axis=1))
     wander = np.stack(curves) - _CENTRING * np.mean(curves, axis=0)
     scale = np.stack([np.interp(times, _TIMES, deviation) for deviation in _DEVIATIONS.values()], axis=1)
     return np.stack(scripted) + scale * wander
@@ -67,7 +67,7 @@ def load_all() -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files}
 
 
-def _smooth(rng: np.random.Generator, times: np.ndarray, correlation: float) -> np.ndarray:
+def correlated(rng: np.random.Generator, times: np.ndarray, correlation: float) -> np.ndarray:
     """A random curve of unit variance that forgets itself after `correlation` seconds."""
     covariance = np.exp(-0.5 * ((times[:, None] - times) / correlation) ** 2) + 1e-6 * np.eye(len(times))
     return np.linalg.cholesky(covariance) @ rng.standard_normal(len(times))

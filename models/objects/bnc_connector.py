@@ -15,7 +15,7 @@ compliant primitives. A soft pad on the barrel stands for the gasket: it pushes 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +62,15 @@ class BncDimensions:
     seat_thickness: float = 2.0 * MM
     shell_radius: float = 5.0 * MM  # the plug's back shell, that is held
     shell_length: float = 16.0 * MM
+
+    @property
+    def bore_clearance(self) -> float:
+        """Between barrel and bore, on each side."""
+        return round(self.bore_radius - self.barrel_radius, 9)
+
+    def with_bore_clearance(self, clearance: float) -> BncDimensions:
+        """The same connector with a wider or a narrower bore."""
+        return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
 
     @property
     def lug_height(self) -> float:

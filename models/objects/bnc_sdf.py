@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from guiderail.models.objects.bnc_connector import MM, BncDimensions
@@ -10,19 +12,20 @@ from guiderail.models.objects.sdf import ContactMaterial, at, box, collision, cy
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 
 
+FRICTION = 0.2  # of metal on metal
 # The lugs are stiffer than the barrel because they are small: the same force must not let one through a slot's wall.
-BARREL = ContactMaterial(friction=0.2, modulus=1e9, resolution=1.5 * MM)
-LUG = ContactMaterial(friction=0.2, modulus=5e9, resolution=0.8 * MM)
+BARREL = ContactMaterial(friction=FRICTION, modulus=1e9, resolution=1.5 * MM)
+LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM)
 PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket is a spring that slips
-RING = ContactMaterial(friction=0.2)
+RING = ContactMaterial(friction=FRICTION)
 SEAT = ContactMaterial(friction=0.05)
 
 PLUG_MASS = 0.03  # [kg]
 
 
-def jack_sdf(dimensions: BncDimensions) -> str:
+def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     """The jack: link `jack` is frame J. Geometry `barrel`, `pad`, `lug_0`, `lug_1`."""
-    d = dimensions
+    d, barrel_material, lug_material = dimensions, *(replace(metal, friction=friction) for metal in (BARREL, LUG))
     barrel = (at(z=d.barrel_height / 2), cylinder(d.barrel_radius, d.barrel_height))
     pad = (
         at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2),
@@ -30,24 +33,24 @@ def jack_sdf(dimensions: BncDimensions) -> str:
     )
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = collision("barrel", *barrel, BARREL) + visual("barrel_visual", *barrel, NICKEL)
+    contents = collision("barrel", *barrel, barrel_material) + visual("barrel_visual", *barrel, NICKEL)
     contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
         lug = (at(x=side * lug_centre, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
-        contents += collision(f"lug_{number}", *lug, LUG) + visual(f"lug_{number}_visual", *lug, BRASS)
+        contents += collision(f"lug_{number}", *lug, lug_material) + visual(f"lug_{number}_visual", *lug, BRASS)
     return model("jack", 0.05, d.barrel_height / 2, 5.0 * MM, contents)
 
 
-def plug_sdf(dimensions: BncDimensions) -> str:
+def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     """The plug: link `plug` is frame P. Geometry `bore`, `slots`, `seat`."""
-    d = dimensions
+    d, ring = dimensions, replace(RING, friction=friction)
     seat = (
         at(z=d.seat_height + d.seat_thickness / 2),
         box(d.seat_width, d.seat_width, d.seat_thickness),
     )
     shell = (at(z=d.ring_length + d.shell_length / 2), cylinder(d.shell_radius, d.shell_length))
-    contents = collision("bore", at(), mesh("bnc_bore.obj"), RING)
-    contents += collision("slots", at(), mesh("bnc_slots.obj"), RING)
+    contents = collision("bore", at(), mesh("bnc_bore.obj"), ring)
+    contents += collision("slots", at(), mesh("bnc_slots.obj"), ring)
     contents += collision("seat", *seat, SEAT)
     contents += visual("ring_visual", at(), mesh("bnc_ring.obj"), NICKEL)
     contents += visual("shell_visual", *shell, BRASS)

@@ -14,7 +14,7 @@ pad as thick as it can be so that no impact takes it through, may touch only the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +57,15 @@ class GridClampDimensions:
     body_height: float = 8.0 * MM
     table_width: float = 96.0 * MM
     table_thickness: float = 14.0 * MM
+
+    @property
+    def clearance(self) -> float:
+        """Between a peg and its hole, on each side."""
+        return round(self.hole_radius - self.peg_radius, 9)
+
+    def with_clearance(self, clearance: float) -> GridClampDimensions:
+        """The same clamp and a table with other holes."""
+        return self if clearance == self.clearance else replace(self, hole_radius=self.peg_radius + clearance)
 
     @property
     def peg_positions(self) -> np.ndarray:

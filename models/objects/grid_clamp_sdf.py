@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from guiderail.models.objects.grid_clamp import MM, GridClampDimensions
 from guiderail.models.objects.sdf import ContactMaterial, at, box, collision, convex_mesh, cylinder, mesh, model, visual
 
 STEEL, ALUMINIUM, ANODIZED = "0.62 0.64 0.68 1", "0.80 0.81 0.82 1", "0.20 0.35 0.60 1"
 
-PEG = ContactMaterial(friction=0.2, modulus=5e8)
+FRICTION = 0.2  # of pegs, holes and the table's face
+PEG = ContactMaterial(friction=FRICTION, modulus=5e8)
 BEAD = ContactMaterial(friction=0.1, modulus=2e7)
-PAD = ContactMaterial(friction=0.2, modulus=1e6)
-HOLE = ContactMaterial(friction=0.2)
+PAD = ContactMaterial(friction=FRICTION, modulus=1e6)
+HOLE = ContactMaterial(friction=FRICTION)
 LIP = ContactMaterial(friction=0.1)
-SLAB = ContactMaterial(friction=0.2)
+SLAB = ContactMaterial(friction=FRICTION)
 
 CLAMP_MASS = 0.15  # [kg]
 STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # what it is held by
 
 
-def clamp_sdf(dimensions: GridClampDimensions) -> str:
+def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
     """The clamp: link `clamp` is frame C. Geometry `peg_0` (the middle one) to `peg_4`, `bead`, `pad`."""
-    d = dimensions
+    d, peg_material, pad = dimensions, *(replace(surface, friction=friction) for surface in (PEG, PAD))
     contents = ""
     for number, (x, y) in enumerate(d.peg_positions):
-        contents += collision(f"peg_{number}", at(x, y), convex_mesh("grid_clamp_peg.obj"), PEG)
+        contents += collision(f"peg_{number}", at(x, y), convex_mesh("grid_clamp_peg.obj"), peg_material)
         shaft = (at(x, y, d.peg_length / 2), cylinder(d.peg_radius, d.peg_length))
         contents += visual(f"peg_{number}_visual", *shaft, STEEL)
     crest = at(z=d.peg_length - d.bead_depth)
@@ -31,21 +34,21 @@ def clamp_sdf(dimensions: GridClampDimensions) -> str:
     contents += visual("bead_visual", crest, mesh("grid_clamp_bead.obj"), ANODIZED)
     top = d.peg_length + d.body_height
     body = (at(z=d.peg_length + d.body_height / 2), box(d.shoulder_width, d.shoulder_width, d.body_height))
-    contents += collision("pad", *body, PAD)
+    contents += collision("pad", *body, pad)
     contents += visual("body_visual", *body, ANODIZED)
     contents += visual("stem_visual", at(z=top + STEM_LENGTH / 2), cylinder(STEM_RADIUS, STEM_LENGTH), STEEL)
     return model("clamp", CLAMP_MASS, d.peg_length, 20.0 * MM, contents)
 
 
-def table_sdf(dimensions: GridClampDimensions) -> str:
+def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
     """The table: link `table` is frame G. Geometry `hole_0` (the middle one) to `hole_4`, `lip`, `slab`."""
-    d = dimensions
+    d, hole, face = dimensions, *(replace(surface, friction=friction) for surface in (HOLE, SLAB))
     contents = ""
     for number, (x, y) in enumerate(d.peg_positions):
-        contents += collision(f"hole_{number}", at(x, y), mesh("grid_clamp_hole.obj"), HOLE)
+        contents += collision(f"hole_{number}", at(x, y), mesh("grid_clamp_hole.obj"), hole)
     contents += collision("lip", at(), mesh("grid_clamp_lip.obj"), LIP)
     contents += visual("lip_visual", at(), mesh("grid_clamp_lip.obj"), STEEL)
     slab = at(z=-d.table_thickness / 2)
-    contents += collision("slab", slab, box(d.table_width, d.table_width, d.table_thickness), SLAB)
+    contents += collision("slab", slab, box(d.table_width, d.table_width, d.table_thickness), face)
     contents += visual("slab_visual", at(), mesh("grid_clamp_slab.obj"), ALUMINIUM)
     return model("table", 1.0, -d.table_thickness / 2, 30.0 * MM, contents)

@@ -5,18 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 
 from guiderail.models.objects.bnc_connector import FOLDER, BncDimensions, bore_mesh, ring_mesh, slot_mesh
-from guiderail.models.objects.bnc_sdf import jack_sdf, plug_sdf
+from guiderail.models.objects.bnc_sdf import FRICTION, jack_sdf, plug_sdf
+from guiderail.models.objects.made import made
 
 
-def files(dimensions: BncDimensions) -> dict[str, str]:
+def files(dimensions: BncDimensions, friction: float = FRICTION) -> dict[str, str]:
     """What each file holds, by name."""
     return {
         "bnc_bore.obj": bore_mesh(dimensions).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
         "bnc_ring.obj": ring_mesh(dimensions).to_obj(),
-        "bnc_jack.sdf": jack_sdf(dimensions),
-        "bnc_plug.sdf": plug_sdf(dimensions),
+        "bnc_jack.sdf": jack_sdf(dimensions, friction),
+        "bnc_plug.sdf": plug_sdf(dimensions, friction),
     }
+
+
+def folder_of(dimensions: BncDimensions, friction: float = FRICTION) -> Path:
+    """Where the files of a connector lie: beside this one, or made to measure."""
+    if (dimensions, friction) == (BncDimensions(), FRICTION):
+        return FOLDER
+    return made(files, dimensions, friction)
 
 
 def main(folder: Path = FOLDER) -> None:

@@ -15,10 +15,11 @@ from guiderail.models.objects.grid_clamp import (
     peg_mesh,
     slab_mesh,
 )
-from guiderail.models.objects.grid_clamp_sdf import clamp_sdf, table_sdf
+from guiderail.models.objects.grid_clamp_sdf import FRICTION, clamp_sdf, table_sdf
+from guiderail.models.objects.made import made
 
 
-def files(dimensions: GridClampDimensions) -> dict[str, str]:
+def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[str, str]:
     """What each file holds, by name."""
     return {
         "grid_clamp_peg.obj": peg_mesh(dimensions).to_obj(),
@@ -26,9 +27,16 @@ def files(dimensions: GridClampDimensions) -> dict[str, str]:
         "grid_clamp_hole.obj": hole_mesh(dimensions).to_obj(),
         "grid_clamp_lip.obj": lip_mesh(dimensions).to_obj(),
         "grid_clamp_slab.obj": slab_mesh(dimensions).to_obj(),
-        CLAMP_SDF.name: clamp_sdf(dimensions),
-        TABLE_SDF.name: table_sdf(dimensions),
+        CLAMP_SDF.name: clamp_sdf(dimensions, friction),
+        TABLE_SDF.name: table_sdf(dimensions, friction),
     }
+
+
+def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Path:
+    """Where the files of a clamp and its table lie: beside this one, or made to measure."""
+    if (dimensions, friction) == (GridClampDimensions(), FRICTION):
+        return FOLDER
+    return made(files, dimensions, friction)
 
 
 def main(folder: Path = FOLDER) -> None:

@@ -62,6 +62,7 @@ def built():
         systems.CartesianPositionController(plant, arm.target, arm.tool_centre, posture=np.zeros(7), period=PERIOD),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
+        systems.ContactLever(0.5),
         systems.ContactWatch(plant, [body], [other], PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from guiderail.diagrams.make import known
-from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
+from guiderail.diagrams.tasks.bnc_options import ALIGNMENT
 from guiderail.models.demonstrations import bnc_connector
 from guiderail.models.errors import InputError
 from guiderail.models.objects.narrow_passage import NarrowPassage

@@ -8,7 +8,8 @@ import gymnasium
 import numpy as np
 
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, POSE_CENTRE, POSE_SCALE
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS
+from guiderail.diagrams.tasks.bnc_observation import POSE_CENTRE, POSE_SCALE
 from guiderail.diagrams.tasks.grid_clamp import CENTRE, SCALE, make_skill
 from guiderail.diagrams.tasks.pouring_inputs import person
 from guiderail.models.errors import InputError
@@ -18,6 +19,7 @@ from guiderail.models.registry import did_you_mean
 from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
 from guiderail.tools.rollouts.rollout import Act
 from guiderail.tools.studies.aiming_person import aiming_person, blind_person
+from guiderail.tools.studies.lever_rule import lever_rule
 from guiderail.tools.studies.slalom import slalom
 
 # The connector: where the demonstrations search the rim, the rule moves against the contact torque.
@@ -48,13 +50,14 @@ LANES = np.array([-1.1, 0.0, 1.1]) * MM  # places along y; between two of them n
 LANE_ENDS = 3.7 * MM  # along x: past the largest offset
 PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # [N], [m/s] while it searches
 SNAP_FORCE = 12.0  # [N] that it snaps in with at most
+GENTLE_SNAP_FORCE = 8.5  # [N] the same where ten newtons are too many
 HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0  # [m/s/N] of force, the same, and [1/s] of distance
 SPEED = make_skill().parameters["speed_m_per_s"]  # of a full input
 LIFT = make_skill().parameters["lift"]  # part of it, upwards
 STIFFNESS = Impedance().stiffness[0]
 
 
-def searching_rule(observation: np.ndarray) -> np.ndarray:
+def searching_rule(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
     """Inputs (3,) in [−1, 1] for an observation (6,), without a memory.
 
     Above the table it goes to where the first lane begins. On it, it presses lightly and follows the lanes, each the
@@ -70,7 +73,7 @@ def searching_rule(observation: np.ndarray) -> np.ndarray:
     elif position[2] > ON_TABLE - IN_HOLE:
         velocity = np.array([*_along_lanes(command[:2]), HEIGHT_GAIN * (force[2] - PRESS)])
     else:
-        velocity = np.array([*(YIELD_GAIN * force[:2]), HEIGHT_GAIN * (force[2] - SNAP_FORCE)])
+        velocity = np.array([*(YIELD_GAIN * force[:2]), HEIGHT_GAIN * (force[2] - snap_force)])
     speeds = np.array([SPEED, SPEED, LIFT * SPEED if velocity[2] > 0.0 else SPEED])
     return np.clip(velocity / speeds, -1.0, 1.0)
 
@@ -84,14 +87,23 @@ def _along_lanes(xy: np.ndarray) -> np.ndarray:
     return np.array([0.0, SEARCH_SPEED])
 
 
+def gentle_rule(observation: np.ndarray) -> np.ndarray:
+    """The same, that never pushes harder than is allowed where the clamp is hard."""
+    return searching_rule(observation, GENTLE_SNAP_FORCE)
+
+
 def straight_descent(observation: np.ndarray) -> np.ndarray:
     """Down, (3,)."""
     return np.array([0.0, 0.0, -1.0])
 
 
 RULES: dict[str, dict[str, Act]] = {
-    "BncConnector": {"reactive_rule": reactive_rule},
-    "GridClamp": {"searching_rule": searching_rule, "straight_descent": straight_descent},
+    "BncConnector": {"reactive_rule": reactive_rule, "lever_rule": lever_rule},
+    "GridClamp": {
+        "searching_rule": searching_rule,
+        "gentle_rule": gentle_rule,
+        "straight_descent": straight_descent,
+    },
     "NarrowPassage": {"slalom": slalom},
     "Pouring": {"person": person, "aiming_person": aiming_person, "blind_person": blind_person},
 }

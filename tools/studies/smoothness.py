@@ -144,7 +144,7 @@ def measure(
     arguments = {"guidance": method.guidance, "uncertainty": "disc", "hold": 1, "explored": explored}
     arguments |= method.environment | _strength(method, explored, kappa)
     env: Any = make_environment(TASK, arguments)
-    unit = deviation(reference_trajectory())[list(explored)]
+    unit = deviation(reference_trajectory("insert"))[list(explored)]
     rows = []
     for place in PLACES:
         seen, moved, smooth, added = [], [], [], []

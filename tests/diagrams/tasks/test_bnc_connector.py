@@ -6,7 +6,8 @@ import pytest
 
 import guiderail.diagrams  # noqa: F401 (registers)
 from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT, COLLISION_FORCE, NUM_STEPS, reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, reference_trajectory
+from guiderail.diagrams.tasks.bnc_options import ALIGNMENT, COLLISION_FORCE
 from guiderail.diagrams.tasks.bnc_rewards import DEPTH_REWARD
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
@@ -144,7 +145,7 @@ def test_reward_is_the_sum_of_its_terms(kgrl):
 def test_shaped_reward_adds_the_depth_gained():
     env = make_env("BncConnector", guidance="kmp", reward="shaped", uncertainty="known", hold=10)
     env.reset(seed=0)
-    start = reference_trajectory().means[0, 2]
+    start = reference_trajectory("insert").means[0, 2]
     depth = 0.0
     for _ in range(12):
         depth += env.step(np.zeros(2))[4]["depth"]

@@ -8,7 +8,8 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import guiderail.diagrams  # noqa: F401 (registers)
 from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.grid_clamp import CENTRE, COLLISION_FORCE, LEASH, SCALE, make_skill
+from guiderail.diagrams.tasks.grid_clamp import CENTRE, LEASH, SCALE, make_skill
+from guiderail.diagrams.tasks.grid_clamp_options import COLLISION_FORCE
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError

@@ -17,9 +17,15 @@ def _passage(*folder: Path) -> None:
     passage.generate().save(folder[0] / passage.PATH.name if folder else passage.PATH)
 
 
+def _search(*folder: Path) -> None:
+    recording = import_module("guiderail.tools.recording.generate.bnc_connector")
+    recording.main(*(folder or (None,)), recording.SEARCH_SESSION)
+
+
 # Each is called with a folder, or with nothing for its own.
 GENERATED: dict[str, Callable[..., None]] = {
     "connector-demonstrations": _main("tools.recording.generate.bnc_connector"),
+    "connector-search-demonstrations": _search,
     "passage-demonstrations": _passage,
     "connector-objects": _main("models.objects.write_bnc"),
     "clamp-objects": _main("models.objects.write_grid_clamp"),

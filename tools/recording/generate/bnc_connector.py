@@ -1,7 +1,9 @@
-"""Records the BNC connector's demonstrations in simulation."""
+"""Records the BNC connector's demonstrations in simulation, those that insert and those that search."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +13,24 @@ from guiderail.diagrams.recording import drive_along
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.rails import RailsStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
-from guiderail.models.demonstrations.bnc_connector import (
-    NAMES,
-    NUM_STEPS,
-    PATH,
-    demonstrator_motions,
-)
+from guiderail.models.demonstrations import bnc_connector, bnc_search
+from guiderail.models.demonstrations.bnc_connector import NAMES, NUM_STEPS
 from guiderail.models.errors import InputError
 from guiderail.systems.recorder import Recording
 
 TIMES = CONTROL_PERIOD * np.arange(NUM_STEPS + 1)
+
+
+@dataclass(frozen=True)
+class Session:
+    """What is demonstrated, and where it is kept."""
+
+    motions: Callable[[int, np.ndarray], np.ndarray]
+    path: Path
+
+
+INSERT_SESSION = Session(bnc_connector.demonstrator_motions, bnc_connector.PATH)
+SEARCH_SESSION = Session(bnc_search.demonstrator_motions, bnc_search.PATH)
 
 
 def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
@@ -30,16 +40,16 @@ def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
     return recording, workcell.is_locked(workcell.plug_in_locked_frame(driven.station.plant, driven.plant_context))
 
 
-def record_session(seed: int) -> list[Recording] | None:
+def record_session(session: Session, seed: int) -> list[Recording] | None:
     """All demonstrations of a session; None if one of them doesn't end locked."""
-    recorded = [record_one(motion) for motion in demonstrator_motions(seed, TIMES)]
+    recorded = [record_one(motion) for motion in session.motions(seed, TIMES)]
     return [recording for recording, _ in recorded] if all(is_locked for _, is_locked in recorded) else None
 
 
-def record(seeds: range) -> dict[str, np.ndarray]:
+def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
     """The arrays of the demonstrations' file: the first session in which every demonstration ends locked."""
     for seed in seeds:
-        if (recordings := record_session(seed)) is not None:
+        if (recordings := record_session(session, seed)) is not None:
             break
     else:
         raise InputError(f"no session of the seeds {seeds} ends locked every time: give more seeds")
@@ -62,7 +72,7 @@ def record(seeds: range) -> dict[str, np.ndarray]:
     }
 
 
-def main(folder: Path = PATH.parent) -> None:
-    """Writes the file."""
-    arrays: dict[str, Any] = record(range(100))
-    np.savez_compressed(folder / PATH.name, **arrays)
+def main(folder: Path | None = None, session: Session = INSERT_SESSION) -> None:
+    """Writes the file of a session into a folder, its own unless given."""
+    arrays: dict[str, Any] = record(session, range(100))
+    np.savez_compressed((folder or session.path.parent) / session.path.name, **arrays)

@@ -1,0 +1,51 @@
+"""The connector's physics where it is hard: with hardly any chamfer it locks and holds all the same."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.make import resolve
+from guiderail.diagrams.recording import drive_along
+from guiderail.diagrams.stations.rails import RailsStation
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.models.objects.bnc_connector import BncDimensions
+from guiderail.models.objects.bnc_motion import CLEAR, insert_and_lock, poses
+from guiderail.models.units import MM
+
+HARD = resolve("BncConnector", {"difficulty": "hard"}).task
+WORKCELL = HARD.world()
+STIFFNESS = Impedance().stiffness[2]
+LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height
+
+
+@pytest.fixture(scope="module")
+def locked_and_pulled():
+    """Locked where the pose is known, then pulled at by more than the effort limit gives."""
+    times, motion = insert_and_lock()
+    pull = np.array([0.0, 0.0, 45.0 / STIFFNESS, 0.0, 0.0, 0.0])
+    times = np.concatenate([times, times[-1] + [1.0, 1.5]])
+    _, recording = drive_along(RailsStation(WORKCELL), times, np.concatenate([motion, [pull, pull]]))
+    return recording
+
+
+def test_it_is_another_connector():
+    assert WORKCELL.dimensions != BncDimensions()
+
+
+def test_known_pose_inserts_and_locks(locked_and_pulled):
+    final = locked_and_pulled["pose"][round(insert_and_lock()[0][-1] / 0.02) - 1]
+    assert np.abs(final[:3]).max() < 0.3 * MM
+    assert np.abs(np.rad2deg(final[3:])).max() < 1.0
+    assert locked_and_pulled["contact_force"][:400].max() < HARD.collision.above
+
+
+def test_pulling_after_locking_holds(locked_and_pulled):
+    assert locked_and_pulled["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
+    assert locked_and_pulled["pose"][-1, 2] < 0.5 * MM
+
+
+def test_rotating_before_insertion_is_blocked_by_the_lugs():
+    depth = LUG_TOP - 30.0 / STIFFNESS
+    motion = poses(np.array([CLEAR, LUG_TOP + 1.0 * MM, depth, depth]), np.deg2rad(45.0))
+    _, recording = drive_along(RailsStation(WORKCELL), np.array([0.0, 1.0, 2.0, 2.5]), motion)
+    assert recording["wrench"][-1, 2] == pytest.approx(30.0, abs=1.5)
+    assert recording["pose"][-1, 2] == pytest.approx(LUG_TOP, abs=0.1 * MM)

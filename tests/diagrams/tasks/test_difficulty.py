@@ -1,0 +1,153 @@
+"""Connector and clamp as hard as their options make them."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.make import make_env, resolve
+from guiderail.diagrams.tasks import bnc_options, grid_clamp_options
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
+from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.diagrams.tasks.insertion import InsertionReset
+from guiderail.models.errors import InputError
+from guiderail.models.objects.bnc_connector import BncDimensions
+from guiderail.models.objects.grid_clamp import GridClampDimensions
+from guiderail.models.units import MM
+from guiderail.tools.rollouts.evaluate import evaluate_policy
+from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.studies.lever_rule import lever_rule
+from guiderail.tools.studies.scripted import gentle_rule, straight_descent
+
+HARD = {"BncConnector": bnc_options.HARD, "GridClamp": grid_clamp_options.HARD}
+FRESH = {"options": {"new_run": True}, "seed": 300_000}
+
+
+@pytest.fixture(scope="module")
+def connector():
+    return make_env("BncConnector", difficulty="hard", guidance="kgrl")
+
+
+@pytest.fixture(scope="module")
+def clamp():
+    return make_env("GridClamp", difficulty="hard")
+
+
+@pytest.mark.parametrize("task", HARD)
+def test_hard_is_what_its_numbers_say_and_each_can_be_given_by_itself(task):
+    standard, hard = (resolve(task, {"difficulty": word}).values for word in ("standard", "hard"))
+    assert {name for name in hard if hard[name] != standard[name]} == {"difficulty", *HARD[task]}
+    assert {name: hard[name] for name in HARD[task]} == HARD[task]
+    assert resolve(task, HARD[task]).values == hard | {"difficulty": "standard"}
+    given = {"difficulty": "hard", "force_limit": 30.0}
+    assert resolve(task, given).values == hard | {"force_limit": 30.0}
+
+
+@pytest.mark.parametrize("task", HARD)
+def test_standard_is_what_it_was(task):
+    declared = resolve(task, {}).task
+    drawn = {"BncConnector": BncDimensions(), "GridClamp": GridClampDimensions()}[task]
+    assert declared.world() == type(declared.world())(drawn)
+    assert declared.collision.above == 35.0
+    assert declared.num_steps == {"BncConnector": 400, "GridClamp": 500}[task]
+    assert declared.choice.observation == "state"
+    if task == "BncConnector":
+        assert declared.reference() is reference_trajectory("insert")
+        np.testing.assert_array_equal(declared.constraints().c, -2.0 * MM)
+
+
+JACK, PLUG = [0.08709568301284622, 1.0485589162894264], [0.12997660481050205, 0.19223467197202893]  # [mm]
+
+
+def test_what_a_seed_draws_at_standard_is_what_it_drew():
+    """Of a generator, so the same everywhere."""
+    uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(3)
+    jack, plug = uncertainty.draw(rng, InsertionReset())
+    np.testing.assert_allclose(1e3 * jack, JACK, atol=1e-12)
+    np.testing.assert_allclose(1e3 * plug, PLUG, atol=1e-12)
+
+
+WRONG = [
+    ("BncConnector", {"force_limit": 4.0}, "force_limit must be at least 5"),
+    ("BncConnector", {"offset_range": (0.003, 0.002)}, "the smaller one first"),
+    ("BncConnector", {"offset_range": (0.0, 0.005)}, "two distances from 0 to 0.004 m"),
+    ("BncConnector", {"offset_range": (0.001,)}, "offset_range"),
+    ("BncConnector", {"mouth_chamfer": 0.1}, "mouth_chamfer must be at most 0.0006"),
+    ("BncConnector", {"bore_clearance": 0.0}, "bore_clearance must be at least"),
+    ("BncConnector", {"slot_clearance": 1.0}, "slot_clearance must be at most"),
+    ("BncConnector", {"bound": 0.0}, "bound must be at least"),
+    ("BncConnector", {"friction": np.nan}, "friction"),
+    ("BncConnector", {"jack_turn": -1.0}, "jack_turn must be at least 0"),
+    ("BncConnector", {"start_beside": 0.01}, "start_beside must be at most"),
+    ("BncConnector", {"demonstrations": "none"}, "there is no demonstrations 'none'"),
+    ("BncConnector", {"difficulty": "harder"}, "did you mean hard"),
+    ("GridClamp", {"force_limit": 100.0}, "force_limit must be at most 60"),
+    ("GridClamp", {"start_height": (0.03, 0.02)}, "the lower one first"),
+    ("GridClamp", {"start_height": (0.0, 0.02)}, "two heights from 0.013"),
+    ("GridClamp", {"seconds": 0.0}, "seconds must be at least 2"),
+    ("GridClamp", {"hole_chamfer": 0.0}, "hole_chamfer must be at least"),
+    ("GridClamp", {"peg_chamfer": 0.01}, "peg_chamfer must be at most"),
+    ("GridClamp", {"clearance": 1.0}, "clearance must be at most"),
+    ("GridClamp", {"friction": 2.0}, "friction must be at most 0.4"),
+]
+
+
+@pytest.mark.parametrize(("task", "wrong", "words"), WRONG)
+def test_what_is_out_of_range_is_refused_in_a_sentence(task, wrong, words):
+    with pytest.raises(InputError) as refused:
+        resolve(task, wrong)
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_the_connector_at_its_hardest_is_searched_for_where_it_may_be(connector):
+    declared = connector.unwrapped.task.declaration
+    assert declared.world().dimensions.mouth_chamfer == 0.1 * MM
+    assert declared.collision.above == 20.0
+    radii = []
+    for seed in range(20):
+        _, info = connector.reset(seed=seed)
+        radii.append(np.linalg.norm(info["jack_offset"]))
+    assert 2.6 * MM <= min(radii) < max(radii) <= 3.0 * MM
+    assert connector.observation_space.shape == (17,)
+    assert len(connector.unwrapped.task.symmetry.observation) == 17
+
+
+def test_a_turned_jack_is_turned():
+    env = make_env("BncConnector", jack_turn=5.0, uncertainty="disc")
+    _, info = env.reset(seed=1)
+    plant = env.task.diagram.GetSubsystemByName("station").plant
+    context = plant.GetMyContextFromRoot(env.simulator.get_context())
+    turn = plant.GetFrameByName("jack").CalcPoseInWorld(context).rotation().ToAngleAxis()
+    assert 0.0 < abs(info["jack_offset"][2]) <= np.deg2rad(5.0)
+    assert turn.angle() * turn.axis()[2] == pytest.approx(np.pi / 2 + info["jack_offset"][2])
+
+
+def test_the_lever_says_where_to_go(connector):
+    """Standing on the rim, the lever and the command lead to the jack."""
+    observation, info = connector.reset(seed=4)
+    while observation[9] < 0.15:
+        observation, _, _, _, _ = connector.step(np.zeros(2))
+    lever, commanded = observation[13:15] * 3.0 * MM, observation[15:17] * 2.0 * MM
+    np.testing.assert_allclose(commanded, connector.unwrapped.trace.commanded[-1, :2], atol=1e-6)
+    assert lever @ info["jack_offset"] > 0.3 * np.linalg.norm(lever) * np.linalg.norm(info["jack_offset"])
+
+
+def test_at_its_hardest_the_rule_locks_and_the_demonstrations_do_not(connector):
+    row = evaluate_policy(connector, lever_rule, episodes=1, **FRESH).iloc[0]
+    assert row["success"]
+    assert row["worst_violation"] <= 1e-9
+    assert not evaluate_policy(connector, still(connector), episodes=1, **FRESH)["success"].any()
+
+
+def test_at_its_hardest_the_rule_snaps_the_clamp_in_and_the_straight_descent_does_not(clamp):
+    assert evaluate_policy(clamp, gentle_rule, episodes=1, **FRESH)["success"].all()
+    assert not evaluate_policy(clamp, straight_descent, episodes=1, **FRESH)["success"].any()
+
+
+def test_a_clamp_has_the_time_and_the_height_that_it_is_given():
+    env = make_env("GridClamp", start_height=(0.04, 0.05), seconds=2.0)
+    env.reset(seed=0)
+    info, truncated = {}, False
+    while not truncated:
+        *_, truncated, info = env.step(np.zeros(3))
+    assert info["control_steps"] == 100
+    assert 0.04 <= env.trace.measured[0, 2] <= 0.05
