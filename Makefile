@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench docs clean
+.PHONY: demo test lint bench docs kills newest clean
 
 demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
@@ -18,6 +18,14 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p guiderail
+
+# Minutes each, and no part of `make test`: runs that are killed at random, and the newest versions of everything.
+kills: $(VENV)/.ready
+	$(BIN)/python tests/kills/kill.py --kills 40
+
+newest:
+	.ci/newest python3.12
+	.ci/newest python3.13
 
 bench: $(VENV)/.ready
 	$(BIN)/guiderail bench primitive

@@ -1,7 +1,9 @@
 """Cameras for image observations and for people, and the browser view."""
 
 import ctypes
+from contextlib import suppress
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
 from pydrake.geometry import (
@@ -11,6 +13,7 @@ from pydrake.geometry import (
     DepthRenderCamera,
     MakeRenderEngineVtk,
     Meshcat,
+    MeshcatAnimation,
     MeshcatParams,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
@@ -71,6 +74,10 @@ def add_camera(
         InputError: if this machine lacks the library that renders without a display.
     """
     check_rendering()
+    # Mesa renders with an LLVM, and Triton, which PyTorch with CUDA brings, has another one: loaded second, that of
+    # Triton ends the process in a segmentation fault, as it would when PyTorch imports its compiler after a render.
+    with suppress(ImportError):
+        import_module("triton")
     if not scene_graph.HasRenderer(_RENDERER):
         scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     clipping = ClippingRange(0.01, 10.0)
@@ -118,3 +125,16 @@ def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> tuple[Meshcat, Me
     visualizer = builder.AddNamedSystem("meshcat", MeshcatVisualizer(meshcat, parameters))
     builder.Connect(query, visualizer.query_object_input_port())
     return meshcat, visualizer
+
+
+def clear_meshcat(meshcat: Meshcat) -> None:
+    """Makes a browser view what it was when it was opened; who is connected to it stays.
+
+    A view is closed only with the diagram that publishes to it. So is its port, and whoever needs a view next gets it.
+    """
+    meshcat.Delete("/drake")
+    meshcat.Delete("/guiderail")
+    meshcat.DeleteRecording()
+    meshcat.SetAnimation(MeshcatAnimation())
+    meshcat.DeleteAddedControls()
+    meshcat.ResetRenderMode()

@@ -1,6 +1,8 @@
 """The Gymnasium environment of every task."""
 
 import re
+import weakref
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -60,12 +62,20 @@ class GuidedEnv(DrakeGymEnv):
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
 
-    def __init__(self, task: TaskDiagram, *, hold: int = 1, render_mode: str | None = None):
+    def __init__(
+        self,
+        task: TaskDiagram,
+        *,
+        hold: int = 1,
+        render_mode: str | None = None,
+        release: Callable[[], None] | None = None,
+    ):
         """
         Args:
             task: what to run.
             hold: control steps per decision, at least 1.
             render_mode: None, "human" (Meshcat) or "rgb_array" (a camera).
+            release: called once, when the environment is closed or nobody has it any more.
 
         Raises:
             InputError: if `hold` is no positive integer, or the task can't be rendered that way.
@@ -113,9 +123,24 @@ class GuidedEnv(DrakeGymEnv):
         self._running = False
         self._observation: np.ndarray | None = None
         self._violations = (-np.inf, -np.inf)
+        self._closed = False
+        self._release = weakref.finalize(self, release or _nothing)
+        self._release.atexit = False
+
+    def close(self) -> None:
+        """Ends the environment; what it recorded stays."""
+        self._running, self._closed = False, True
+        self._release()
+
+    def __reduce_ex__(self, protocol):
+        """A simulation in progress is not to be copied."""
+        made = "gymnasium.make" if self.spec is None else f"gymnasium.make({self.spec.id!r}, ...)"
+        raise InputError(f"an environment holds a simulation and cannot be pickled: call {made} in the worker instead")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         """Starts an episode; `options` are the task's own (its `Reset`)."""
+        if self._closed:
+            raise InputError("the environment is closed: make another one")
         # Not the parent's reset: it initializes before the state is set, and refuses options.
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
@@ -257,6 +282,10 @@ class GuidedEnv(DrakeGymEnv):
             "control_steps": self._control_steps,
             **terms,
         }
+
+
+def _nothing() -> None:
+    """Nobody waits for the environment's diagram."""
 
 
 def check_render_mode(render_mode: str | None) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,16 @@ from pydantic import Field
 from pydrake.systems.framework import Diagram, System
 from threadpoolctl import threadpool_limits
 
+from guiderail.diagrams.cameras import clear_meshcat
 from guiderail.diagrams.env import GuidedEnv, check_render_mode
 from guiderail.diagrams.guidance.known import Known
-from guiderail.diagrams.guidance.registry import build_guidance, check_guidance, possible_guidance
+from guiderail.diagrams.guidance.registry import GUIDANCE, build_guidance, check_guidance, possible_guidance
 from guiderail.diagrams.options import Integer, Options, PrimitiveOptions, TemplateOptions, choose, validated
+from guiderail.diagrams.pool import Pool
 from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of
+from guiderail.diagrams.task import TaskDiagram
+from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of, randomizes
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
 from guiderail.models.errors import InputError
@@ -143,9 +147,46 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     check_render_mode(render_mode)
     resolved = resolve(task, options)
     threadpool_limits(1)
+    key = _key(resolved, render_mode)
+    built = _POOL.take(key, lambda: _build(resolved, render_mode))
+    # What a run hides is the task's: it is this environment's own, whoever had the diagram before.
+    reset = randomizes(resolved.task, built.station, built.guidance)
+    diagram = replace(built.diagram, randomize=reset, declaration=resolved.task)
+    release = partial(_release, key, built)
+    return GuidedEnv(diagram, hold=resolved.task.choice.hold, render_mode=render_mode, release=release)
+
+
+@dataclass(frozen=True)
+class _Built:
+    diagram: TaskDiagram
+    station: Station
+    guidance: Diagram
+
+
+_POOL: Pool[_Built] = Pool()
+
+
+def _release(key: Hashable, built: _Built) -> None:
+    if built.diagram.meshcat is not None:
+        clear_meshcat(built.diagram.meshcat)
+    _POOL.give_back(key, built)
+
+
+def _build(resolved: Resolved, render_mode: str | None) -> _Built:
     station = make_station(resolved)
-    diagram = assemble(resolved.task, station, make_guidance(resolved, station), render_mode=render_mode)
-    return GuidedEnv(diagram, hold=resolved.task.choice.hold, render_mode=render_mode)
+    guidance = make_guidance(resolved, station)
+    return _Built(assemble(resolved.task, station, guidance, render_mode=render_mode), station, guidance)
+
+
+def _key(resolved: Resolved, render_mode: str | None) -> Hashable:
+    """What makes two environments' diagrams the same: everything that they are made of."""
+    kind = GUIDANCE.get(resolved.task.choice.guidance)
+    key = (type(resolved.task), kind, resolved.station, render_mode, *sorted(resolved.values.items()))
+    try:
+        hash(key)
+    except TypeError:
+        return object()  # an option that cannot be compared: nobody else has it
+    return key
 
 
 def make_skill(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lapack
 
 from guiderail.models.vectors import cross
 
@@ -55,16 +56,30 @@ def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: flo
         Lambda_inverse: Λ⁻¹ = J M⁻¹ Jᵀ, the inertia at the tool, inverted.
         damping_ratio: ζ.
     """
-    L_modes, eigenvalues = _modes(K, Lambda_inverse)
-    return (L_modes * (2.0 * damping_ratio * np.sqrt(np.maximum(eigenvalues, 0.0)))) @ L_modes.T
+    L_modes, eigenvalues = _modes(K, _root_of_inverse(Lambda_inverse))
+    return (L_modes * _dampings(eigenvalues, damping_ratio)) @ L_modes.T
 
 
-def _modes(K: np.ndarray, Lambda_inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """L U with L Lᵀ = Λ and (L U)ᵀ Λ⁻¹ L U = 1, U the eigenvectors of L⁻¹ K L⁻ᵀ, (6, 6), and its eigenvalues, (6,)."""
-    # With Λ⁻¹ = R Rᵀ, L = R⁻ᵀ: nothing but R has to be inverted.
-    R = np.linalg.cholesky(Lambda_inverse)
-    eigenvalues, modes = np.linalg.eigh(R.T @ K @ R)
-    return np.linalg.solve(R.T, modes), eigenvalues
+def _root_of_inverse(Lambda_inverse: np.ndarray) -> np.ndarray:
+    """R⁻¹, (6, 6), lower triangular, of Λ⁻¹ = R Rᵀ: Λ = R⁻ᵀ R⁻¹, and nothing else has to be inverted."""
+    # LAPACK itself: what NumPy does around six numbers takes longer than they do.
+    R, failed = lapack.dpotrf(Lambda_inverse, lower=1, clean=1)
+    if failed:
+        raise np.linalg.LinAlgError("the inertia at the tool is not positive definite")
+    return lapack.dtrtri(R, lower=1)[0]
+
+
+def _modes(K: np.ndarray, R_inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """L U with L = R⁻ᵀ, Λ = L Lᵀ and (L U)ᵀ Λ⁻¹ L U = 1, U the eigenvectors of L⁻¹ K L⁻ᵀ, and its eigenvalues, (6,)."""
+    R = lapack.dtrtri(R_inverse, lower=1)[0]
+    eigenvalues, modes, failed = lapack.dsyevd(R.T @ K @ R, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("the modes of the stiffness did not converge")
+    return R_inverse.T @ modes, eigenvalues
+
+
+def _dampings(eigenvalues: np.ndarray, damping_ratio: float) -> np.ndarray:
+    return 2.0 * damping_ratio * np.sqrt(np.maximum(eigenvalues, 0.0))
 
 
 def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
@@ -123,17 +138,21 @@ def impedance_torques(
         R[:3, :3] = R[3:, 3:] = R_axes
         K = R @ K @ R.T
 
-    M_inverse_JT = np.linalg.solve(M, J.T)
+    _, M_inverse_JT, failed = lapack.dposv(M, J.T, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("the arm's mass matrix is not positive definite")
     Lambda_inverse = J @ M_inverse_JT + _REGULARIZATION
-    D = damping_matrix(K, Lambda_inverse, damping_ratio)
-    wanted_wrench = spring_wrench(K, p_error, eta, epsilon) - D @ (J @ v)
+    R_inverse = _root_of_inverse(Lambda_inverse)
+    L_modes, eigenvalues = _modes(K, R_inverse)
+    damping = L_modes @ (_dampings(eigenvalues, damping_ratio) * (L_modes.T @ (J @ v)))
+    wanted_wrench = spring_wrench(K, p_error, eta, epsilon) - damping
     along_axes = wanted_wrench if R_axes is None else R.T @ wanted_wrench
     wrench = _clipped(along_axes, wrench_limits)
     if R_axes is not None:
         wrench = R @ wrench
     tool_acceleration = M_inverse_JT.T @ posture_torque
-    if _is_regular(Lambda_inverse):
-        leak = np.linalg.solve(Lambda_inverse, tool_acceleration)  # the tool wrench of the posture's torque
+    if _is_regular(R_inverse):
+        leak = R_inverse.T @ (R_inverse @ tool_acceleration)  # the tool wrench of the posture's torque
     else:
         leak = reachable_inertia(Lambda_inverse) @ tool_acceleration
     wanted_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
@@ -142,10 +161,10 @@ def impedance_torques(
     return JointTorques(torque, wrench, is_saturated)
 
 
-def _is_regular(Lambda_inverse: np.ndarray) -> bool:
+def _is_regular(R_inverse: np.ndarray) -> bool:
     """Whether no direction weighs more than `LIGHT`, for certain: all six together don't."""
-    masses = np.linalg.inv(Lambda_inverse).diagonal() / _SCALE**2
-    return float(masses.sum()) < LIGHT
+    scaled = R_inverse / _SCALE
+    return float(np.vdot(scaled, scaled)) < LIGHT
 
 
 def _clipped(values: np.ndarray, limits: np.ndarray) -> np.ndarray:

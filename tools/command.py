@@ -196,7 +196,12 @@ def evaluate(
     for name in others:
         if name not in found["beside"]:
             _say(f"{name} is left out: it sees or moves other things than this environment")
+    differs = [] if as_json else found.pop("differs_from_thesis")
     _print(found, as_json)
+    if differs:
+        typer.echo("differs from the thesis in")
+    for words in differs:
+        typer.echo(f"  · {words}")
 
 
 @command("replay runs/passage --html replay.html")
@@ -319,6 +324,42 @@ def study(
         raise RunsFailedError(found["failed"], None)
 
 
+@command("report studies --out report.html")
+def report(
+    runs: Annotated[list[Path], _arg("Folders of runs, or of a study.", "RUN...")],
+    out: Annotated[Path, _opt("The page to write, .html.")] = Path("report.html"),
+    episodes: Annotated[
+        int, _opt("Held-out episodes to judge each run on that no study judged; what was judged is used again.")
+    ] = 0,
+) -> None:
+    """Write what runs or a study came to as one page.
+
+    It needs nothing else: learning curves with bootstrap bands, episodes to convergence, held-out success beside
+    policies that learned nothing, safety from the ledger, in what it differs from the thesis, configuration, versions,
+    and the commands that repeat it.
+    """
+    from guiderail.tools.report.report import write_report
+
+    typer.echo(write_report(runs, out, episodes=episodes))
+
+
+@command("results studies --out docs/results")
+def results(
+    studies: Annotated[
+        list[Path] | None, _arg("Folders of finished studies; none: the stored ones.", "STUDY...")
+    ] = None,
+    out: Annotated[Path, _opt("The folder of results: a table for each study, and the page.")] = Path("docs/results"),
+) -> None:
+    """Write what was reproduced as a page, from the tables that studies left.
+
+    It keeps their tables, so that the page can be written anew without them: each study with what the thesis says,
+    every seed, the time it took, and in what its setting differs.
+    """
+    from guiderail.tools.studies.results import write_results
+
+    typer.echo(write_results(studies or [], out))
+
+
 @command("reproduce 5.6 --seeds 3")
 def reproduce(
     figure: Annotated[str, _arg("A figure of the thesis: {figures}.", "FIGURE", "figures")],
@@ -339,15 +380,17 @@ def reproduce(
 @command("bench primitive")
 def bench(
     what: Annotated[str, _arg("What is measured: {benchmarks}.", "WHAT", "benchmarks")],
+    task: Annotated[str | None, _arg("Whose training is measured: {tasks}.", "TASK", "tasks")] = None,
+    env: Env = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how fast the primitive or the simulation is here.
+    """Measure how fast the primitive, the simulation or a learner is here, or where a training run's time goes.
 
     It takes a minute or two.
     """
     from guiderail.tools.benchmarks import run_benchmark
 
-    result, show = run_benchmark(what)
+    result, show = run_benchmark(what, task=task, environment=_environment(env))
     typer.echo(json.dumps(result)) if as_json else show(result)
 
 

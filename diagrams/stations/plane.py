@@ -11,7 +11,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import ModelInstanceIndex, PrismaticJoint, SpatialInertia
+from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
 
@@ -21,6 +21,9 @@ from guiderail.diagrams.task import exact_period
 from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
+
+OBSTACLE_Z = -0.035  # [m] below the robot: it is drawn, and the robot may be above it
+OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,7 @@ class PlaneStation(Station):
         self._robot = _add_robot(self.plant, world, config)
         _add_walls(self.plant, world, config)
         _add_markings(self.plant, world)
+        self._places = _add_moving_obstacles(self.plant, world) if world.obstacles_move else []
         self.plant.Finalize()
 
         # F = clip(k (x_d - x), ±F_max), against the rails' viscous friction.
@@ -150,6 +154,12 @@ class PlaneStation(Station):
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositionsAndVelocities(plant_context, self._robot, np.concatenate([pose, np.zeros(2)]))
 
+    def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
+        """Puts the obstacles to (n, 2), in a world where they move; `context` is the root context."""
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        for place, (x, y) in zip(self._places, obstacles, strict=True):
+            place.SetPoseInParentFrame(plant_context, RigidTransform([x, y, OBSTACLE_Z]))
+
 
 def _add_robot(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig) -> ModelInstanceIndex:
     robot = plant.AddModelInstance("robot")
@@ -186,7 +196,24 @@ def _add_markings(plant: MultibodyPlant, world: NarrowPassage) -> None:
     mark("floor", Box(3.0, 3.0, 0.001), 0.4, 0.5, -0.06, [0.97, 0.97, 0.95, 1.0])
     mark("zone", Box(1.0, 3.0, 0.001), world.zone_x + 0.5, 0.5, -0.055, [0.95, 0.72, 0.70, 1.0])
     mark("goal", Cylinder(world.goal_radius, 0.001), *world.goal, -0.05, [0.55, 0.80, 0.55, 1.0])
-    mark("obstacle", Cylinder(world.obstacle_radius, 0.03), *world.obstacle, -0.035, [0.75, 0.25, 0.15, 1.0])
+    if not world.obstacles_move:
+        mark("obstacle", _obstacle_shape(world), *world.obstacle, OBSTACLE_Z, OBSTACLE_COLOR)
+
+
+def _add_moving_obstacles(plant: MultibodyPlant, world: NarrowPassage) -> list[FixedOffsetFrame]:
+    """Obstacles to be seen, each on a frame that a reset can move."""
+    model, places = plant.AddModelInstance("obstacles"), []
+    for number, (x, y) in enumerate(world.obstacles):
+        X_WO = RigidTransform([x, y, OBSTACLE_Z])
+        places.append(plant.AddFrame(FixedOffsetFrame(f"place_{number}", plant.world_frame(), X_WO)))
+        body = plant.AddRigidBody(f"obstacle_{number}", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
+        plant.WeldFrames(places[-1], body.body_frame())
+        plant.RegisterVisualGeometry(body, RigidTransform(), _obstacle_shape(world), "disc", np.array(OBSTACLE_COLOR))
+    return places
+
+
+def _obstacle_shape(world: NarrowPassage) -> Cylinder:
+    return Cylinder(world.obstacle_radius, 0.03)
 
 
 def _contact(config: PlaneConfig) -> ProximityProperties:

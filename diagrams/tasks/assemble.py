@@ -224,7 +224,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         observation_space=loop.space,
         reward_terms=reward.term_names,
         ledger_fields=SafetyLedger.FIELDS,
-        randomize=_randomize(task, station, guidance),
+        randomize=randomizes(task, station, guidance),
         push=_push(station) if task.pushable else None,
         meshcat=meshcat,
         symmetry=task.symmetry(),
@@ -294,7 +294,7 @@ def assemble_skill(
     meshcat = _add_view(builder, task, station, render_mode)
     diagram = builder.Build()
     diagram.set_name(f"{task.name.replace('/', '_')}_skill")
-    return SkillDiagram(diagram, station.control_period, task.num_steps, _randomize(task, station, guidance), meshcat)
+    return SkillDiagram(diagram, station.control_period, task.num_steps, randomizes(task, station, guidance), meshcat)
 
 
 def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
@@ -321,7 +321,9 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
     return violations
 
 
-def _randomize(task: Task, station: Station, guidance: Diagram) -> Any:
+def randomizes(task: Task, station: Station, guidance: Diagram) -> Any:
+    """What draws an episode's conditions and writes them into the root context: `TaskDiagram.randomize`."""
+
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         return task.reset(station, guidance, context, rng, validated(task.Reset, options, f"a reset of {task.name}"))
 

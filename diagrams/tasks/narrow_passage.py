@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.cameras import Camera
 from guiderail.diagrams.observation import Observed
-from guiderail.diagrams.options import Numbers, Options, ResetOptions
 from guiderail.diagrams.scene import Scene, in_plane
+from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.drawn import Drawn
+from guiderail.diagrams.tasks.narrow_passage_conditions import conditions
+from guiderail.diagrams.tasks.narrow_passage_options import HARD, NarrowPassageOptions, NarrowPassageReset
 from guiderail.diagrams.tasks.narrow_passage_rewards import reward_terms
+from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Task
+from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
 from guiderail.models.demonstrations import narrow_passage as demonstrations
 from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut
@@ -30,8 +33,6 @@ from guiderail.systems.reward_system import RewardTerm
 IMAGE_SIZE = (144, 110)  # width and height of the policy's image (4.4.1, end)
 COMPONENTS = 20  # of the mixture: with 8 to 16 of them the passage is blurred
 FLOOR = 0.002  # [m], how well a hand repeats itself: added to the demonstrations' covariance as a standard deviation
-BLOCKED_STEPS = 20
-BLOCKED_PROGRESS = 1e-4
 HELD_OUT_DEVIATION = 0.01  # [m] of a held-out start from the usual one
 FARTHEST_START = 2.0  # [m] along x and y
 
@@ -42,34 +43,37 @@ def reference_trajectory() -> ReferenceTrajectory:
     return ReferenceTrajectory.from_demonstrations(demonstrations.load(), components=COMPONENTS, floor=FLOOR)
 
 
-class NarrowPassageReset(ResetOptions):
-    """Of a reset of the passage."""
-
-    start: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="(x, y) [m] to start from, instead of where the demonstrations do"
-    )
-
-
 @register_task("NarrowPassage")
 class NarrowPassage(Task):
     """Through the gap: "sparse" is the thesis's reward (4.22-4.25), "shaped" adds how much nearer the goal came, in
     centimetres; "state" is the time in [-1, 1] (the thesis's policy state), "image" is 110 x 144 x 3."""
 
     world_kind = "plane"
+    Options = NarrowPassageOptions
     Reset = NarrowPassageReset
+    options: NarrowPassageOptions
     rewards = ("sparse", "shaped")
     observations = ("state", "image")
     defaults = {"guidance": "skgrl", "hold": 5}
+    difficulties = {STANDARD: {}, "hard": HARD}
     num_steps = demonstrations.NUM_STEPS
     clip = 1.0
 
-    def __init__(self, options: Options, choice: Choice):
+    def __init__(self, options: NarrowPassageOptions, choice: Choice):
         super().__init__(options, choice)
-        self._world = World()
+        self._world = options.world()
+        self._obstacles: Drawn | None = None
 
     def world(self) -> World:
         """Walls, a zone, an obstacle and a goal."""
         return self._world
+
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Where the obstacles are, one after the other."""
+        if not self.options.drawn:
+            return {}
+        self._obstacles = Drawn(builder, "obstacles", self._world.obstacles.size)
+        return {"obstacles": self._obstacles.port}
 
     def reference(self) -> ReferenceTrajectory:
         """Of the nine demonstrations."""
@@ -84,42 +88,35 @@ class NarrowPassage(Task):
         return self._world.keep_out()
 
     def observed(self) -> Sequence[Observed] | Camera:
-        """The phase; or the plane from above, lying on its side: the way up is to the right."""
+        """The phase, and where obstacles are that a reset draws; or the plane from above, lying on its side: the way up
+        is to the right."""
         if self.choice.observation == "state":
-            return (Observed("phase"),)
+            usual = self._world.obstacles.ravel()
+            beside = Observed("obstacles", usual, self.options.obstacle_beside or 1.0)
+            return (Observed("phase"), beside) if self.options.obstacle_beside else (Observed("phase"),)
         R_WC = RotationMatrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
         return Camera(IMAGE_SIZE, np.deg2rad(30), RigidTransform(R_WC, [0.42, 0.5, 1.5]))
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of the way gone, the obstacle and the goal; of the way to the goal where the reward is shaped."""
-        return reward_terms(self.choice.reward, self._world)
+        return reward_terms(self.choice.reward, self._world, self.options.drawn)
 
     def conditions(self) -> list[Condition]:
-        """At the goal; or pressed against a wall, or stopped before it by a filter, and getting nowhere."""
-        world = self._world
-
-        def blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:
-            return (contact_force[0] > 0 or fallback[0] > 0) and world.in_passage(pose)
-
-        return [
-            Condition("success", {"pose": 2}, world.at_goal),
-            Condition(
-                "blocked",
-                {"pose": 2, "contact_force": 1, "fallback": 1},
-                blocked,
-                steps=BLOCKED_STEPS,
-                progress=lambda pose, contact_force, fallback: pose[1],
-                min_progress=BLOCKED_PROGRESS,
-            ),
-        ]
+        """At the goal, or getting nowhere; where touching obstacles ends an episode, that."""
+        return conditions(self._world, self.options.obstacles_end)
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Starts where the demonstrations do; held out, a little beside it."""
-        start = reference_trajectory().means[0].copy()
-        if options.held_out:
-            start = start + HELD_OUT_DEVIATION * rng.standard_normal(2)
+        """Starts where the demonstrations do, or as far beside it as it is asked for; held out, a little beside it."""
+        start, obstacles = reference_trajectory().means[0].copy(), self._world.obstacles
+        deviation = self.options.start_deviation or (HELD_OUT_DEVIATION if options.held_out else 0.0)
+        if self.options.drawn:
+            rng = episode_stream(rng, options.held_out)
+            sides = (-1.0) ** (rng.integers(2) + np.arange(len(obstacles)))
+            obstacles[:, 0] += self.options.obstacle_beside * sides
+        if deviation:
+            start = start + deviation * rng.standard_normal(2)
         if options.start is not None:
             start = np.array(options.start)
         if np.abs(start).max() > FARTHEST_START:
@@ -127,7 +124,12 @@ class NarrowPassage(Task):
                 f"the reset option 'start' is at most {FARTHEST_START:g} m along x and y, not {start.tolist()}"
             )
         station.set_pose(context, start)
-        return {"start": start}
+        if self._obstacles is None:
+            return {"start": start}
+        assert isinstance(station, PlaneStation)
+        self._obstacles.set(context, obstacles.ravel())
+        station.set_obstacles(context, obstacles)
+        return {"start": start, "obstacles": obstacles}
 
     def camera(self) -> Camera:
         """The plane from above."""

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.cameras import Camera, look_at
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.known import Template
 from guiderail.diagrams.observation import Observed
-from guiderail.diagrams.options import Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.scene import Scene, in_frame, viewpoint
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, vessel_or_refuse
 from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.drawn import Drawn
 from guiderail.diagrams.tasks.offsets import episode_stream
+from guiderail.diagrams.tasks.pouring_belief import draw_error
 from guiderail.diagrams.tasks.pouring_conditions import conditions
+from guiderail.diagrams.tasks.pouring_options import HARD, MAX_MUG_ERROR, MAX_MUG_OFFSET, PouringOptions, PouringReset
 from guiderail.diagrams.tasks.pouring_rewards import reward_terms
-from guiderail.diagrams.tasks.pouring_template import SPARSE_INPUT_SPEED, make_skill
+from guiderail.diagrams.tasks.pouring_template import SPARSE_INPUT_SPEED, frames_of, make_aimed_skill, make_skill
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Task, Threshold
+from guiderail.diagrams.tasks.task import STANDARD, Choice, Task, Threshold
 from guiderail.models.errors import InputError
-from guiderail.models.objects.vessels import MUG, Ball
+from guiderail.models.objects.vessels import Ball
 from guiderail.models.pose_coordinates import transform_to_pose
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
@@ -36,37 +37,13 @@ POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
 START_HEIGHT = (0.08, 0.19)  # [m]
-MAX_MUG_OFFSET = 0.04  # [m] along x and y: as far as the arm reaches around the mug
-
-
-class PouringOptions(Options):
-    """Of pouring."""
-
-    input_speed: Number | None = Field(
-        None, ge=0.2, le=2.0, description="how much faster the template's inputs are; 1, and 1.7 where sparse, if None"
-    )
-    mug_inner_diameter: Number = Field(MUG.inner_diameter, description="of the mug that stands there [m]")
-    mug_depth: Number = Field(MUG.depth, description="[m]")
-    mug_offset: Number = Field(
-        0.0, ge=0, le=MAX_MUG_OFFSET, description="up to which the mug is moved along x and y at every reset [m]"
-    )
-
-
-class PouringReset(ResetOptions):
-    """Of a reset of pouring."""
-
-    start: Numbers | None = Field(
-        None, min_length=3, max_length=3, description="(x, y, z) [m] of the upright thermos's tip in the mug's frame"
-    )
-    mug_position: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="(x, y) [m] of the mug from where it nominally stands"
-    )
 
 
 @register_task("Pouring")
 class Pouring(Task):
     """Pour both balls: "sparse" is rewarded as in (3.5-3.6), "shaped" by the template's transition distances too
-    (3.7), "hand_shaped" as in (3.8-3.10)."""
+    (3.7), "hand_shaped" as in (3.8-3.10). With the standard template a constant action pours; "hard" is a mug that the
+    template believes elsewhere."""
 
     world_kind = "pouring"
     Options = PouringOptions
@@ -74,16 +51,23 @@ class Pouring(Task):
     options: PouringOptions
     rewards = ("shaped", "sparse", "hand_shaped")
     defaults = {"guidance": "sct", "hold": 10}
+    difficulties = {STANDARD: {}, "hard": HARD}
     learner = {"algorithm": "sac", "preset": "pouring"}
-    num_steps = 1500  # 150 decisions at 10 Hz, about as many as in the thesis
+    num_steps: int  # 1500 unless said otherwise: 150 decisions at 10 Hz, about as many as in the thesis
     clip = 10.0
     collision = Threshold("touched")
     pushable = False  # what is in a thermos does not move along with an arm that is put elsewhere
 
     def __init__(self, options: PouringOptions, choice: Choice):
         super().__init__(options, choice)
+        options.check()
         self._config = PouringConfig(mug=vessel_or_refuse(options.mug_inner_diameter, options.mug_depth, Ball()))
-        self._skill = make_skill(self._config, self._input_speed())
+        self.num_steps = round(options.time_limit / self._config.control_period)
+        speed = self._input_speed()
+        self._skill = make_skill(self._config, speed)
+        if options.aim:
+            self._skill = make_aimed_skill(self._config, speed, options.aim_speed, options.pour_speed)
+        self._error: Drawn | None = None
 
     def _input_speed(self) -> float:
         if self.options.input_speed is not None:
@@ -94,18 +78,27 @@ class Pouring(Task):
         """The vessels, and where they stand."""
         return self._config
 
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Where the mug is believed to be, from where it is, if that is to be seen."""
+        if not self.options.aim:
+            return {}
+        self._error = Drawn(builder, "mug_error", 2)
+        return {"mug_error": self._error.port}
+
     def template(self) -> Template:
-        """Of figure 2.2 and table 3.3."""
+        """Of figure 2.2 and table 3.3, or the one that can be aimed."""
         active = self.choice.values["active_constraints"]
-        return Template(self._skill, {"mug_tip": RigidTransform()}, active_constraints=active, leash=LEASH)
+        return Template(self._skill, frames_of(self._skill, RigidTransform()), active_constraints=active, leash=LEASH)
 
     def observed(self) -> Sequence[Observed]:
-        """The tip's pose in the frame of the mug's tip, position in units of 0.2 m and a rotation vector."""
-        return (Observed("tip_in_mug", 0.0, [1.0 / POSITION_SCALE] * 3 + [1.0] * 3),)
+        """The tip's pose in the frame of the mug's tip, position in units of 0.2 m and a rotation vector; where Pour
+        can be aimed, the error of the template's belief and its state, from -1 to 1, too."""
+        tip = Observed("tip_in_mug", 0.0, [1.0 / POSITION_SCALE] * 3 + [1.0] * 3)
+        return (tip, Observed("mug_error", 0.0, MAX_MUG_ERROR), Observed("state", 1.0)) if self.options.aim else (tip,)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Equations 3.5 to 3.10."""
-        return reward_terms(self.choice.reward, num_actions, self.choice.hold)
+        """Equations 3.5 to 3.10, and aiming."""
+        return reward_terms(self.choice.reward, num_actions, self.choice.hold, self.options.aim)
 
     def conditions(self) -> list[Condition]:
         """Poured, spilled, or touched."""
@@ -114,8 +107,7 @@ class Pouring(Task):
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Places the mug, the upright thermos and the balls; everything is drawn, whether or not an option replaces
-        it."""
+        """Places the mug, the upright thermos and the balls; everything is drawn, even what an option replaces."""
         assert isinstance(station, PouringStation)
         episode = episode_stream(rng, options.held_out)
         azimuth = np.deg2rad(episode.uniform(*START_AZIMUTH_DEG))
@@ -128,14 +120,19 @@ class Pouring(Task):
             raise InputError(
                 f"the mug can be moved by {MAX_MUG_OFFSET} m along x and y, where the arm reaches: not more"
             )
-        X_TMug = RigidTransform([*p_TMug, 0.0])
-        station.set_mug(context, X_TMug)
+        error = draw_error(episode, self.options, options)
+        # Where it is believed to be stays where the arm reaches; it is the mug that stands elsewhere.
+        believed, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
+        frames = frames_of(self._skill, believed)
+        station.set_mug(context, RigidTransform([*p_TMug, 0.0]))
         if isinstance(guidance, Guidance):
-            guidance.set_frames(context, {"mug_tip": X_TMug})
+            guidance.set_frames(context, frames)
+        if self._error is not None:
+            self._error.set(context, error)
         # Turned as the template wants it, whether or not that guides: all kinds of guidance start alike.
-        X_TP = self._skill.project(self._skill.initial_state, RigidTransform(X_TMug @ p_MP), {"mug_tip": X_TMug})
+        X_TP = self._skill.project(self._skill.initial_state, RigidTransform(believed @ p_MP), frames)
         station.set_pose(context, transform_to_pose(X_TP))
-        return {"start": p_MP, "mug_position": p_TMug}
+        return {"start": p_MP, "mug_position": p_TMug} | ({"mug_error": error} if error.any() else {})
 
     def camera(self) -> Camera:
         """From before the mug and a little above it."""

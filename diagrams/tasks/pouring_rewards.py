@@ -15,10 +15,15 @@ APPROACH = 15.0  # [1/m] equation 3.9
 NEAR_BONUS = 0.2  # a decision
 TILT = 20.0  # [1/rad] equation 3.10
 NEAR = 0.07  # [m] where pouring begins; the thesis's 0.04 is nearer than these vessels' rims let the tips come
+POUR = 2  # the template's state in which it pours
+AIM = np.array([0.0, -0.045])  # [m] in the mug's frame: where a tip that is tipped over pours both balls
+AIMING = 2000.0  # [1/m] 50 mm count half as much as the whole tilt
 
 
-def reward_terms(reward: str, inputs: int, hold: int) -> list[RewardTerm]:
+def reward_terms(reward: str, inputs: int, hold: int, aimed: bool = False) -> list[RewardTerm]:
     """The terms of a reward by name, for `inputs` actions and one of `hold` control steps of a decision.
+
+    Where Pour can be `aimed`, the shaped reward also has how much nearer the tip came to where it should be, in Pour.
 
     A decision's reward is the sum over its control steps: what the thesis gives once a decision is divided by `hold`.
     """
@@ -38,7 +43,8 @@ def reward_terms(reward: str, inputs: int, hold: int) -> list[RewardTerm]:
             {"progress": 1, "last_progress": 1},
             lambda progress, last_progress: SHAPING * float(progress[0] - last_progress[0]),
         )
-        return [*terms, shaping]
+        aiming = RewardTerm("aiming", {"tip_in_mug": 6, "last_tip_in_mug": 6, "state": 1}, _aiming)
+        return [*terms, shaping, aiming] if aimed else [*terms, shaping]
     if reward == "hand_shaped":
         poses = {"tip_in_mug": 6, "last_tip_in_mug": 6}
 
@@ -50,6 +56,14 @@ def reward_terms(reward: str, inputs: int, hold: int) -> list[RewardTerm]:
 
         return [*terms, RewardTerm("approach", poses, approach), RewardTerm("tilting", poses, tilting)]
     raise InputError(f"there is no reward '{reward}': use {', '.join(REWARDS)}")
+
+
+def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarray) -> float:
+    """Only in Pour: until then the template leads."""
+    if state[0] != POUR:
+        return 0.0
+    before, after = (float(np.linalg.norm(tip[:2] - AIM)) for tip in (last_tip_in_mug, tip_in_mug))
+    return AIMING * (before - after)
 
 
 def _approach(tip: np.ndarray, last: np.ndarray, hold: int) -> float:

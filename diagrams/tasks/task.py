@@ -78,7 +78,7 @@ class Task(ABC):
     defaults: ClassVar[Mapping[str, Any]] = {}
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}}
     learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "robust"}
-    num_steps: ClassVar[int]
+    num_steps: int
     clip: ClassVar[float] = 3.0
     collision: ClassVar[Threshold] = Threshold()
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
@@ -149,7 +149,11 @@ class Task(ABC):
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Draws an episode's conditions and writes them into the root context; returns what `info` says of them."""
+        """Draws an episode's conditions and writes them into the root context; returns what `info` says of them.
+
+        They go nowhere else: rewards and conditions read signals, and may belong to a diagram that was built for an
+        earlier environment with the same options. What is remembered in the task is for its next reset.
+        """
 
     # How it is drawn.
 

@@ -1,5 +1,6 @@
 """The planar world with a narrow passage (thesis, figures 4.3 and 5.3)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,9 @@ class NarrowPassage:
         zone_x: the restricted zone is x ≥ zone_x.
         obstacle, obstacle_radius: the disc that was put on the path after the demonstrations; it costs, but it does not
             block.
-        obstacle_margin: the distance from the disc within which it costs.
+        second_obstacle: another such disc, where there is one.
+        obstacles_move: whether episodes differ in where the discs are.
+        obstacle_margin: the distance from a disc within which it costs.
         robot_radius: of the robot itself; its walls are that much smaller than the centre's.
     """
 
@@ -34,8 +37,15 @@ class NarrowPassage:
     zone_x: float = 0.60
     obstacle: tuple[float, float] = (0.56, 0.27)
     obstacle_radius: float = 0.03
+    second_obstacle: tuple[float, float] | None = None
+    obstacles_move: bool = False
     obstacle_margin: float = 0.04
     robot_radius: float = 0.015
+
+    @property
+    def obstacles(self) -> np.ndarray:
+        """Where the discs are, (n, 2)."""
+        return np.array([self.obstacle] if self.second_obstacle is None else [self.obstacle, self.second_obstacle])
 
     @property
     def walls(self) -> tuple[np.ndarray, np.ndarray]:
@@ -63,13 +73,19 @@ class NarrowPassage:
         """True in the gap and just before it, where a robot that doesn't advance is blocked by the walls."""
         return bool(self.wall_y[0] - 0.05 < pose[1] < self.wall_y[1] + 0.02)
 
-    def obstacle_distance(self, pose: np.ndarray) -> float:
-        """d_t of equation 4.24: from the robot's centre to the edge of the obstacle, negative inside."""
-        return float(np.hypot(pose[0] - self.obstacle[0], pose[1] - self.obstacle[1])) - self.obstacle_radius
+    def obstacle_distance(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
+        """d_t of equation 4.24: from the robot's centre to the edge of an obstacle, negative inside.
 
-    def obstacle_cost(self, pose: np.ndarray) -> float:
-        """r_o of equation 4.24."""
-        return -100.0 * max(self.obstacle_margin - self.obstacle_distance(pose), 0.0)
+        Args:
+            pose: (2,) of the robot.
+            obstacle: (x, y) where that is, if not where the first one usually is.
+        """
+        x, y = self.obstacle if obstacle is None else obstacle
+        return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius
+
+    def obstacle_cost(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
+        """r_o of equation 4.24, of one obstacle."""
+        return -100.0 * max(self.obstacle_margin - self.obstacle_distance(pose, obstacle), 0.0)
 
 
 def action_cost(displacement: np.ndarray) -> float:

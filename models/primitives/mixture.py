@@ -1,6 +1,6 @@
 """Gaussian mixtures of demonstrations, and regression on them (thesis, sections 2.2.3 and 2.2.4).
 
-scikit-learn fits the mixture, gmr conditions it; what stands here is what neither knows: that the first column is time.
+scikit-learn fits the mixture; what stands here is what it doesn't know: that the first column is time.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 
-# Importing them takes over a second, which who only reads a file need not wait for.
+# Importing it takes over a second, which who only reads a file need not wait for.
 if TYPE_CHECKING:
-    from gmr import GMM
     from sklearn.mixture import GaussianMixture
 
 # Variance added to every component, relative to the data's own: what keeps EM alive where demonstrations coincide.
@@ -25,9 +24,19 @@ _MOST_COMPONENTS = 20
 
 @dataclass(frozen=True)
 class Mixture:
-    """A joint Gaussian mixture of (time, outputs), in units of the data's own standard deviations."""
+    """A joint Gaussian mixture of (time, outputs), in units of the data's own standard deviations.
 
-    gmm: GMM
+    Attributes:
+        weights: (C,), of the components.
+        means: (C, 1 + O).
+        covariances: (C, 1 + O, 1 + O).
+        center: (1 + O,), the data's mean [s, unit of the output].
+        scale: (1 + O,), its standard deviations.
+    """
+
+    weights: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
     center: np.ndarray
     scale: np.ndarray
 
@@ -47,8 +56,6 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     Raises:
         InputError: if there are fewer points than components need.
     """
-    from gmr import GMM
-
     data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
     center, deviation = data.mean(axis=0), data.std(axis=0)
     scale = np.where(deviation > 0, deviation, 1.0)
@@ -60,17 +67,29 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     slices = np.tile(np.arange(len(times)), len(outputs)) / len(times)
     fits = [_fit(data, slices, count, seed) for count in candidates]
     best = min(fits, key=lambda fit: fit.bic(data)) if len(fits) > 1 else fits[0]
-    gmm = GMM(best.n_components, best.weights_, best.means_, best.covariances_, random_state=seed)
-    return Mixture(gmm, center, scale)
+    return Mixture(best.weights_, best.means_, best.covariances_, center, scale)
 
 
 def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gaussian mixture regression on time: means (N, O) and covariances (N, O, O) at `times` (N,)."""
-    conditionals = [mixture.gmm.condition([0], [(t - mixture.center[0]) / mixture.scale[0]]).to_mvn() for t in times]
+    """Gaussian mixture regression on time: means (N, O) and covariances (N, O, O) at `times` (N,).
+
+    Each component is a line and a constant covariance there; together they have the mixture's mean and covariance,
+    weighted by how likely the time is under each.
+    """
+    early = (times[:, None] - mixture.center[0]) / mixture.scale[0] - mixture.means[:, 0]  # (N, C)
+    variance, across = mixture.covariances[:, 0, 0], mixture.covariances[:, 1:, 0]
+    log = np.log(mixture.weights) - 0.5 * (np.log(variance) + early**2 / variance)
+    likely = np.exp(log - log.max(axis=1, keepdims=True))  # far from every component some of them are still likeliest
+    likely /= likely.sum(axis=1, keepdims=True)
+    slopes = across / variance[:, None]
+    lines = mixture.means[:, 1:] + early[..., None] * slopes  # (N, C, O)
+    within = mixture.covariances[:, 1:, 1:] - slopes[:, :, None] * across[:, None, :]
+    means = np.einsum("nc,nco->no", likely, lines)
+    apart = lines - means[:, None, :]
+    covariances = np.einsum("nc,cop->nop", likely, within) + np.einsum("nc,nco,ncp->nop", likely, apart, apart)
+    covariances = (covariances + covariances.transpose(0, 2, 1)) / 2
     scale = mixture.scale[1:]
-    means = np.array([c.mean for c in conditionals]) * scale + mixture.center[1:]
-    covariances = np.array([c.covariance for c in conditionals]) * scale[:, None] * scale
-    return means, (covariances + covariances.transpose(0, 2, 1)) / 2
+    return means * scale + mixture.center[1:], covariances * scale[:, None] * scale
 
 
 def _fit(data: np.ndarray, slices: np.ndarray, components: int, seed: int) -> GaussianMixture:

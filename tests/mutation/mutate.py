@@ -46,7 +46,7 @@ TARGETS = {
 }
 SURVIVORS = ROOT / "tests" / "mutation" / "survivors.md"
 # Imported once, before a process is forked for each mutant: what takes seconds and is never mutated.
-HEAVY = ("daqp", "gmr", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
+HEAVY = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
 HEAVY += ("scipy.optimize", "scipy.sparse", "scipy.spatial.transform", "sklearn.mixture", "yaml", "matplotlib.figure")
 
 

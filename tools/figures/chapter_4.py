@@ -104,7 +104,7 @@ def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:
     """Two standard deviations of each component, in the plane."""
     mixture = fit_mixture(demonstrations.times[0], np.stack(demonstrations.outputs), COMPONENTS, 0)
     scale = mixture.scale[1:]
-    for mean, covariance in zip(mixture.gmm.means, mixture.gmm.covariances, strict=True):
+    for mean, covariance in zip(mixture.means, mixture.covariances, strict=True):
         values, vectors = np.linalg.eigh(covariance[1:, 1:] * scale[:, None] * scale)
         width, height = 4 * np.sqrt(values)
         angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))

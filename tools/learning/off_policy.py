@@ -16,8 +16,6 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.preprocessing import is_image_space
@@ -29,6 +27,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.learning import older
 from guiderail.tools.learning.checkpoint_selection import CheckpointSelection
+from guiderail.tools.learning.ensemble import EnsembleSac, EnsembleTqc
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.presets import Preset, decision_discount
 from guiderail.tools.rollouts.rollout import Decision
@@ -372,10 +371,10 @@ class OffPolicyLearner(Learner):
 class SacLearner(OffPolicyLearner):
     """Soft actor-critic (Haarnoja et al., 2018)."""
 
-    algorithm = SAC
+    algorithm = EnsembleSac
 
 
 class TqcLearner(OffPolicyLearner):
     """Truncated quantile critics (Kuznetsov et al., 2020)."""
 
-    algorithm = TQC
+    algorithm = EnsembleTqc

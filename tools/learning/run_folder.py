@@ -112,7 +112,9 @@ class RunFolder:
 
     def refuse_existing(self) -> None:
         """Raises an InputError if the folder holds something already."""
-        if self.path.exists() and (not self.path.is_dir() or any(path.name != LOCK for path in self.path.iterdir())):
+        # What is left of a run that was killed before it had a configuration is nothing that could go on.
+        left = {LOCK, *(part.name for part in self.path.glob(".*.part"))}
+        if self.path.exists() and (not self.path.is_dir() or any(one.name not in left for one in self.path.iterdir())):
             raise InputError(f"{self.path} already exists: name another folder, or go on with that run by --resume")
 
     def refuse_another(self, wanted: RunConfig, also: Sequence[str] = ()) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import make_environment
+from guiderail.tools.thesis import differences
 
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
 COMPARED = (
@@ -117,7 +119,7 @@ def evaluate(
         The statistics `COMPARED`, each also as `demonstration_<name>` (the same episodes before anything was learned;
         None where guidance has no demonstration) and as `<policy>_<name>` for those beside it; `beside`, the names of
         those that can act in this environment; `episodes` and `seed`; `converged_after` and `trained_episodes` of
-        the training.
+        the training; `differs_from_thesis`, in what task, learner and environment do, in words.
 
     Raises:
         InputError: if there is no trained run, or a number is out of range.
@@ -150,6 +152,7 @@ def evaluate(
         "seed": seed,
         "converged_after": converged_after(trained),
         "trained_episodes": len(trained),
+        "differs_from_thesis": differences(replace(config, environment=where)),
     }
 
 

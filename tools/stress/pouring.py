@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.tasks.pouring import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES, Inputs
+from guiderail.diagrams.tasks.pouring_options import MAX_MUG_OFFSET
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import Choose, corners

@@ -29,7 +29,7 @@ class Board:
         """
         Args:
             jobs: that are to be run, by their keys.
-            total: of the whole study; those that are not among `jobs` were finished before.
+            total: of the whole study; those that are not among `jobs` were finished before, and end too.
             console: where it is drawn; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)
@@ -37,8 +37,7 @@ class Board:
             key: (job, job.folder.path / "episodes.csv", job.log.stat().st_size if job.log.exists() else 0)
             for key, job in jobs.items()
         }
-        self._total, self._ended = total, total - len(jobs)
-        self._failed = 0
+        self._total, self._ended, self._failed = total, 0, 0
         terminal = self._console.is_terminal
         self._period = TERMINAL_PERIOD if terminal else LOG_PERIOD
         self._live = Live(console=self._console, auto_refresh=False, transient=True) if terminal and jobs else None
@@ -77,7 +76,7 @@ class Board:
     def _watch(self) -> None:
         while not self._over.wait(self._period):
             if self._live is None:
-                self._say("; ".join(map(" ".join, self._running())) + f"; {self._counts()}")
+                self._say("; ".join([*map(" ".join, self._running()), self._counts()]))
             else:
                 self._live.update(self._table(), refresh=True)
 
@@ -112,4 +111,5 @@ class Board:
         for name, state in running[:SHOWN]:
             table.add_row(name, state)
         more = f"and {len(running) - SHOWN} more run; " if len(running) > SHOWN else ""
-        return Group(table, Text(more + self._counts()))
+        counts = Text(more + self._counts())
+        return Group(table, counts) if running else Group(counts)

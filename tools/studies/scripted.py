@@ -17,6 +17,8 @@ from guiderail.models.objects.grid_clamp import GridClampDimensions
 from guiderail.models.registry import did_you_mean
 from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
 from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.studies.aiming_person import aiming_person, blind_person
+from guiderail.tools.studies.slalom import slalom
 
 # The connector: where the demonstrations search the rim, the rule moves against the contact torque.
 GAIN = 1.5  # of the action per scaled contact torque
@@ -90,7 +92,8 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
 RULES: dict[str, dict[str, Act]] = {
     "BncConnector": {"reactive_rule": reactive_rule},
     "GridClamp": {"searching_rule": searching_rule, "straight_descent": straight_descent},
-    "Pouring": {"person": person},
+    "NarrowPassage": {"slalom": slalom},
+    "Pouring": {"person": person, "aiming_person": aiming_person, "blind_person": blind_person},
 }
 
 

@@ -131,6 +131,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
     ]
     for job in jobs:
         _check(job)
+    _refuse_shared_folders(jobs)
     outcomes = _outcomes(jobs, engine or make_engine(), console)
     rows = pd.DataFrame([row for index in range(len(jobs)) for row in outcomes[index].rows], dtype=object)
     failed = [
@@ -192,7 +193,10 @@ def _outcomes(jobs: list[Job], engine: Engine, console: Console | None) -> dict[
     outcomes: dict[int, Outcome] = {}
     with Board(to_run, len(jobs), console) as board:
         for index, job in done.items():
-            outcomes[index] = Outcome(tuple(run_job(job)))
+            try:
+                outcomes[index] = Outcome(tuple(run_job(job)))
+            except InputError as error:
+                outcomes[index] = Outcome(failure=str(error))
             board.end(index, job, outcomes[index])
         if to_run:
             with engine:
@@ -225,6 +229,18 @@ def _check(job: Job) -> None:
                 _refuse_gone(job, mark)
     elif job.learns:
         job.folder.refuse_existing()
+
+
+def _refuse_shared_folders(jobs: list[Job]) -> None:
+    """Two workers that write one run would each destroy what the other did."""
+    known: dict[Path, Job] = {}
+    for job in jobs:
+        other = known.setdefault(job.folder.path, job)
+        if other is not job:
+            raise InputError(
+                f"{job.folder.path} would hold both runs of {other.method}, seed {other.seed} and of {job.method}, "
+                f"seed {job.seed}: write the study's folder with {{method}} and {{seed}}"
+            )
 
 
 def _refuse_gone(job: Job, mark: int) -> None:

@@ -3,6 +3,7 @@ import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+from guiderail.models.primitives.mixture import Mixture, regress
 
 
 def hourglass(num=9, n=120, seed=0):
@@ -22,6 +23,23 @@ def test_regression_recovers_mean_and_width(components):
     wide, narrow = reference.standard_deviations[[10, 60], 0]
     assert wide > 4 * narrow
     assert wide == pytest.approx(outputs[:, 10, 0].std(), rel=0.3)
+
+
+def test_regression_gives_the_moments_of_the_mixture_at_an_instant():
+    """They are added up from the joint density, which is what conditioning means."""
+    weights, means = np.array([0.3, 0.7]), np.array([[-0.5, 1.0], [0.8, -0.4]])
+    covariances = np.array([[[0.4, 0.3], [0.3, 0.5]], [[0.2, -0.1], [-0.1, 0.3]]])
+    center, scale = np.array([2.0, 0.1]), np.array([0.5, 3.0])
+    at, y = np.array([1.2, 2.0, 2.5, 5.0]), np.linspace(-30, 30, 20001)
+    regressed = regress(Mixture(weights, means, covariances, center, scale), at)
+    for t, mean, covariance in zip(at, *regressed, strict=True):
+        joint = (np.stack([np.full_like(y, t), y], axis=1) - center) / scale
+        apart = joint[:, None] - means
+        exponent = np.einsum("ncj,cjk,nck->nc", apart, np.linalg.inv(covariances), apart)
+        density = (np.exp(-exponent / 2) / np.sqrt(np.linalg.det(covariances)) * weights).sum(axis=1)
+        density /= density.sum()
+        assert mean[0] == pytest.approx(density @ y, rel=1e-9)
+        assert covariance[0, 0] == pytest.approx(density @ (y - mean[0]) ** 2, rel=1e-9)
 
 
 def test_same_seed_same_reference():

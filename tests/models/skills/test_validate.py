@@ -23,7 +23,7 @@ def errors(change):
     return [finding.message for finding in findings(change) if finding.is_error]
 
 
-@pytest.mark.parametrize("name", ["pouring", "grid_clamp", "end_effector_velocity"])
+@pytest.mark.parametrize("name", ["pouring", "pouring_aimed", "grid_clamp", "end_effector_velocity"])
 def test_our_own_skills_have_no_errors(name):
     assert [f.message for f in validate(load_skill(name)) if f.is_error] == []
 

@@ -123,5 +123,5 @@ def test_a_rule_is_found_by_its_name_or_as_the_tasks_own():
     assert find_rule("GridClamp", "straight_descent") is RULES["GridClamp"]["straight_descent"]
     with pytest.raises(InputError, match="did you mean reactive_rule"):
         find_rule("BncConnector", "reactiv_rule")
-    with pytest.raises(InputError, match="NarrowPassage has no policy 'rule'"):
-        find_rule("NarrowPassage", "rule")
+    with pytest.raises(InputError, match="lab/Peg has no policy 'rule'"):
+        find_rule("lab/Peg", "rule")

@@ -1,9 +1,12 @@
+import json
+
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, RunsFailedError
+from guiderail.tools.command import main
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import evaluate_policy
 from guiderail.tools.rollouts.metrics import STATISTICS
@@ -66,6 +69,54 @@ def test_a_finished_study_is_not_touched_and_one_that_was_stopped_goes_on_to_the
     assert written(whole) == before
     run(study(marks=[2], seeds=[5]), parts)
     assert without_clock(run(study(), parts)) == without_clock(expected)
+
+
+def test_a_run_that_fails_stops_no_other_and_is_named_at_the_end(tmp_path, capsys):
+    file, out = tmp_path / "beads.yaml", tmp_path / "out"
+    expected = run(study(), tmp_path / "undisturbed")
+    run(study(marks=[2]), out)
+    checkpoint = out / "learner-5" / "checkpoint" / "state.safetensors"
+    whole = checkpoint.read_bytes()
+    checkpoint.write_bytes(whole[:-1000])
+    file.write_text(yaml.safe_dump(BEAD))
+    command = ["study", str(file), "--out", str(out), "--processes", "1", "--json"]
+    with pytest.raises(SystemExit) as end:
+        main(command)
+    said = capsys.readouterr()
+    assert end.value.code == 1
+    sentence = f"learner, seed 5, failed: the checkpoint {checkpoint} is damaged"
+    assert said.err.splitlines()[-1].startswith(f"guiderail: {sentence}")
+    assert json.loads(said.out)["failed"][0].startswith(sentence)
+    assert read_table(out / "beads.csv")["seed"].tolist() == [6, 6]
+    assert "damaged" in (out / "logs" / "beads-learner-5.txt").read_text()
+    (judged,) = (out / "learner-6").glob("held_out-4-*.csv")
+    table = judged.read_bytes()
+    judged.write_text("a,b\n1\n")
+    with pytest.raises(RunsFailedError) as failed:
+        run(study(), out)
+    assert [sentence.partition(",")[2][:7] for sentence in failed.value.sentences] == [" seed 5", " seed 6"]
+    judged.write_bytes(table)
+    checkpoint.write_bytes(whole)
+    assert without_clock(run(study(), out)) == without_clock(expected)
+
+
+def test_a_study_names_what_registers_its_task(tmp_path):
+    file = tmp_path / "pearl.py"
+    file.write_text(
+        "import bead, gymnasium\n"
+        "if 'guiderail/Pearl-v0' not in gymnasium.registry:\n"
+        "    gymnasium.register('guiderail/Pearl-v0', entry_point=bead.Bead)\n"
+    )
+    with pytest.raises(InputError, match="there is none for"):
+        run(study(task="Pearl", imports=[str(tmp_path / "perl.py")], marks=[2]), tmp_path / "out")
+    rows = run(study(task="Pearl", imports=[str(file)], seeds=[5], marks=[2]), tmp_path / "out")
+    assert rows["seed"].tolist() == [5]
+    assert RunFolder(tmp_path / "out" / "learner-5").config().imports == (str(file),)
+
+
+def test_two_runs_never_share_a_folder(tmp_path):
+    with pytest.raises(InputError, match="both runs of learner, seed 5 and of learner, seed 6"):
+        run(study(folder="{method}"), tmp_path)
 
 
 def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
@@ -157,7 +208,8 @@ def test_a_ratio_is_of_sums_and_a_number_that_never_was_says_so():
     )
     wanted = study(ratios=[{"of": "force", "method": "a", "against": "b"}]).ratios[0]
     assert list(ratio(rows, wanted).values()) == ["0.25, 1.00", "0.50"]
-    assert ratio(rows[:2], wanted) == {}
+    assert ratio(rows[:2], wanted) == ratio(rows[:3], wanted) == {}
+    assert ratio(rows.assign(seed=[0, 1, 1, 2]), wanted) == {}
     assert each(rows[:2].astype(object), "after") == "3.0, never"
 
 

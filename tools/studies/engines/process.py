@@ -15,7 +15,6 @@ from guiderail.models.errors import InputError
 from guiderail.tools.studies.engines.engine import ATTEMPTS, GIVEN_UP, Engine, Outcome, Work, register_engine
 
 PROCESSES = 2
-PATIENCE = 5.0  # s, for a worker that has nothing more to do
 
 
 @register_engine("process")
@@ -115,12 +114,10 @@ class _Worker:
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
     def stop(self) -> None:
-        """Ends the process: at once if it has a job, which nobody waits for any more."""
-        self.connection.close()
-        if self.key is None:
-            self._process.join(PATIENCE)
+        """Ends the process at once: what it has done is on the disk or handed over, and the rest nobody waits for."""
         self._process.kill()
         self._process.join()
+        self.connection.close()
 
 
 def _serve(connection: Connection, work: Work) -> None:

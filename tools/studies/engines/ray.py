@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 from collections.abc import Iterator, Mapping
 from typing import Any, Self
 
@@ -12,6 +13,7 @@ from guiderail.tools.studies.engines.engine import ATTEMPTS, GIVEN_UP, Engine, O
 from guiderail.tools.studies.engines.process import PROCESSES
 
 LOCAL = "local"
+REACHED = 5.0  # s, within which a cluster answers; Ray itself asks for minutes
 
 
 @register_engine("ray")
@@ -47,6 +49,7 @@ class RayEngine(Engine):
         quiet = {"log_to_driver": False, "configure_logging": True, "logging_level": logging.CRITICAL}
         alone = {"num_cpus": self.processes, "include_dashboard": False, "_node_ip_address": "127.0.0.1"}
         try:
+            _reach(self._address)
             self._ray.init(self._address, **quiet, **(alone if self._address == LOCAL else {}))
         except Exception as error:  # its errors have no common type
             words = next(iter(str(error).splitlines()), type(error).__name__)
@@ -70,6 +73,13 @@ class RayEngine(Engine):
 
     def __exit__(self, *error: object) -> None:
         self._ray.shutdown()  # what a cluster still does for this process ends with it
+
+
+def _reach(address: str) -> None:
+    """Raises an OSError if nothing listens at an address with a host and a port."""
+    host, _, port = address.rpartition("//")[2].rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), REACHED).close()
 
 
 def work_on(work: Work, job: Any) -> Outcome:

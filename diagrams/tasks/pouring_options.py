@@ -1,0 +1,81 @@
+"""What pouring can be asked for, and what is hard about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import Field
+
+from guiderail.diagrams.options import Number, Numbers, Options, ResetOptions
+from guiderail.models.errors import InputError
+from guiderail.models.objects.vessels import MUG
+
+MAX_MUG_OFFSET = 0.04  # [m] along x and y: as far as the arm reaches around the mug
+MAX_MUG_ERROR = 0.06  # [m] as far as an aimed Pour leads from where the mug is believed
+
+HARD: Mapping[str, Any] = {
+    "aim": True,
+    "mug_error_least": 0.035,
+    "mug_error_most": 0.05,
+    "mug_inner_diameter": 0.07,
+    "time_limit": 6.0,
+}
+"""The mug stands elsewhere than the template believes, anew every episode, and whoever pours has to see that."""
+
+
+class PouringOptions(Options):
+    """Of pouring."""
+
+    input_speed: Number | None = Field(
+        None, ge=0.2, le=2.0, description="how much faster the template's inputs are; 1, and 1.7 where sparse, if None"
+    )
+    mug_inner_diameter: Number = Field(MUG.inner_diameter, description="of the mug that stands there [m]")
+    mug_depth: Number = Field(MUG.depth, description="[m]")
+    mug_offset: Number = Field(
+        0.0, ge=0, le=MAX_MUG_OFFSET, description="up to which the mug is moved along x and y at every reset [m]"
+    )
+    mug_error_least: Number = Field(
+        0.0, ge=0, le=MAX_MUG_ERROR, description="least distance from the mug to where it is believed to be [m]"
+    )
+    mug_error_most: Number = Field(
+        0.0, ge=0, le=MAX_MUG_ERROR, description="largest one; distance and direction are drawn at every reset [m]"
+    )
+    time_limit: Number = Field(15.0, ge=3.0, le=30.0, description="after which an episode ends [s]")
+    aim: bool = Field(False, description="whether Pour can be aimed; the policy then sees error and template's state")
+    aim_speed: Number = Field(
+        1.0, ge=0.1, le=1.0, description="part of the inputs' full speed with which Pour is aimed"
+    )
+    pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="part of the full tilt's with which an aimed Pour tips")
+
+    def check(self) -> None:
+        """Refuses numbers that don't go together.
+
+        Raises:
+            InputError: if the least error is larger than the largest one.
+        """
+        if self.mug_error_least > self.mug_error_most:
+            raise InputError(
+                f"mug_error_least must be at most mug_error_most, which is {self.mug_error_most:g} m, "
+                f"not {self.mug_error_least:g} m: give both"
+            )
+
+
+class PouringReset(ResetOptions):
+    """Of a reset of pouring."""
+
+    start: Numbers | None = Field(
+        None,
+        min_length=3,
+        max_length=3,
+        description="(x, y, z) [m] of the upright thermos's tip in the frame of the mug, where that is believed to be",
+    )
+    mug_position: Numbers | None = Field(
+        None,
+        min_length=2,
+        max_length=2,
+        description="(x, y) [m] of the mug, where that is believed to be, from where it nominally stands",
+    )
+    mug_error: Numbers | None = Field(
+        None, min_length=2, max_length=2, description="(x, y) [m] from the mug to where it is believed to be"
+    )

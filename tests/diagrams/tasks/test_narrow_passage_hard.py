@@ -1,0 +1,87 @@
+"""The narrow passage half as wide, between two obstacles that may not be touched."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.narrow_passage_options import HARD, NarrowPassageOptions
+from guiderail.models.errors import InputError
+from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.tools.rollouts.null_policies import NULL_POLICIES, always, still
+from guiderail.tools.rollouts.rollout import rollout
+from guiderail.tools.studies.slalom import slalom
+
+
+@pytest.fixture(scope="module", params=["skgrl", "kgrl"])
+def env(request):
+    return make_env("NarrowPassage", difficulty="hard", guidance=request.param)
+
+
+def test_the_rule_passes_and_the_demonstrations_do_not(env):
+    for seed in range(2):
+        row = rollout(env, slalom, seed=seed, held_out=True)
+        assert row["success"]
+        assert row["worst_violation"] <= 1e-9
+        row = rollout(env, still(env), seed=seed, held_out=True)
+        assert row["termination"] == "collision"
+
+
+def test_no_constant_side_is_right(env):
+    for side in (-1.0, 1.0):
+        row = rollout(env, always(env, np.array([side, 0.0])), seed=1)
+        assert row["termination"] == "collision"
+
+
+@pytest.mark.parametrize("name", ["white", "held", "corners", "stuck"])
+def test_no_action_leads_out_of_the_constraints(env, name):
+    for seed in range(2):
+        row = rollout(env, NULL_POLICIES[name](np.random.default_rng(seed), 2), seed=seed)
+        assert row["worst_violation"] <= 1e-9
+
+
+def test_sides_alternate_are_drawn_and_are_seen(env):
+    usual, sides = NarrowPassageOptions(**HARD).world().obstacles, []
+    starts = []
+    for seed in range(8):
+        observation, drawn = env.reset(seed=seed)
+        beside = (drawn["obstacles"] - usual) / HARD["obstacle_beside"]
+        np.testing.assert_allclose(observation[1:], beside.ravel(), atol=1e-6)
+        np.testing.assert_allclose(np.abs(beside), [[1.0, 0.0], [1.0, 0.0]], atol=1e-9)
+        assert beside[0, 0] == pytest.approx(-beside[1, 0])
+        sides.append(np.sign(beside[0, 0]))
+        starts.append(drawn["start"])
+    assert set(sides) == {-1.0, 1.0}
+    assert 0.01 < np.std(starts, axis=0).min() < 0.1
+
+
+def test_the_obstacles_are_drawn_where_they_are(env):
+    _, drawn = env.reset(seed=2)
+    plant = env.task.diagram.GetSubsystemByName("station").plant
+    context = plant.GetMyContextFromRoot(env.simulator.get_context())
+    for number, obstacle in enumerate(drawn["obstacles"]):
+        X_WO = plant.GetBodyByName(f"obstacle_{number}").EvalPoseInWorld(context)
+        np.testing.assert_allclose(X_WO.translation()[:2], obstacle, atol=1e-12)
+
+
+def test_the_standard_world_is_what_it_was():
+    assert NarrowPassageOptions().world() == NarrowPassage()
+    standard = make_env("NarrowPassage")
+    assert standard.observation_space.shape == (1,)
+    _, drawn = standard.reset(seed=3)
+    np.testing.assert_array_equal(drawn["start"], standard.task.declaration.reference().means[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"gap_width": 0.0}, "gap_width must be at least 0.02"),
+        ({"obstacle_radius": 1.0}, "obstacle_radius must be at most 0.1"),
+        ({"obstacle_beside": -1}, "obstacle_beside must be at least 0"),
+        ({"start_deviation": 0.5}, "start_deviation must be at most 0.05"),
+        ({"obstacles_end": "maybe"}, "obstacles_end cannot be 'maybe'"),
+    ],
+)
+def test_refuses_numbers_out_of_range(arguments, said):
+    with pytest.raises(InputError, match=said) as error:
+        make_env("NarrowPassage", **arguments)
+    assert "\n" not in str(error.value)

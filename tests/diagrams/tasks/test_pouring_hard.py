@@ -1,0 +1,131 @@
+"""Pouring where the mug is not where the template believes it is."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.make import make_env
+from guiderail.diagrams.tasks.pouring_options import HARD, MAX_MUG_ERROR
+from guiderail.diagrams.tasks.pouring_template import frames_of, make_aimed_skill
+from guiderail.models.errors import InputError
+from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
+from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
+from guiderail.tools.studies.aiming_person import aiming_person, blind_person
+
+PERIOD = 0.01  # [s] between control steps
+# Where seed 3 started before there were difficulties.
+START_OF_SEED_3 = [-0.05165154964949667, -0.27188929363368947, 0.12006535135237559]
+BESIDE = (0.045, 0.0)  # [m] where the mug is believed to be, from the mug
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_env("Pouring", difficulty="hard")
+
+
+def run(env, inputs, limit=60, **options):
+    observation, drawn = env.reset(seed=1, options=options)
+    for _ in range(limit):
+        observation, _, terminated, truncated, info = env.step(inputs(observation))
+        if terminated or truncated:
+            break
+    return drawn, info
+
+
+def test_who_looks_pours_and_who_does_not_spills(env):
+    for inputs, ending in ((aiming_person, "success"), (blind_person, "spill")):
+        drawn, info = run(env, inputs, mug_error=BESIDE)
+        np.testing.assert_array_equal(drawn["mug_error"], BESIDE)
+        assert info["termination"] == ending
+        assert info["ledger"]["worst_commanded_violation"] <= 1e-9
+        assert info["ledger"]["collisions"] == 0.0
+
+
+def guided(skill, frames, actions, X_TP):
+    """The states and commands of an episode without an arm, as pose coordinates carry them from step to step."""
+    state = skill.state_at(X_TP, frames)
+    for action in actions:
+        request = skill.displace(X_TP, skill.map(state, action, X_TP, frames, PERIOD))
+        command = skill.command(state, X_TP, request, frames, PERIOD).X_WE
+        X_TP = pose_to_transform(transform_to_pose(command))
+        yield state, X_TP
+        state = skill.next_state(state, X_TP, frames)
+
+
+@pytest.mark.parametrize("name", ["white", "held", "corners", "stuck"])
+def test_no_command_ever_leaves_the_constraints(env, name):
+    """Through all three states and along every edge: without the arm, hundreds of control steps take no time."""
+    skill = make_aimed_skill(env.task.declaration.world(), 1.0, 1.0, 0.3)
+    frames = frames_of(skill, RigidTransform([0.02, -0.01, 0.0]))
+    start = skill.project(skill.initial_state, RigidTransform([0.02, -0.27, 0.12]), frames)
+    worst, reached = 0.0, set()
+    for seed in range(2):
+        act = NULL_POLICIES[name](np.random.default_rng(seed), 3)
+        # Half of them lean forwards until they are in Pour, and then do what they want.
+        lean = [np.array([0.0, 2.0 * (seed % 2 == 0 and k < 25), 0.0]) for k in range(45)]
+        actions = np.repeat([np.clip(act(None) + forwards, -1.0, 1.0) for forwards in lean], 10, axis=0)
+        for state, X_TP in guided(skill, frames, actions, start):
+            reached.add(state)
+            worst = max(worst, skill.violation(state, X_TP, frames))
+    assert worst <= 1e-9
+    assert reached == {0, 1, 2}
+
+
+def test_the_arms_commands_are_inside_as_recomputed_at_every_step(env):
+    """Also where the arm and the template's diagram take part, and at every control step, not only at decisions."""
+    stepwise = make_env("Pouring", difficulty="hard", hold=1)
+    diagram, context = stepwise.task.diagram, stepwise.simulator.get_context()
+    corners = NullPolicy(NULL_POLICIES["corners"], stepwise)
+    corners.begin()
+    task = stepwise.task.declaration
+    skill = make_aimed_skill(task.world(), 1.0, 1.0, 0.3)
+    _, drawn = stepwise.reset(seed=3)
+    frames = frames_of(skill, RigidTransform([*(drawn["mug_position"] + drawn["mug_error"]), 0.0]))
+    for _ in range(60):
+        stepwise.step(corners(None))
+        state = int(diagram.GetOutputPort("state").Eval(context)[0])
+        desired = pose_to_transform(diagram.GetOutputPort("desired_pose").Eval(context))
+        assert skill.violation(state, desired, frames) <= 1e-9
+
+
+def test_the_error_is_drawn_anew_in_its_ring_and_seen(env):
+    errors = []
+    for held_out in (False, True) * 4:
+        observation, drawn = env.reset(options={"held_out": held_out})
+        errors.append(drawn["mug_error"])
+        np.testing.assert_allclose(observation[6:8] * MAX_MUG_ERROR, drawn["mug_error"], atol=1e-8)
+        assert observation[8] == -1.0  # not pouring yet
+    lengths = np.linalg.norm(errors, axis=1)
+    np.testing.assert_array_equal(np.clip(lengths, HARD["mug_error_least"], HARD["mug_error_most"]), lengths)
+    assert len(np.unique(lengths)) == len(lengths)
+
+
+def test_the_standard_sees_and_draws_what_it_did():
+    standard = make_env("Pouring")
+    assert standard.observation_space.shape == (6,)
+    assert standard.task.num_steps == 1500
+    _, drawn = standard.reset(seed=3)
+    assert "mug_error" not in drawn
+    np.testing.assert_array_equal(drawn["start"], START_OF_SEED_3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"difficulty": "harder"}, "Pouring has no difficulty 'harder': did you mean hard"),
+        ({"mug_error_most": 0.2}, "mug_error_most must be at most 0.06, not 0.2"),
+        ({"mug_error_least": 0.05}, "mug_error_least must be at most mug_error_most, which is 0 m, not 0.05 m"),
+        ({"aim": True, "aim_speed": 0.0}, "aim_speed must be at least 0.1"),
+        ({"aim": True, "pour_speed": 2.0}, "pour_speed must be at most 1"),
+        ({"time_limit": 0.1}, "time_limit must be at least 3"),
+    ],
+)
+def test_refuses_numbers_out_of_range(arguments, said):
+    with pytest.raises(InputError, match=said) as error:
+        make_env("Pouring", **arguments)
+    assert "\n" not in str(error.value)
+
+
+def test_refuses_an_error_beyond_where_pour_leads(env):
+    with pytest.raises(InputError, match=r"'mug_error' is at most 0\.06 m long"):
+        env.reset(options={"mug_error": (0.1, 0.0)})

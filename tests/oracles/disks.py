@@ -1,0 +1,43 @@
+"""Disks that are full and folders that cannot be written, also for the superuser whom tests may be run by."""
+
+import contextlib
+import ctypes
+import os
+import resource
+from collections.abc import Iterator
+
+CAPABILITY_VERSION = 0x20080522
+OVERRIDES = 0b110  # CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH: whom permissions do not concern
+
+
+@contextlib.contextmanager
+def full_disk(room: int = 512) -> Iterator[None]:
+    """No file grows beyond so many bytes, as on a disk that has no more of them."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@contextlib.contextmanager
+def bound_by_permissions() -> Iterator[None]:
+    """This thread may write what its permissions say, whoever it is."""
+    if os.geteuid() != 0:
+        yield
+        return
+    libc = ctypes.CDLL(None, use_errno=True)
+    header = (ctypes.c_uint32 * 2)(CAPABILITY_VERSION, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable; then those above the 32nd
+    if libc.capget(header, sets):
+        raise OSError(ctypes.get_errno(), "capget")
+    before = sets[0]
+    sets[0] = before & ~OVERRIDES
+    if libc.capset(header, sets):
+        raise OSError(ctypes.get_errno(), "capset")
+    try:
+        yield
+    finally:
+        sets[0] = before
+        libc.capset(header, sets)

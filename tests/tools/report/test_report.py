@@ -1,0 +1,121 @@
+import itertools
+import re
+import shlex
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.report.gather import command, gather
+from guiderail.tools.report.report import write_report
+from guiderail.tools.rollouts.ledger import Ledger, read_ledger
+from guiderail.tools.rollouts.rollout import rollout
+from guiderail.tools.tables import write_table
+from guiderail.tools.tasks import make_environment
+
+SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    """Two methods, two seeds, and the table that a study of them leaves."""
+    folder = tmp_path_factory.mktemp("beads")
+    for guidance in ("skgrl", "kmp"):
+        for seed in (1, 2):
+            config = configure("Bead", {"guidance": guidance}, settings=SETTINGS, episodes=3, seed=seed)
+            train(RunFolder(folder / f"{guidance}-{seed}"), config)
+    rows = [("learner", "learned", seed, 3, 10, rate) for seed, rate in ((1, 0.9), (2, 0.7))]
+    rows.append(("nothing", "zero", 1, 0, 10, 0.1))
+    table = pd.DataFrame(rows, columns=["method", "policy", "seed", "mark", "episodes", "success_rate"])
+    write_table(folder / "beads", table.assign(judged_on="held out"))
+    return folder
+
+
+def text_of(page):
+    return " ".join(re.sub(r"<[^>]+>", " ", re.sub(r"<(svg|style).*?</\1>", " ", page, flags=re.S)).split())
+
+
+def test_a_study_is_one_page_that_needs_nothing_else(studied, tmp_path):
+    page = write_report([studied], tmp_path / "report.html").read_text()
+    assert page.count("<svg") >= 4
+    assert write_report([studied], tmp_path / "again.html").read_text() == page
+    outside = re.findall(r"(?:src|href)=\"(?!#)[^\"]*\"", page)
+    assert outside == []
+    assert "<script" not in page
+    text = text_of(page)
+    assert "sKGRL" in text
+    assert "16/20 80.0%" in text, "successes of all seeds together"
+    assert "9/10, 7/10" in text, "and of each"
+    assert "nothing: zero" in text
+    assert "Differs from the thesis in it has no task Bead" in text
+    assert "guiderail study beads --out studies" in text
+    assert RunFolder(studied / "kmp-1").config().versions["drake"] in text
+
+
+def test_runs_are_named_by_what_they_differ_in(studied):
+    gathered = gather([studied / "skgrl-1", studied / "kmp-1"])
+    assert [run.method for run in gathered.runs] == ["sKGRL", "demonstration alone"]
+    assert not gathered.study
+    assert len(gathered.held_out) == 0
+    again = gather([studied / "skgrl-1", studied / "skgrl-2"])
+    assert {run.method for run in again.runs} == {"sKGRL"}
+    assert [len(runs) for runs in again.methods("Bead").values()] == [2]
+
+
+def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
+    run = studied / "skgrl-1"
+    judged = gather([run], episodes=2).held_out
+    assert set(judged["policy"]) == {"learned", "demonstration", "white", "constant"}
+    assert judged["episodes"].eq(2).all()
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    gather([run], episodes=2)
+    assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+
+
+def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):
+    config = configure("NarrowPassage", {"guidance": "residual"}, episodes=1)
+    folder, env = RunFolder(tmp_path / "run"), make_environment("NarrowPassage", config.environment)
+    folder.create(config)
+    folder.write_episodes([rollout(env, lambda _: np.array([1.0, 0.0]), Ledger(env, folder.ledger), seed=0)])
+    env.close()
+    (run,) = gather([tmp_path / "run"]).runs
+    ledger, row = read_ledger(tmp_path / "run" / "ledger"), run.episodes.iloc[0]
+    assert run.safety["source"] == "ledger"
+    assert run.safety["steps"] == len(ledger) == row["steps"]
+    assert run.safety["collision_steps"] > 0
+    assert run.safety["poses_outside"] == (ledger["measured_violation"] > 1e-9).sum()
+    assert run.safety["worst_command"] == row["worst_violation"]
+    assert run.safety["collision_steps"] == row["collision_steps"]
+    (tmp_path / "run" / "ledger" / "episode-000000.parquet").unlink()
+    with pytest.raises(InputError, match="holds no ledger"):
+        _ = run.safety
+
+
+def test_the_command_of_a_run_makes_the_same_run(bead_config):
+    config = replace(bead_config, ledger=False)
+    words = shlex.split(command(config, "runs/bead"))
+    assert words[:3] == ["guiderail", "train", "Bead"]
+    assert words[-3:] == ["--no-ledger", "--out", "runs/bead"]
+    given = dict(word.split("=") for before, word in itertools.pairwise(words) if before == "--set")
+    option = dict(zip(words[3:-3:2], words[4:-3:2], strict=True))
+    again = configure(
+        "Bead", {"guidance": option["--guidance"]}, algorithm=option["--algorithm"], preset=option["--preset"],
+        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=given, ledger=False,
+    )  # fmt: skip
+    assert again == config
+
+
+@pytest.mark.parametrize("name", ["report.pdf", "report"])
+def test_what_is_no_page_is_refused_before_anything_is_read(name, tmp_path):
+    with pytest.raises(InputError, match=r"a report is a page, .html"):
+        write_report([tmp_path / "missing"], tmp_path / name)
+
+
+def test_a_folder_without_runs_is_refused(tmp_path):
+    with pytest.raises(InputError, match="holds no run"):
+        write_report([tmp_path], tmp_path / "report.html")

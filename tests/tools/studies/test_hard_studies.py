@@ -1,0 +1,36 @@
+"""What the studies of `hard` declare can be made."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.tasks.pouring import POSITION_SCALE
+from guiderail.diagrams.tasks.pouring_options import MAX_MUG_ERROR
+from guiderail.tools.studies.aiming_person import aiming_person, blind_person
+from guiderail.tools.studies.declaration import load_study
+from guiderail.tools.studies.study import Job
+
+
+@pytest.mark.parametrize("name", ["pouring_hard", "pouring_hard_nulls", "pouring_sweep", "narrow_passage_hard_nulls"])
+def test_every_method_can_be_made(name, tmp_path):
+    study = load_study(name)
+    for method in study.methods:
+        job = Job(study, method, study.seeds[0], tmp_path)
+        assert job.config(job.marks[-1]).environment["difficulty"] == "hard"
+
+
+def seen(tip, error=(0.0, 0.0), state=1.0, tilt=0.0):
+    values = [*(POSITION_SCALE * np.array(tip)), -tilt, 0.0, 0.0, *(np.array(error) / MAX_MUG_ERROR), state]
+    return np.array(values)
+
+
+def test_who_looks_aims_before_it_pours():
+    np.testing.assert_array_equal(aiming_person(seen((0.05, -0.2, 0.06)))[[0, 2]], [-1.0, 0.0])
+    assert aiming_person(seen((0.0, -0.045, 0.06)))[2] == 1.0
+    assert aiming_person(seen((0.05, -0.2, 0.06), tilt=np.deg2rad(100)))[2] == 1.0  # no way back: the balls roll
+
+
+def test_who_does_not_look_acts_as_if_the_mug_were_where_it_is_believed():
+    """However far the two are apart, the same in the frame of where the mug is believed to be."""
+    for state in (-1.0, 0.0, 1.0):
+        there = blind_person(seen((0.01 + 0.04, -0.1 - 0.02, 0.06), (0.04, -0.02), state))
+        np.testing.assert_allclose(there, aiming_person(seen((0.01, -0.1, 0.06), state=state)), atol=1e-9)

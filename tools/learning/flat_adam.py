@@ -1,0 +1,98 @@
+"""Adam on parameters that share one buffer: a step is one call, however many layers there are."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import torch
+
+_MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def flatten(parameters: Iterable[torch.Tensor]) -> torch.Tensor:
+    """One buffer of all parameters, in their order; each of them becomes a view of it."""
+    parameters = list(parameters)
+    flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
+    for parameter, part in zip(parameters, _parts(flat, [p.shape for p in parameters]), strict=True):
+        parameter.data = part
+    return flat
+
+
+def _parts(flat: torch.Tensor, shapes: Iterable[torch.Size]) -> list[torch.Tensor]:
+    shapes = list(shapes)
+    sizes = [shape.numel() for shape in shapes]
+    return [part.view(shape) for part, shape in zip(flat.split(sizes), shapes, strict=True)]
+
+
+class FlatAdam:
+    """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with its state named as `torch.optim.Adam` names it.
+
+    It is no `torch.optim.Optimizer`: creating one imports PyTorch's compiler, which takes seconds of every start.
+
+    Attributes:
+        values: (P,), all parameters, which are views of it.
+        gradient: (P,), what the next step goes against.
+    """
+
+    def __init__(self, parameters: Iterable[torch.Tensor], lr: float):
+        """
+        Args:
+            parameters: of one data type; whoever holds them sees each step.
+            lr: the learning rate.
+        """
+        parameters = list(parameters)
+        self._shapes = [parameter.shape for parameter in parameters]
+        self.values = flatten(parameters)
+        self.gradient = torch.zeros_like(self.values)
+        self._lr = lr
+        self._moments = [torch.zeros_like(self.values) for _ in _MOMENTS]
+        self._steps = torch.zeros(())
+
+    def step(self) -> None:
+        """Goes one step against `gradient`."""
+        first, second = self._moments
+        self._steps += 1
+        torch._fused_adam_(
+            [self.values],
+            [self.gradient],
+            [first],
+            [second],
+            [],
+            [self._steps],
+            lr=self._lr,
+            beta1=0.9,
+            beta2=0.999,
+            weight_decay=0.0,
+            eps=1e-8,
+            amsgrad=False,
+            maximize=False,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        """As of `torch.optim.Adam`: the moments of each parameter by its index, and none before the first step."""
+        if not self._steps:
+            return {"state": {}, "param_groups": []}
+        moments = [_parts(moment, self._shapes) for moment in self._moments]
+        named = [dict(zip(_MOMENTS, of_one, strict=True)) for of_one in zip(*moments, strict=True)]
+        return {"state": {i: {"step": self._steps, **of_one} for i, of_one in enumerate(named)}, "param_groups": []}
+
+    def load_state_dict(self, stored: Mapping[str, Any]) -> None:
+        """Takes what `state_dict` gave, also that of a `torch.optim.Adam`.
+
+        Raises:
+            KeyError: if a parameter's moments are missing.
+            ValueError: if one has another shape, or there are more than parameters.
+        """
+        state = stored["state"]
+        for moment in self._moments:
+            moment.zero_()
+        self._steps.zero_()
+        if not state:
+            return
+        if len(state) != len(self._shapes):
+            raise ValueError(f"moments of {len(state)} parameters for {len(self._shapes)}")
+        for name, moment in zip(_MOMENTS, self._moments, strict=True):
+            for index, part in enumerate(_parts(moment, self._shapes)):
+                if state[index][name].shape != part.shape:
+                    raise ValueError(f"the moment {name} of parameter {index} has another shape")
+                part.copy_(state[index][name])
+        self._steps.copy_(state[0]["step"].reshape(()))  # files know no number without a dimension

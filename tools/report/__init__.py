@@ -1,0 +1,1 @@
+"""`guiderail report`: what runs and studies came to, as one page."""
