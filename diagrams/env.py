@@ -145,7 +145,7 @@ class GuidedEnv(DrakeGymEnv):
             options: the task's own, by name (its `Reset`).
 
         Raises:
-            InputError: for an option that the task doesn't have or a value out of range, or if the environment is closed.
+            InputError: for an option that the task doesn't have, a value out of range, or a closed environment.
         """
         if self._closed:
             raise InputError("the environment is closed: make another one")
