@@ -138,7 +138,15 @@ class GuidedEnv(DrakeGymEnv):
         raise InputError(f"an environment holds a simulation and cannot be pickled: call {made} in the worker instead")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Starts an episode; `options` are the task's own (its `Reset`)."""
+        """Starts an episode.
+
+        Args:
+            seed: of everything that the episodes from here on draw; what was drawn before goes on unless given.
+            options: the task's own, by name (its `Reset`).
+
+        Raises:
+            InputError: for an option that the task doesn't have, a value out of range, or a closed environment.
+        """
         if self._closed:
             raise InputError("the environment is closed: make another one")
         # Not the parent's reset: it initializes before the state is set, and refuses options.

@@ -569,9 +569,64 @@ def examples() -> str:
     return page
 
 
+def wiring() -> str:
+    """Each kind of guidance as it is built: systems, and every connection between them."""
+    import numpy as np
+    from pydrake.math import RigidTransform
+
+    from guiderail.diagrams.guidance import GUIDANCE, Known, PrimitiveSkill, Template, build_guidance
+    from guiderail.models.keep_out import KeepOut
+    from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
+    from guiderail.models.skills import load_skill
+
+    period, box = 0.02, LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
+    times = period * np.arange(20)
+    reference = ReferenceTrajectory(times, np.column_stack([times, times]), np.tile(0.01 * np.eye(2), (20, 1, 1)))
+    walls = KeepOut([[5.0, 5.0]], [[6.0, 6.0]], box, margin=0.0)
+    skill = PrimitiveSkill(reference, box, period, horizon=4, keep_out=walls)
+    shown = Known(period, demonstrations=skill, pose_size=2)
+    template = Known(period, template=Template(load_skill("grid_clamp"), {"hole": RigidTransform()}))
+    page = (
+        "# Guidance as it is wired\n\nRead from the diagrams that `build_guidance` makes, here of demonstrations in a "
+        "plane and of the grid clamp's template. A diagram's own ports have no system before the dot. "
+        "[Systems](systems.md) has what each of them does.\n\n"
+    )
+    for name in GUIDANCE.names():
+        if not GUIDANCE.get(name).build.__module__.startswith("guiderail."):
+            continue
+        known = template if not GUIDANCE.get(name).lacks({"template"}) else shown
+        diagram = build_guidance(name, known)
+        page += f"## {name}\n\n{prose(inspect.getdoc(GUIDANCE.get(name).build) or '').split(chr(10) * 2)[0]}\n\n"
+        page += table(["from", "to"], [(code(one), code(other)) for one, other in connections(diagram)])
+    return page
+
+
+def connections(diagram: Any) -> list[tuple[str, str]]:
+    """Every connection of a diagram, from and to, as `system.port`."""
+    from pydrake.systems.framework import InputPortIndex, OutputPortIndex
+
+    rows = []
+    for index in range(diagram.num_input_ports()):
+        for system, port in diagram.GetInputPortLocators(InputPortIndex(index)):
+            rows.append((f".{diagram.get_input_port(index).get_name()}", _port(system.get_input_port(port))))
+    rows += sorted(
+        (_port(source.get_output_port(output)), _port(system.get_input_port(port)))
+        for (system, port), (source, output) in diagram.connection_map().items()
+    )
+    for index in range(diagram.num_output_ports()):
+        source, output = diagram.get_output_port_locator(OutputPortIndex(index))
+        rows.append((_port(source.get_output_port(output)), f".{diagram.get_output_port(index).get_name()}"))
+    return rows
+
+
+def _port(port: Any) -> str:
+    return f"{port.get_system().get_name()}.{port.get_name()}"
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "examples": examples,
     "systems": systems,
+    "wiring": wiring,
     "names": api,
     "command": command,
     "options": options,

@@ -7,7 +7,7 @@ env = gymnasium.make("guiderail.diagrams:guiderail/GridClamp-v0", guidance="sct"
 print("observes", env.observation_space.shape, "acts", env.action_space.shape)
 rng = np.random.default_rng(0)
 observation, info = env.reset(seed=0)
-total, over = 0.0, False
+total = 0.0
 for _ in range(20):
     action = rng.uniform(-1, 1, env.action_space.shape)  # your learner's
     observation, reward, terminated, truncated, info = env.step(action)
