@@ -6,9 +6,10 @@ from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_watch import ContactWatch as ContactWatch
-from .episode_monitor import TERMINATIONS as TERMINATIONS
+from .desired_pose_ramp import DesiredPoseRamp as DesiredPoseRamp
 from .episode_monitor import Condition as Condition
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
+from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .gripper_command import GripperCommand as GripperCommand
 from .guidance_law import GuidanceLaw as GuidanceLaw
 from .history_buffer import HistoryBuffer as HistoryBuffer
@@ -31,4 +32,9 @@ from .safety_filter import SafetyFilter as SafetyFilter
 from .safety_ledger import SafetyLedger as SafetyLedger
 from .sct_input_mapping import SctInputMapping as SctInputMapping
 from .sct_state_machine import SctStateMachine as SctStateMachine
+from .status_watchdog import StatusWatchdog as StatusWatchdog
+from .torque_guard import Phase as Phase
+from .torque_guard import SafetyLimits as SafetyLimits
+from .torque_guard import TorqueGuard as TorqueGuard
+from .torque_publisher import TorquePublisher as TorquePublisher
 from .wrench_sensor import WrenchSensor as WrenchSensor
