@@ -66,6 +66,10 @@ class JointStatus:
     velocities: np.ndarray
     external_torque: np.ndarray
 
+    def __deepcopy__(self, memo: object) -> JointStatus:
+        """Itself: Drake copies values all the time, and nobody writes into this one."""
+        return self
+
     @property
     def is_readable(self) -> bool:
         """Whether the message could be read."""

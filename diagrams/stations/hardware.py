@@ -49,6 +49,8 @@ from guiderail.systems.torque_publisher import TorquePublisher
 # Of what a driver stops at by itself: how much is sent, how much of the surroundings' is borne, and of a joint's speed.
 TORQUE_SHARE, EXTERNAL_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
 MICROSECOND = 1e-6  # [s]
+TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
+REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
 
 
 @dataclass(frozen=True)
@@ -244,7 +246,8 @@ class HardwareStation(Station):
         self.lcm = bus = lcm or DrakeLcm(lcm_url)
         self.known = known = KnownArm(workcell, robot, end_effector)
         self.limits = limits = limits or safety_limits(known.plant, driver)
-        self.impedance = impedance
+        self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
+        self._robot_timeout = robot_timeout
         num_joints = known.plant.num_positions()
         builder = DiagramBuilder()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(bus))
@@ -388,6 +391,23 @@ class HardwareStation(Station):
         """
         raise InputError("a real arm can't be put to a pose by a reset: move it there by desired poses")
 
+    def alike(self, workcell: Workcell) -> HardwareStation:
+        """Another station of the same arm on the same bus, with the same limits."""
+        return HardwareStation(
+            workcell,
+            self.lcm,
+            self.impedance,
+            end_effector=self._end_effector,
+            robot=self._robot,
+            limits=self.limits,
+            robot_timeout=self._robot_timeout,
+        )
+
+    def force_of(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:
+        """The force on the tool that external torques (n,) [Nm] of a resting arm mean, (3,) [N]."""
+        J = self._jacobian(positions)
+        return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
+
     def load_of_force(self, positions: np.ndarray) -> np.ndarray:
         """The share of what is sent at most that the impedance's greatest force and torque can take of each joint, (n,).
 
@@ -396,15 +416,18 @@ class HardwareStation(Station):
         Args:
             positions: of the joints, (n,) [rad].
         """
+        J, limits = self._jacobian(positions), force_first(self.impedance.limits)
+        force = np.linalg.norm(J[3:], axis=0) * limits[:3].max()
+        return (force + np.linalg.norm(J[:3], axis=0) * limits[3:].max()) / np.array(self.limits.torque)
+
+    def _jacobian(self, positions: np.ndarray) -> np.ndarray:
+        """Of the tool centre in the target's axes, (6, n), its rotation first."""
         plant, arm = self.known.plant, self.known.arm
         context = plant.CreateDefaultContext()
         plant.SetPositions(context, positions)
-        J = plant.CalcJacobianSpatialVelocity(
+        return plant.CalcJacobianSpatialVelocity(
             context, JacobianWrtVariable.kV, arm.tool_centre, np.zeros(3), arm.target, arm.target
         )
-        limits = force_first(self.impedance.limits)
-        force = np.linalg.norm(J[3:], axis=0) * limits[:3].max()
-        return (force + np.linalg.norm(J[:3], axis=0) * limits[3:].max()) / np.array(self.limits.torque)
 
 
 class SimulatedIiwa(Diagram):
@@ -430,15 +453,15 @@ class SimulatedIiwa(Diagram):
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
         )
-        self._known = KnownArm(workcell, IIWA14, end_effector)
+        self.known = KnownArm(workcell, IIWA14, end_effector)
         BuildIiwaControl(
-            builder, lcm, self.plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self._known.plant
+            builder, lcm, self.plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self.known.plant
         )
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
-        self._known.place(self.plant, self.arm.model, context, pose)
+        self.known.place(self.plant, self.arm.model, context, pose)
 
 
 class NewMessages:
@@ -460,52 +483,51 @@ class NewMessages:
 
 
 def serve(robot: SimulatedIiwa, lcm: DrakeLcm, start: np.ndarray, seconds: float, patience: float) -> float:
-    """Runs a simulated arm for another process.
+    """Runs a simulated arm for another process: one step, then it waits until its status was answered.
 
-    Until the first command it goes at the pace of the wall's clock, as a real one. From then on it goes step by step:
-    after each it waits for the torque that answers its status. So neither side ever outruns the other, however slow a
-    machine is.
+    So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
+    has taken the status in; where that never came, it is a command.
 
     Args:
         robot: the arm.
         lcm: its bus.
         start: pose at which the tool starts, (6,).
-        seconds: of simulated time to run from the first command on.
-        patience: how long to wait for each command, and ten times as long for the first [s of wall clock].
+        seconds: of simulated time to run.
+        patience: how long to wait for each answer, and ten times as long for the first [s of wall clock].
 
     Returns:
-        The simulated time for which it answered: less than `seconds` if commands stopped.
+        The simulated time at which it ended: less than `seconds` if answers stopped.
     """
     commands = Subscriber(lcm, COMMAND_CHANNEL, lcmt_iiwa_command)
+    words = NewMessages(lcm, STATUS_CHANNEL + TAKEN)
     simulator = Simulator(robot)
     robot.set_pose(simulator.get_mutable_context(), start)
     simulator.Initialize()
-    steps = 0
-    milliseconds = round(1000 * kIiwaLcmStatusPeriod)
-    while commands.count == 0:
-        if steps * kIiwaLcmStatusPeriod > 10 * patience:
-            return 0.0
-        lcm.HandleSubscriptions(milliseconds)
-        steps += 1
-        simulator.AdvanceTo(steps * kIiwaLcmStatusPeriod)
-    first = steps
-    while (steps - first) * kIiwaLcmStatusPeriod < seconds:
-        answered = commands.count
-        for _ in range(50):
-            lcm.HandleSubscriptions(max(1, int(1000 * patience / 50)))
-            if commands.count > answered:
+
+    def answers() -> int:
+        return words.count or commands.count
+
+    steps, repeats = 0, max(1, round(patience / REPEAT))
+    while steps * kIiwaLcmStatusPeriod < seconds:
+        answered = answers()
+        for _ in range(repeats if steps else 10 * repeats):
+            lcm.HandleSubscriptions(round(1000 * REPEAT))
+            if answers() > answered:
                 break
-            # A datagram may be lost.
+            # A datagram may be lost, and before its first answer the other side may not have been listening.
             simulator.get_system().ForcedPublish(simulator.get_context())
         else:
             break
         steps += 1
         simulator.AdvanceTo(steps * kIiwaLcmStatusPeriod)
-    return (steps - first) * kIiwaLcmStatusPeriod
+    return steps * kIiwaLcmStatusPeriod
 
 
 class StepByStep:
-    """Advances a hardware station at the pace of the robot's own clock: a step for each new status that arrives."""
+    """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
+
+    After each it says so, for `serve`, which waits for it.
+    """
 
     def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str = STATUS_CHANNEL):
         """
@@ -514,14 +536,15 @@ class StepByStep:
             patience: how long to wait for a status [s]; then a step goes without, and the station's watchdog notices.
             channel: of the statuses.
         """
-        self._lcm, self._patience = lcm, patience
+        self._lcm, self._patience, self._answers = lcm, patience, channel + TAKEN
         self._statuses = NewMessages(lcm, channel)
-        self._taken = 0
+        self._taken = self._said = 0
 
-    def forget(self) -> None:
-        """Leaves out what came until now."""
+    def begin(self) -> None:
+        """Called when a simulator was initialized, with the newest status: asks for the next."""
         self._lcm.HandleSubscriptions(0)
         self._taken = self._statuses.count
+        self._say()
 
     def advance(self, simulator: Simulator, steps: int) -> None:
         """Advances by so many periods of `PLANT_PERIOD`."""
@@ -529,12 +552,19 @@ class StepByStep:
         for step in range(steps):
             for _ in range(10):
                 if self._statuses.count > self._taken:
-                    self._taken += 1
                     break
                 self._lcm.HandleSubscriptions(max(1, int(1000 * self._patience / 10)))
+            self._taken = self._statuses.count
             simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
+            self._say()
+
+    def _say(self) -> None:
+        self._said += 1
+        self._lcm.Publish(self._answers, struct.pack(">q", self._said))
 
 
 def drive_in_step(simulator: Simulator, lcm: DrakeLcm, seconds: float, patience: float) -> None:
     """Advances a hardware station step by step: see `StepByStep`."""
-    StepByStep(lcm, patience).advance(simulator, round(seconds / PLANT_PERIOD))
+    pace = StepByStep(lcm, patience)
+    pace.begin()
+    pace.advance(simulator, round(seconds / PLANT_PERIOD))

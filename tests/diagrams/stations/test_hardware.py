@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,14 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
-from guiderail.diagrams.stations.hardware import HardwareStation, SimulatedIiwa, drive_in_step, find_driver
+from guiderail.diagrams.stations.hardware import (
+    IIWA_DRIVER,
+    HardwareStation,
+    SimulatedIiwa,
+    drive_in_step,
+    find_driver,
+    safety_limits,
+)
 from guiderail.diagrams.stations.rails import RailsStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
 from guiderail.models.errors import InputError
@@ -31,7 +39,8 @@ class OneProcess:
         self.lcm = lcm = DrakeLcm("memq://")
         self.torques = []
         self.robot = SimulatedIiwa(WORKCELL, lcm)
-        self.station = HardwareStation(WORKCELL, lcm, robot_timeout=1.0)
+        limits = replace(safety_limits(self.robot.known.plant, IIWA_DRIVER), damping_time=0.2, ramp_time=0.1)
+        self.station = HardwareStation(WORKCELL, lcm, robot_timeout=1.0, limits=limits)
         self.robot_simulator, self.simulator = Simulator(self.robot), Simulator(self.station)
         self.robot.set_pose(self.robot_simulator.get_mutable_context(), START)
         self.context = self.simulator.get_mutable_context()
@@ -42,7 +51,7 @@ class OneProcess:
         self.station.start(self.simulator)
         self._steps = 0
         if settled:
-            self.go(START, 0.8)
+            self.go(START, 0.4)
             assert self.phase == Phase.RUNNING
 
     @property
@@ -76,13 +85,13 @@ def test_starts_by_holding_where_the_robot_is():
 
 def test_follows_pushes_and_feels_over_messages():
     both = OneProcess()
-    both.go(START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0], 1.5)
+    both.go(START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0], 1.0)
     np.testing.assert_allclose(both["pose"][:3], START[:3] + [0.01, 0, 0], atol=1e-3)
     # Turned by 45°, the mouth stands on the lugs: 10 N of push come back as 10 N.
     lug_top = 0.005975
     turned = np.array([0.0, 0.0, 0.012, np.pi / 4, 0.0, 0.0])
-    both.go(turned, 1.0)
-    both.go(turned + [0, 0, lug_top - 0.012 - 10.0 / 1500.0, 0, 0, 0], 1.5)
+    both.go(turned, 1.75)
+    both.go(turned + [0, 0, lug_top - 0.012 - 10.0 / 1500.0, 0, 0, 0], 1.0)
     assert both["wrench"][2] == pytest.approx(10.0, abs=1.5)
     assert both["contact_force"][0] == pytest.approx(10.0, abs=1.5)
     assert both["pose"][2] == pytest.approx(lug_top, abs=5e-4)
@@ -125,13 +134,9 @@ def status(both, **changed):
 NAN7, THREE = [np.nan] * 7, {name: [0.0] * 3 for name in lcmt_iiwa_status.__slots__[2:]}
 FAULTY = {
     "NaN in the positions": (Fault.NOT_FINITE, {"joint_position_measured": NAN7}),
-    "NaN in the external torques": (Fault.NOT_FINITE, {"joint_torque_external": NAN7}),
     "three joints": (Fault.WRONG_SIZE, {"num_joints": 3} | THREE),
     "an old status": (Fault.OUT_OF_ORDER, {"utime": 1000}),
-    "a status from the future": (Fault.FUTURE, {"utime": 10**9}),
-    "a jump": (Fault.POSITION_JUMP, {"joint_position_measured": [1.0] * 7}),
     "garbage": (Fault.MALFORMED, None),
-    "nothing": (Fault.MALFORMED, None),
 }
 
 
@@ -147,7 +152,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     side = 0.01 * (-1.0) ** list(FAULTY).index(name)
     goal = START + [side, 0.0, 0.0, 0.0, 0.0, 0.0]
     both.go(goal, 0.06)
-    wrong = {"garbage": bytes(range(100)), "nothing": b""}.get(name) if changed is None else status(both, **changed)
+    wrong = bytes(range(100)) if changed is None else status(both, **changed)
     both.torques.clear()
     both.lcm.Publish("IIWA_STATUS", wrong)
     both.go(goal, PLANT_PERIOD, robot=False)
@@ -156,7 +161,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     assert both.phase == Phase.DAMPING
     assert np.isfinite(both.torques).all()
     assert (np.abs(both.torques) <= both.station.limits.torque).all()
-    both.go(goal, 0.7)
+    both.go(goal, 0.25)
     assert (both.phase, both.fault) == (Phase.OFF, fault)
     np.testing.assert_array_equal(both["iiwa.torque_commanded"], 0.0)
     assert both.commands[-1].joint_torque == (0.0,) * 7
@@ -165,7 +170,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     both.station.resume(both.context)
     both.go(goal, 0.05)
     assert np.linalg.norm((both["pose"] - before)[:3]) < 1e-3
-    both.go(goal, 0.6)
+    both.go(goal, 0.4)
     assert both.phase == Phase.RUNNING
     assert np.linalg.norm((both["pose"] - goal)[:3]) < 0.5 * np.linalg.norm((before - goal)[:3])
     assert np.isfinite(both["wrench"]).all()
@@ -178,7 +183,7 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     moving = both["iiwa.velocity_estimated"].copy()
     assert np.abs(moving).max() > 0.05
     both.torques.clear()
-    both.go(goal, 1.0, robot=False)
+    both.go(goal, 0.5, robot=False)
     found = next(step for step, torque in enumerate(both.torques) if (torque @ moving < 0.0) or not torque.any())
     assert found * PLANT_PERIOD <= 0.05
     assert (both.phase, both.fault) == (Phase.OFF, Fault.STALE)
@@ -195,7 +200,7 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     assert len(both.commands) > sent
     np.testing.assert_array_equal(both.torques[back:], 0.0)
     both.station.resume(both.context)
-    both.go(goal, 1.5)
+    both.go(goal, 1.0)
     assert both.phase == Phase.RUNNING
     np.testing.assert_allclose(both["pose"][:3], goal[:3], atol=2e-3)
 
