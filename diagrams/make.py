@@ -144,8 +144,8 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     resolved = resolve(task, options)
     if not resolved.station.simulated:
         raise InputError(
-            f"station={resolved.station.name!r} is a real robot, which no reset can put anywhere: train and evaluate in "
-            "a simulation, and run what was learned by guiderail run"
+            f"station={resolved.station.name!r} is a real robot, which no reset can put anywhere: train and evaluate "
+            "in a simulation, and run what was learned by guiderail run"
         )
     threadpool_limits(1)
     station = make_station(resolved)

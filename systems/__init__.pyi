@@ -7,9 +7,9 @@ from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_watch import ContactWatch as ContactWatch
 from .desired_pose_ramp import DesiredPoseRamp as DesiredPoseRamp
+from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import Condition as Condition
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
-from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .gripper_command import GripperCommand as GripperCommand
 from .guidance_law import GuidanceLaw as GuidanceLaw
 from .history_buffer import HistoryBuffer as HistoryBuffer

@@ -1,7 +1,15 @@
 """Where an arm is told to go: from where it is to where it is commanded, never faster than it may."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from guiderail.models.errors import InputError
 from guiderail.systems.support.sampling import check_period

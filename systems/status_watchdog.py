@@ -4,7 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common.value import Value
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from guiderail.models.joint_status import Fault, Heard, JointStatus, StatusLimits, judge_status
 from guiderail.systems.support.caching import declare_cache

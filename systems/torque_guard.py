@@ -5,7 +5,15 @@ from enum import IntEnum
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import FAULTS, Fault
@@ -153,7 +161,10 @@ class TorqueGuard(LeafSystem):
             self, plant, self._set_plant_state, prerequisites_of_calc={self._state_port.ticket()}
         )
         self._found = declare_cache(
-            self, "found", self._find_fault, prerequisites_of_calc=memory | fault | measured | {self._torque_port.ticket()}
+            self,
+            "found",
+            self._find_fault,
+            prerequisites_of_calc=memory | fault | measured | {self._torque_port.ticket()},
         )
         found = {self._found.ticket()}
         self._safe_torque_port = self.DeclareVectorOutputPort(

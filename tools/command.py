@@ -413,7 +413,9 @@ def run(
     """
     from guiderail.tools.operate.run_policy import run_policy
 
-    code = run_policy(run, station=station, lcm_url=lcm_url, robot=robot, rehearse=rehearse, yes=yes, out=out, say=_tell)
+    code = run_policy(
+        run, station=station, lcm_url=lcm_url, robot=robot, rehearse=rehearse, yes=yes, out=out, say=_tell
+    )
     raise typer.Exit(code)
 
 

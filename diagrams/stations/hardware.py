@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
@@ -70,7 +71,7 @@ class Driver:
     name: str
     status_channel: str
     command_channel: str
-    status_type: type
+    status_type: Any
     status_fields: tuple[str, str, str]
     external_torque_sign: float
     encode: Callable[[float, np.ndarray], bytes]
@@ -409,7 +410,7 @@ class HardwareStation(Station):
         return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
 
     def load_of_force(self, positions: np.ndarray) -> np.ndarray:
-        """The share of what is sent at most that the impedance's greatest force and torque can take of each joint, (n,).
+        """The share of each joint's greatest torque that the impedance's greatest force and torque can take, (n,).
 
         Above 1 the guard clips what the impedance wants; the driver would stop at more than 1 / `TORQUE_SHARE`.
 
@@ -511,7 +512,9 @@ def serve(robot: SimulatedIiwa, lcm: DrakeLcm, start: np.ndarray, seconds: float
     while steps * kIiwaLcmStatusPeriod < seconds:
         answered = answers()
         for _ in range(repeats if steps else 10 * repeats):
-            lcm.HandleSubscriptions(round(1000 * REPEAT))
+            # A command comes before the word that belongs to it.
+            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and answers() == answered:
+                pass
             if answers() > answered:
                 break
             # A datagram may be lost, and before its first answer the other side may not have been listening.

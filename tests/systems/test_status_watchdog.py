@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import Simulator
 from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
 
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import FAULTS, UNREADABLE, Fault, JointStatus, StatusLimits

@@ -43,9 +43,7 @@ class Guarded:
             "status_age": [0.0],
             "holding": [0.0],
         }
-        self.ports = {
-            name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in ok.items()
-        }
+        self.ports = {name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in ok.items()}
         self.ok = ok
         if running:
             self.simulator.Initialize()

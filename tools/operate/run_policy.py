@@ -142,7 +142,9 @@ class Operation:
             for signal in ("position_measured", "velocity_estimated")
         )
         external = station.GetOutputPort(f"{name}.torque_external").Eval(context)
-        force = station.force_of(positions, external)
+        force = float(np.linalg.norm(station.force_of(positions, external)))
+        fastest = float(np.abs(velocities).max())
+        p_WT = arm.target.CalcPoseInWorld(plant.CreateDefaultContext()).translation()
         lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
         payload = sum(body.default_mass() for body in arm.tool)
         load = station.load_of_force(positions).max()
@@ -154,10 +156,10 @@ class Operation:
                 f"{np.rad2deg(positions).round(1).tolist()} degrees",
                 bool((lower < positions).all() and (positions < upper).all()),
             ),
-            Check("standstill", f"fastest joint {np.abs(velocities).max():.3f} rad/s", (abs(velocities) < STANDSTILL).all()),
+            Check("standstill", f"fastest joint {fastest:.3f} rad/s", fastest < STANDSTILL),
             Check("payload", f"{payload:.2f} kg bolted to the flange, as the robot must have been told"),
-            Check("load", f"{np.linalg.norm(force):.1f} N felt at rest", float(np.linalg.norm(force)) < UNLOADED),
-            Check("target", f"at {arm.target.CalcPoseInWorld(plant.CreateDefaultContext()).translation()} m of the base"),
+            Check("load", f"{force:.1f} N felt at rest", force < UNLOADED),
+            Check("target", f"at {p_WT} m of the base"),
             Check("tool", f"at {pose[:3].round(4)} m and {np.rad2deg(pose[3:]).round(1)} degrees of the target"),
             Check(
                 "start",
@@ -200,7 +202,9 @@ class Operation:
         if self._is_stopped():
             return Outcome(Fault.ASKED, FAULTS[Fault.ASKED], len(self.trace))
         if force > limit:
-            return Outcome(Fault.FORCE, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", len(self.trace))
+            return Outcome(
+                Fault.FORCE, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", len(self.trace)
+            )
         return None
 
     def _approach(self, here: np.ndarray) -> Outcome | None:

@@ -236,7 +236,10 @@ def test_another_station_takes_over_without_letting_go():
     for step in range(1, 40):
         both.robot_simulator.AdvanceTo(time + step * PLANT_PERIOD)
         simulator.AdvanceTo(step * PLANT_PERIOD)
-        assert (other.get_phase_output_port().Eval(context)[0], other.get_fault_output_port().Eval(context)[0]) == (2, 0)
+        assert (other.get_phase_output_port().Eval(context)[0], other.get_fault_output_port().Eval(context)[0]) == (
+            2,
+            0,
+        )
     np.testing.assert_allclose(other.get_pose_output_port().Eval(context)[:3], goal[:3], atol=1.5e-3)
 
 
