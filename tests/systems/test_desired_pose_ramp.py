@@ -46,6 +46,7 @@ def test_goes_from_there_along_a_straight_line_never_faster_than_it_may():
     ramped = Ramped(goal).take_over()
     first = ramped.system.get_limited_pose_output_port().Eval(ramped.simulator.get_context())
     assert np.linalg.norm((first - MEASURED)[:3]) <= SPEED * PERIOD + 1e-12
+    assert np.abs((first - MEASURED)[3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
     poses = ramped.go(30)
     steps = np.diff(poses, axis=0)
     assert np.linalg.norm(steps[:, :3], axis=1).max() <= SPEED * PERIOD + 1e-12

@@ -100,6 +100,7 @@ def test_sends_nothing_before_the_status_is_sound_and_then_takes_over_gradually(
             assert guarded["not_following"][0] == 1.0
             expected = np.clip(share * WANTED + (1.0 - share) * guarded.damping(), -20.0, 20.0)
             np.testing.assert_allclose(guarded["safe_torque"], expected, atol=1e-12)
+    assert len(shares) >= LIMITS.ramp_time / PERIOD - 1
     np.testing.assert_allclose(np.diff(shares), PERIOD / LIMITS.ramp_time)
 
 

@@ -172,18 +172,37 @@ class Operation:
         ]
 
     def run(self, say: Say) -> Outcome:
-        """Takes over where the arm is, approaches the skill's start at a crawl, executes it, and lets the arm rest."""
+        """Takes over where the arm is, approaches the skill's start at a crawl, executes it, and lets the arm rest.
+
+        The arm is brought to rest whatever is raised, such as by a policy that returns no action.
+        """
         self._simulator = self._initialized()
         here = self._station.get_pose_output_port().Eval(self._simulator.get_context()).copy()
         say(f"taking over, and approaching the start at {CRAWL / MM:.0f} mm/s")
-        stopped = self._approach(here)
-        if stopped is None:
-            say(f"executing {self._task.name}")
-            stopped = self._execute()
+        try:
+            stopped = self._approach(here)
+            if stopped is None:
+                say(f"executing {self._task.name}")
+                stopped = self._execute()
+        except BaseException:
+            self._give_back()
+            self._rest()
+            raise
+        self._rest()
+        return stopped
+
+    def _rest(self) -> None:
         station, context = self._acting()
         station.stop(context)
         self._pace.advance(self._simulator, round((station.limits.damping_time + 0.1) / PLANT_PERIOD))
-        return stopped
+
+    def _give_back(self) -> None:
+        """Lets the station that approached go on instead of the skill, which can't be advanced any more."""
+        station, root = self._acting()
+        if station is self._skills_station:
+            before = station.GetMyContextFromRoot(root)
+            self._simulator = self._initialized()
+            self._station.take_over(self._simulator.get_mutable_context(), before)
 
     def _acting(self) -> tuple[HardwareStation, Context]:
         """The station that acts now, and the root context."""

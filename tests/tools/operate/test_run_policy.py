@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
+from drake import lcmt_iiwa_command
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
@@ -13,6 +14,7 @@ from guiderail.diagrams.stations.hardware import HardwareStation, SimulatedIiwa
 from guiderail.diagrams.stations.station import PLANT_PERIOD
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
+from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.command import main
 from guiderail.tools.operate import run_policy
 from guiderail.tools.operate.run_policy import Operation
@@ -80,6 +82,19 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
     assert len(ledger) == 20
     assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(ledger)
     assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "done"
+
+
+def test_a_policy_that_returns_no_action_leaves_the_arm_at_rest(operated):
+    operation, pace = operated(policy=lambda observation: np.full(2, np.nan))
+    commands = []
+    operation._station.lcm.Subscribe(
+        "IIWA_COMMAND", lambda message: commands.append(lcmt_iiwa_command.decode(message).joint_torque)
+    )
+    with pytest.raises(PolicyError):
+        operation.run(print)
+    assert commands[-1] == (0.0,) * 7
+    velocities = pace.robot.plant.GetVelocities(pace.robot.plant.GetMyContextFromRoot(pace.simulator.get_context()))
+    assert np.abs(velocities).max() < 0.01
 
 
 def test_a_status_that_stops_ends_it(operated):
