@@ -246,13 +246,13 @@ def test_another_station_takes_over_without_letting_go():
 def test_an_external_torque_has_the_sign_of_what_the_surroundings_do():
     """An iiwa's driver says it so; a Franka's says what the arm does to them."""
     iiwa, panda = lcmt_iiwa_status(), lcmt_panda_status()
-    iiwa.num_joints = 7
     for message in (iiwa, panda):
+        message.num_joints = 7
         for name in (name for name in message.__slots__ if name.startswith("joint_")):
             setattr(message, name, [0.0] * 7)
         message.joint_torque_external = [1.0] * 7
-    np.testing.assert_array_equal(find_driver("iiwa14").decode(iiwa.encode()).external_torque, 1.0)
-    np.testing.assert_array_equal(find_driver("panda").decode(panda.encode()).external_torque, -1.0)
+    np.testing.assert_array_equal(find_driver("iiwa14").decode(iiwa.encode()).external_torque, [1.0] * 7)
+    np.testing.assert_array_equal(find_driver("panda").decode(panda.encode()).external_torque, [-1.0] * 7)
     with pytest.raises(InputError, match="nothing here speaks to a robot"):
         find_driver("ur5e")
 
