@@ -536,12 +536,13 @@ class StepByStep:
         """
         Args:
             lcm: the bus.
-            patience: how long to wait for a status [s]; then a step goes without, and the station's watchdog notices.
+            patience: how long to wait for a status [s]; then steps go without, and the station's watchdog notices.
             channel: of the statuses.
         """
         self._lcm, self._patience, self._answers = lcm, patience, channel + TAKEN
         self._statuses = NewMessages(lcm, channel)
         self._taken = self._said = 0
+        self._is_silent = False
 
     def begin(self) -> None:
         """Called when a simulator was initialized, with the newest status: asks for the next."""
@@ -553,10 +554,13 @@ class StepByStep:
         """Advances by so many periods of `PLANT_PERIOD`."""
         start = simulator.get_context().get_time()
         for step in range(steps):
+            # A robot that has fallen silent is not waited for again and again.
+            patience = PLANT_PERIOD if self._is_silent else self._patience
             for _ in range(10):
                 if self._statuses.count > self._taken:
                     break
-                self._lcm.HandleSubscriptions(max(1, int(1000 * self._patience / 10)))
+                self._lcm.HandleSubscriptions(max(1, int(1000 * patience / 10)))
+            self._is_silent = self._statuses.count == self._taken
             self._taken = self._statuses.count
             simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
             self._say()

@@ -47,7 +47,7 @@ STANDSTILL = 0.05  # [rad/s] of a joint
 UNLOADED = 5.0  # [N]: what a robot feels at rest whose payload is known to it
 SIGNALS = {"wrench": 6, "saturation": 1, "holding": 1, "fallback": 1, "commanded_violation": 1, "fault": 1, "phase": 1}
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
-PATIENCE = 1.0  # [s] of wall clock that a rehearsal waits for each status
+PATIENCE = 3.0  # [s] of wall clock that a rehearsal waits for a status
 
 Say = Callable[[str], None]
 
