@@ -425,6 +425,7 @@ def serve_iiwa(
     seconds: Annotated[float, _opt("How long, in simulated time.")] = 3600.0,
     patience: Annotated[float, _opt("How many seconds to wait for a command.")] = 5.0,
     task: Annotated[str, _opt("What stands in front of it: {tasks}.", of="tasks")] = "BncConnector",
+    real_time: Annotated[bool, _opt("Go by the wall's clock, and wait for nobody.", "--real-time")] = False,
 ) -> None:
     """Simulate an iiwa at the other end of LCM.
 
@@ -432,7 +433,7 @@ def serve_iiwa(
     """
     from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
 
-    raise typer.Exit(0 if serve(url, seconds, patience, task) else 1)
+    raise typer.Exit(0 if serve(url, seconds, patience, task, real_time=real_time) else 1)
 
 
 @command("generate connector-demonstrations --out .")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import json
 import os
@@ -355,7 +356,8 @@ def run_policy(
         if not yes:
             _confirm()
         say("Enter or Ctrl-C stops the arm")
-        outcome = operation.run(say)
+        with _no_pauses():
+            outcome = operation.run(say)
     found = {
         "task": config.task,
         "run": folder.path.name,
@@ -406,6 +408,17 @@ def _confirm() -> None:
 @contextmanager
 def _nothing() -> Iterator[None]:
     yield
+
+
+@contextmanager
+def _no_pauses() -> Iterator[None]:
+    """A garbage collection takes longer than a robot waits for a command."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 @contextmanager
