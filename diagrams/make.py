@@ -146,6 +146,11 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     """
     check_render_mode(render_mode)
     resolved = resolve(task, options)
+    if not resolved.station.simulated:
+        raise InputError(
+            f"station={resolved.station.name!r} is a real robot, which no reset can put anywhere: train and evaluate "
+            "in a simulation, and run what was learned by guiderail run"
+        )
     threadpool_limits(1)
     key = _key(resolved, render_mode)
     built = _POOL.take(key, lambda: _build(resolved, render_mode))

@@ -7,6 +7,7 @@ from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_lever import ContactLever as ContactLever
 from .contact_watch import ContactWatch as ContactWatch
+from .desired_pose_ramp import DesiredPoseRamp as DesiredPoseRamp
 from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import Condition as Condition
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
@@ -32,4 +33,9 @@ from .safety_filter import SafetyFilter as SafetyFilter
 from .safety_ledger import SafetyLedger as SafetyLedger
 from .sct_input_mapping import SctInputMapping as SctInputMapping
 from .sct_state_machine import SctStateMachine as SctStateMachine
+from .status_watchdog import StatusWatchdog as StatusWatchdog
+from .torque_guard import Phase as Phase
+from .torque_guard import SafetyLimits as SafetyLimits
+from .torque_guard import TorqueGuard as TorqueGuard
+from .torque_publisher import TorquePublisher as TorquePublisher
 from .wrench_sensor import WrenchSensor as WrenchSensor

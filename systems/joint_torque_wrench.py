@@ -29,7 +29,8 @@ class JointTorqueWrench(LeafSystem):
         - wrench
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool centre P in the axes of
-    T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, and never feeds through.
+    T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, and never feeds through. A
+    sample that is not finite is left out.
     """
 
     def __init__(
@@ -86,6 +87,10 @@ class JointTorqueWrench(LeafSystem):
         self._plant.SetPositions(plant_context, self._positions_port.Eval(context))
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        external_torque = self._external_torque_port.Eval(context)
+        # A sample that is no number would stay in the filter for ever.
+        if not np.isfinite([*self._positions_port.Eval(context), *external_torque]).all():
+            return EventStatus.DidNothing()
         J = self._plant.CalcJacobianSpatialVelocity(
             self._plant_context.Eval(context),
             JacobianWrtVariable.kV,
@@ -95,7 +100,7 @@ class JointTorqueWrench(LeafSystem):
             self._target,
         )
         # [torque, force], as the Jacobian's rows are [rotational, translational]
-        F = np.linalg.solve(J @ J.T + self._damping * np.eye(6), J @ self._external_torque_port.Eval(context))
+        F = np.linalg.solve(J @ J.T + self._damping * np.eye(6), J @ external_torque)
         newest = np.concatenate([F[3:], F[:3]])
         last = context.get_discrete_state(self._state).value()
         discrete_state.set_value(newest + self._decay * (last - newest))

@@ -438,19 +438,45 @@ def drive(
     drive_by_hand(task, ({} if guidance is None else {"guidance": guidance}) | _environment(env))
 
 
+@command("run runs/connector --rehearse --yes")
+def run(
+    run: Run,
+    station: Annotated[str, _opt("Where: a station that is a robot.", of="stations")] = "hardware",
+    lcm_url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
+    robot: Annotated[str, _opt("Which arm.", of="robots")] = "iiwa14",
+    rehearse: Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")] = False,
+    yes: Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")] = False,
+    out: Annotated[Path | None, _opt("The folder of what is recorded.  [default: hardware in the run]")] = None,
+) -> None:
+    """Run a policy on a robot.
+
+    What is assumed of the robot is read out and has to be confirmed. Then the arm takes over where it is, approaches
+    the start at a crawl and executes the skill; every control step is recorded. It ends with 0 if the skill was
+    executed to its end, and with 1 if a limit, a fault of the status or a key stopped it.
+    """
+    from guiderail.tools.operate.run_policy import run_policy
+
+    code = run_policy(
+        run, station=station, lcm_url=lcm_url, robot=robot, rehearse=rehearse, yes=yes, out=out, say=_tell
+    )
+    raise typer.Exit(code)
+
+
 @command("serve-iiwa --seconds 60", "serve-iiwa")
 def serve_iiwa(
     url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
     seconds: Annotated[float, _opt("How long, in simulated time.")] = 3600.0,
     patience: Annotated[float, _opt("How many seconds to wait for a command.")] = 5.0,
+    task: Annotated[str, _opt("What stands in front of it: {tasks}.", of="tasks")] = "BncConnector",
+    real_time: Annotated[bool, _opt("Go by the wall's clock, and wait for nobody.", "--real-time")] = False,
 ) -> None:
     """Simulate an iiwa at the other end of LCM.
 
-    It stands in front of a BNC jack; the command ends with 1 if commands stopped coming.
+    It stands in front of a task's fixture; the command ends with 1 if commands stopped coming.
     """
     from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
 
-    raise typer.Exit(0 if serve(url, seconds, patience) else 1)
+    raise typer.Exit(0 if serve(url, seconds, patience, task, real_time=real_time) else 1)
 
 
 @command("generate connector-demonstrations --out .")
@@ -574,6 +600,10 @@ def _usage_sentence(error: Any) -> str:
 def _refuse(sentence: str) -> int:
     _say(sentence)
     return 2
+
+
+def _tell(words: str) -> None:
+    print(words, flush=True)
 
 
 def _say(sentence: str) -> None:

@@ -1,42 +1,212 @@
-"""A real iiwa behind LCM, with the same ports as a simulated station; and the robot's side of it, simulated."""
+"""A real arm behind LCM, with the same ports as a simulated station; and the robot's side of it, simulated."""
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
-from drake import lcmt_iiwa_command, lcmt_iiwa_status
+from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
+from pydantic import Field
+from pydrake.common.value import Value
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface, Subscriber
-from pydrake.manipulation import (
-    BuildIiwaControl,
-    IiwaCommandSender,
-    IiwaControlMode,
-    IiwaDriver,
-    IiwaStatusReceiver,
-    kIiwaLcmStatusPeriod,
-)
+from pydrake.manipulation import BuildIiwaControl, IiwaDriver, kIiwaLcmStatusPeriod
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.lcm import LcmInterfaceSystem, LcmPublisherSystem, LcmSubscriberSystem
-from pydrake.systems.primitives import Multiplexer
+from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, SerializerInterface
+from pydrake.systems.primitives import MatrixGain
 
-from guiderail.diagrams.stations.arm import KnownArm, add_arm, add_impedance_control
-from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance, Station, add_workcell_plant
+from guiderail.diagrams.options import Number, Options
+from guiderail.diagrams.stations.arm import KnownArm, add_arm, impedance_gains
+from guiderail.diagrams.stations.registry import register_station
+from guiderail.diagrams.stations.station import (
+    PLANT_PERIOD,
+    Impedance,
+    Station,
+    add_workcell_plant,
+    export_station_ports,
+    force_first,
+)
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
+from guiderail.models.joint_status import UNREADABLE, JointStatus, StatusLimits
+from guiderail.models.registry import did_you_mean
 from guiderail.models.robots.iiwa import IIWA14
-from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector
+from guiderail.models.robots.panda import PANDA
+from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector, Robot, find_robot
+from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
+from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.desired_pose_ramp import DesiredPoseRamp
+from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
+from guiderail.systems.status_watchdog import StatusWatchdog
+from guiderail.systems.torque_guard import SafetyLimits, TorqueGuard
+from guiderail.systems.torque_publisher import TorquePublisher
 
-STATUS_CHANNEL, COMMAND_CHANNEL = "IIWA_STATUS", "IIWA_COMMAND"
-NUM_JOINTS = IIWA14.num_joints
+# Of what a driver stops at by itself: how much is sent, how much of the surroundings' is borne, and of a joint's speed.
+TORQUE_SHARE, EXTERNAL_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
+MICROSECOND = 1e-6  # [s]
+TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
+REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
 
 
+@dataclass(frozen=True)
+class Driver:
+    """How the program that drives a robot speaks over LCM, and what it does by itself.
+
+    Attributes:
+        name: what Drake calls its ports.
+        status_channel, command_channel: of the bus.
+        status_type: its message, of the fields that `status_fields` names.
+        status_fields: of position, velocity and external torque.
+        external_torque_sign: what the last of these is multiplied by to be what the surroundings do to the arm.
+        encode: from the time [s] and torques (n,) to a command.
+        trips: external torques at which it stops by itself when it is controlled by torque, (n,) [Nm].
+    """
+
+    name: str
+    status_channel: str
+    command_channel: str
+    status_type: Any
+    status_fields: tuple[str, str, str]
+    external_torque_sign: float
+    encode: Callable[[float, np.ndarray], bytes]
+    trips: tuple[float, ...]
+
+    def decode(self, message: bytes) -> JointStatus:
+        """What a message says; `UNREADABLE` where it can't be read."""
+        try:
+            status = self.status_type.decode(message)
+            positions, velocities, external = (
+                np.array(getattr(status, name), dtype=float) for name in self.status_fields
+            )
+        except (ValueError, struct.error, OverflowError):
+            return UNREADABLE
+        return JointStatus(status.utime * MICROSECOND, positions, velocities, self.external_torque_sign * external)
+
+
+def _encode_iiwa(time: float, torque: np.ndarray) -> bytes:
+    command = lcmt_iiwa_command()
+    command.utime = round(time / MICROSECOND)
+    command.num_torques, command.joint_torque = len(torque), torque.tolist()
+    return command.encode()
+
+
+def _encode_panda(time: float, torque: np.ndarray) -> bytes:
+    command = lcmt_panda_command()
+    command.utime = round(time / MICROSECOND)
+    command.num_joint_torque, command.joint_torque = len(torque), torque.tolist()
+    command.control_mode_expected = lcmt_panda_status.CONTROL_MODE_TORQUE
+    return command.encode()
+
+
+IIWA_DRIVER = Driver(
+    name="iiwa",
+    status_channel="IIWA_STATUS",
+    command_channel="IIWA_COMMAND",
+    status_type=lcmt_iiwa_status,
+    status_fields=("joint_position_measured", "joint_velocity_estimated", "joint_torque_external"),
+    external_torque_sign=1.0,
+    encode=_encode_iiwa,
+    trips=tuple(60.0 * share for share in (1.0, 1.0, 1.0, 0.5, 0.2, 0.2, 0.1)),
+)
+# Franka's external torque is what the arm does to the surroundings. The trips are those of libfranka's examples.
+PANDA_DRIVER = Driver(
+    name="panda",
+    status_channel="PANDA_STATUS",
+    command_channel="PANDA_COMMAND",
+    status_type=lcmt_panda_status,
+    status_fields=("joint_position", "joint_velocity", "joint_torque_external"),
+    external_torque_sign=-1.0,
+    encode=_encode_panda,
+    trips=(20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0),
+)
+DRIVERS = {IIWA14.name: IIWA_DRIVER, PANDA.name: PANDA_DRIVER}
+"""By the name of the robot."""
+
+STATUS_CHANNEL, COMMAND_CHANNEL = IIWA_DRIVER.status_channel, IIWA_DRIVER.command_channel
+
+
+def find_driver(robot: Robot | str) -> Driver:
+    """The driver of a robot.
+
+    Raises:
+        InputError: if there is none.
+    """
+    name = robot if isinstance(robot, str) else robot.name
+    if name not in DRIVERS:
+        raise InputError(f"nothing here speaks to a robot {name!r} over LCM: {did_you_mean(name, DRIVERS)}")
+    return DRIVERS[name]
+
+
+def safety_limits(plant: MultibodyPlant, driver: Driver) -> SafetyLimits:
+    """Limits below those at which the driver stops by itself, and below the joints' own.
+
+    Args:
+        plant: the arm as its controller knows it.
+        driver: of the arm.
+    """
+    trips = np.array(driver.trips)
+    return SafetyLimits(
+        velocity=tuple((VELOCITY_SHARE * plant.GetVelocityUpperLimits()).tolist()),
+        torque=tuple(np.minimum(TORQUE_SHARE * trips, plant.GetEffortUpperLimits()).tolist()),
+        external_torque=tuple((EXTERNAL_SHARE * trips).tolist()),
+    )
+
+
+class _StatusSerializer(SerializerInterface):
+    """Reads whatever comes: a message that can't be read must not end the process that stops the arm."""
+
+    def __init__(self, driver: Driver):
+        SerializerInterface.__init__(self)
+        self._driver = driver
+
+    def CreateDefaultValue(self) -> Value:
+        """No status yet."""
+        return Value[object](None)
+
+    def Deserialize(self, buffer: bytes, abstract_value: Value) -> None:
+        """A message as a `JointStatus`."""
+        abstract_value.set_value(self._driver.decode(bytes(buffer)))
+
+
+class HardwareOptions(Options):
+    """Of a station whose arm is real."""
+
+    robot: str = Field(IIWA14.name, description="which arm")
+    end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
+    lcm_url: str = Field("", description="the bus; LCM's own default where it is empty")
+    robot_timeout: Number = Field(10.0, gt=0, description="how long to wait for the robot's first status [s]")
+
+
+@register_station("hardware", world="workcell", options=HardwareOptions, simulated=False)
 class HardwareStation(Station):
     """The impedance controller on this machine, the arm at the other end of Drake's LCM messages.
 
-    Torques go out on `IIWA_COMMAND`, joint states come in on `IIWA_STATUS`. The robot's own controller, in torque mode,
-    carries its weight: here nothing compensates gravity a second time. The wrench is estimated from the joints'
-    external torques; there is no wrist sensor. `start` waits for the robot's first status, and the first pose that
-    is held is where the robot then is.
+    Torques go out as commands, joint states come in as statuses: see `DRIVERS`. The robot's own controller, in torque
+    mode, carries its weight: here nothing compensates gravity a second time. The wrench is estimated from the joints'
+    external torques; there is no wrist sensor. `start` waits for the robot's first status. Then nothing is sent until
+    statuses have come for the settling time, and from there the arm takes over gradually, where it is.
+
+    A `StatusWatchdog` judges what comes and a `TorqueGuard` what is measured and sent; they stop the arm, `fault` says
+    why, and `resume` goes on. Beside every station's ports it has these outputs, the last of them under the names that
+    they have in Drake's own stations, after the name of the driver and a dot:
+
+    =====================  =====  =====================================================================================
+    output                 size   meaning
+    =====================  =====  =====================================================================================
+    `fault`                1      why the arm is stopped: a code of `Fault`
+    `phase`                1      what it does: a number of `Phase`
+    `position_measured`    n      of the joints [rad]
+    `velocity_estimated`   n      [rad/s]
+    `state_estimated`      2n     both
+    `torque_external`      n      what the surroundings do to the joints [Nm], whatever sign the driver gives it
+    `torque_commanded`     n      what is sent [Nm]
+    =====================  =====  =====================================================================================
     """
 
     def __init__(
@@ -48,34 +218,48 @@ class HardwareStation(Station):
         wrench_time_constant: float = 0.02,
         robot_timeout: float = 10.0,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
+        *,
+        robot: Robot | str = IIWA14,
+        lcm_url: str = "",
+        limits: SafetyLimits | None = None,
+        status_limits: StatusLimits | None = None,
     ):
         """
         Args:
             workcell: for its target frame and for what is held; the fixture is real.
-            lcm: the bus; Drake's default unless given.
+            lcm: the bus; unless given, the one at `lcm_url`.
             impedance: at the tool centre.
-            period: at which commands are sent [s].
+            period: at which commands are sent [s]: the driver's.
             wrench_time_constant: of the wrench estimate's low-pass filter [s].
             robot_timeout: how long an initialization waits for the robot [s].
             end_effector: which tool is bolted on, or its name; a gripper has a driver of its own, and stays open here.
+            robot: which arm, or its name.
+            lcm_url: of the bus; LCM's own default where it is empty.
+            limits: of what is measured and sent; `safety_limits` unless given.
+            status_limits: of the statuses; unless given, the joints' speeds and otherwise the defaults.
+
+        Raises:
+            InputError: if nothing here speaks to such a robot.
         """
         super().__init__()
+        robot = find_robot(robot)
+        self.driver = driver = find_driver(robot)
+        self.lcm = bus = lcm or DrakeLcm(lcm_url)
+        self.known = known = KnownArm(workcell, robot, end_effector)
+        self.limits = limits = limits or safety_limits(known.plant, driver)
+        self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
+        self._robot_timeout = robot_timeout
+        num_joints = known.plant.num_positions()
         builder = DiagramBuilder()
-        bus = lcm or DrakeLcm()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(bus))
-        known = KnownArm(workcell, IIWA14, end_effector)
         subscriber = builder.AddNamedSystem(
             "status_subscriber",
-            LcmSubscriberSystem.Make(
-                STATUS_CHANNEL,
-                lcmt_iiwa_status,
-                bus,
-                use_cpp_serializer=True,
-                wait_for_message_on_initialization_timeout=robot_timeout,
-            ),
+            LcmSubscriberSystem(driver.status_channel, _StatusSerializer(driver), bus, robot_timeout),
         )
-        status = builder.AddNamedSystem("status", IiwaStatusReceiver(NUM_JOINTS))
-        state = builder.AddNamedSystem("state", Multiplexer([NUM_JOINTS, NUM_JOINTS]))
+        status_limits = status_limits or StatusLimits(tuple(known.plant.GetVelocityUpperLimits().tolist()))
+        status = builder.AddNamedSystem("status", StatusWatchdog(status_limits, period=period))
+        positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
+        velocities = builder.AddNamedSystem("velocities", MatrixGain(np.eye(num_joints, 2 * num_joints, num_joints)))
         wrench = builder.AddNamedSystem(
             "wrench",
             JointTorqueWrench(
@@ -86,30 +270,82 @@ class HardwareStation(Station):
                 time_constant=wrench_time_constant,
             ),
         )
-        torque = add_impedance_control(
-            builder,
-            known,
-            impedance,
-            period,
-            state=state.get_output_port(),
-            wrench=wrench.get_wrench_output_port(),
-            compensate_gravity=False,
-        )
-        sender = builder.AddNamedSystem("command", IiwaCommandSender(NUM_JOINTS, IiwaControlMode.kTorqueOnly))
-        publisher = builder.AddNamedSystem(
-            "command_publisher",
-            LcmPublisherSystem.Make(
-                COMMAND_CHANNEL, lcmt_iiwa_command, bus, publish_period=period, use_cpp_serializer=True
+        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period))
+        ramp = builder.AddNamedSystem("ramp", DesiredPoseRamp(period=period))
+        controller = builder.AddNamedSystem(
+            "controller",
+            CartesianImpedanceController(
+                known.plant,
+                known.arm.target,
+                known.arm.tool_centre,
+                impedance_gains(impedance, known.posture),
+                period=period,
+                compensate_gravity=False,
             ),
         )
-        builder.Connect(subscriber.get_output_port(), status.get_input_port())
-        builder.Connect(status.get_position_measured_output_port(), state.get_input_port(0))
-        builder.Connect(status.get_velocity_estimated_output_port(), state.get_input_port(1))
-        builder.Connect(status.get_position_measured_output_port(), wrench.get_positions_input_port())
-        builder.Connect(status.get_torque_external_output_port(), wrench.get_external_torque_input_port())
-        builder.Connect(torque, sender.get_torque_input_port())
-        builder.Connect(sender.get_output_port(), publisher.get_input_port())
+        monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
+        self._guard = guard = builder.AddNamedSystem("guard", TorqueGuard(known.plant, limits, period=period))
+        publisher = builder.AddNamedSystem(
+            "command_publisher",
+            TorquePublisher(bus, driver.command_channel, driver.encode, num_joints, period=period),
+        )
+        state, external_torque = status.get_state_output_port(), status.get_external_torque_output_port()
+        pose = controller.get_pose_output_port()
+        for source, target in (
+            (subscriber.get_output_port(), status.get_status_input_port()),
+            (state, positions.get_input_port()),
+            (state, velocities.get_input_port()),
+            (state, controller.get_state_input_port()),
+            (positions.get_output_port(), wrench.get_positions_input_port()),
+            (external_torque, wrench.get_external_torque_input_port()),
+            (pose, watchdog.get_pose_input_port()),
+            (watchdog.get_safe_pose_output_port(), ramp.get_desired_pose_input_port()),
+            (pose, ramp.get_pose_input_port()),
+            (guard.get_authority_output_port(), ramp.get_authority_input_port()),
+            (ramp.get_limited_pose_output_port(), controller.get_desired_pose_input_port()),
+            (controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port()),
+            (controller.get_torque_output_port(), guard.get_torque_input_port()),
+            (state, guard.get_state_input_port()),
+            (external_torque, guard.get_external_torque_input_port()),
+            (wrench.get_wrench_output_port(), guard.get_wrench_input_port()),
+            (pose, guard.get_pose_input_port()),
+            (watchdog.get_safe_pose_output_port(), guard.get_desired_pose_input_port()),
+            (status.get_fault_output_port(), guard.get_status_fault_input_port()),
+            (status.get_age_output_port(), guard.get_status_age_input_port()),
+            (watchdog.get_holding_output_port(), guard.get_holding_input_port()),
+            (guard.get_safe_torque_output_port(), publisher.get_torque_input_port()),
+            (guard.get_sending_output_port(), publisher.get_sending_input_port()),
+        ):
+            builder.Connect(source, target)
+        export_station_ports(
+            builder,
+            watchdog.get_desired_pose_input_port(),
+            watchdog.get_command_time_input_port(),
+            pose=pose,
+            wrench=wrench.get_wrench_output_port(),
+            contact_force=monitor.get_contact_force_output_port(),
+            saturation=controller.get_saturation_output_port(),
+            holding=guard.get_not_following_output_port(),
+        )
+        builder.ExportOutput(guard.get_fault_output_port(), "fault")
+        builder.ExportOutput(guard.get_phase_output_port(), "phase")
+        for name, port in (
+            ("position_measured", positions.get_output_port()),
+            ("velocity_estimated", velocities.get_output_port()),
+            ("state_estimated", state),
+            ("torque_external", external_torque),
+            ("torque_commanded", guard.get_safe_torque_output_port()),
+        ):
+            builder.ExportOutput(port, f"{driver.name}.{name}")
         builder.BuildInto(self)
+
+    def get_fault_output_port(self):
+        """Why the arm is stopped, (1,): a code of `Fault`."""
+        return self.GetOutputPort("fault")
+
+    def get_phase_output_port(self):
+        """What the arm does, (1,): a number of `Phase`."""
+        return self.GetOutputPort("phase")
 
     def start(self, simulator: Simulator) -> None:
         """Initializes a simulator that runs this station: waits for the robot, and holds where it is.
@@ -123,8 +359,30 @@ class HardwareStation(Station):
             if "Timed out" not in str(error):
                 raise
             raise InputError(
-                f"no robot answers on LCM channel {STATUS_CHANNEL}: start its driver, and check the bus's URL"
+                f"no robot answers on LCM channel {self.driver.status_channel}: start its driver, and check the bus's "
+                "URL"
             ) from error
+
+    def stop(self, context: Context) -> None:
+        """Brings the arm to rest because somebody asks for it; `context` is the root context."""
+        self._guard.stop(self._guard.GetMyMutableContextFromRoot(context))
+
+    def resume(self, context: Context) -> None:
+        """Goes on after a stop, from where the arm is; `context` is the root context.
+
+        Raises:
+            InputError: if the arm is not stopped, not yet at rest, or something is wrong still.
+        """
+        self._guard.resume(self._guard.GetMyMutableContextFromRoot(context))
+
+    def take_over(self, context: Context, before: Context) -> None:
+        """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.
+
+        Args:
+            context: this station's own, initialized.
+            before: the other station's own, whose bus is the same.
+        """
+        context.SetStateAndParametersFrom(before)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """A real arm can't be put anywhere.
@@ -133,6 +391,44 @@ class HardwareStation(Station):
             InputError: always; move it there by desired poses.
         """
         raise InputError("a real arm can't be put to a pose by a reset: move it there by desired poses")
+
+    def alike(self, workcell: Workcell) -> HardwareStation:
+        """Another station of the same arm on the same bus, with the same limits."""
+        return HardwareStation(
+            workcell,
+            self.lcm,
+            self.impedance,
+            end_effector=self._end_effector,
+            robot=self._robot,
+            limits=self.limits,
+            robot_timeout=self._robot_timeout,
+        )
+
+    def force_of(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:
+        """The force on the tool that external torques (n,) [Nm] of a resting arm mean, (3,) [N]."""
+        J = self._jacobian(positions)
+        return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
+
+    def load_of_force(self, positions: np.ndarray) -> np.ndarray:
+        """The share of each joint's greatest torque that the impedance's greatest force and torque can take, (n,).
+
+        Above 1 the guard clips what the impedance wants; the driver would stop at more than 1 / `TORQUE_SHARE`.
+
+        Args:
+            positions: of the joints, (n,) [rad].
+        """
+        J, limits = self._jacobian(positions), force_first(self.impedance.limits)
+        force = np.linalg.norm(J[3:], axis=0) * limits[:3].max()
+        return (force + np.linalg.norm(J[:3], axis=0) * limits[3:].max()) / np.array(self.limits.torque)
+
+    def _jacobian(self, positions: np.ndarray) -> np.ndarray:
+        """Of the tool centre in the target's axes, (6, n), its rotation first."""
+        plant, arm = self.known.plant, self.known.arm
+        context = plant.CreateDefaultContext()
+        plant.SetPositions(context, positions)
+        return plant.CalcJacobianSpatialVelocity(
+            context, JacobianWrtVariable.kV, arm.tool_centre, np.zeros(3), arm.target, arm.target
+        )
 
 
 class SimulatedIiwa(Diagram):
@@ -158,69 +454,124 @@ class SimulatedIiwa(Diagram):
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
         )
-        self._known = KnownArm(workcell, IIWA14, end_effector)
+        self.known = KnownArm(workcell, IIWA14, end_effector)
         BuildIiwaControl(
-            builder, lcm, self.plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self._known.plant
+            builder, lcm, self.plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self.known.plant
         )
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
-        self._known.place(self.plant, self.arm.model, context, pose)
+        self.known.place(self.plant, self.arm.model, context, pose)
+
+
+class NewMessages:
+    """Counts the messages of a channel; one that is sent again counts once."""
+
+    def __init__(self, lcm: DrakeLcmInterface, channel: str):
+        """
+        Args:
+            lcm: the bus.
+            channel: its channel.
+        """
+        self.count = 0
+        self._last = b""
+        lcm.Subscribe(channel, self._hear)
+
+    def _hear(self, message: bytes) -> None:
+        if message != self._last:
+            self._last, self.count = message, self.count + 1
 
 
 def serve(robot: SimulatedIiwa, lcm: DrakeLcm, start: np.ndarray, seconds: float, patience: float) -> float:
-    """Runs a simulated arm for another process: one step, then it waits for the torque that answers its status.
+    """Runs a simulated arm for another process: one step, then it waits until its status was answered.
 
-    So neither side ever outruns the other, however slow a machine is.
+    So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
+    has taken the status in; where that never came, it is a command.
 
     Args:
         robot: the arm.
         lcm: its bus.
         start: pose at which the tool starts, (6,).
         seconds: of simulated time to run.
-        patience: how long to wait for each command, and ten times as long for the first [s of wall clock].
+        patience: how long to wait for each answer, and ten times as long for the first [s of wall clock].
 
     Returns:
-        The simulated time at which it ended: less than `seconds` if commands stopped.
+        The simulated time at which it ended: less than `seconds` if answers stopped.
     """
     commands = Subscriber(lcm, COMMAND_CHANNEL, lcmt_iiwa_command)
+    words = NewMessages(lcm, STATUS_CHANNEL + TAKEN)
     simulator = Simulator(robot)
     robot.set_pose(simulator.get_mutable_context(), start)
     simulator.Initialize()
-    steps, missed = 0, 0
+
+    def answers() -> int:
+        return words.count or commands.count
+
+    steps, repeats = 0, max(1, round(patience / REPEAT))
     while steps * kIiwaLcmStatusPeriod < seconds:
-        answered = commands.count
-        tries = 100 if answered == 0 else 10
-        for _ in range(tries):
-            lcm.HandleSubscriptions(int(1000 * patience / 10))
-            if commands.count > answered:
+        answered = answers()
+        for _ in range(repeats if steps else 10 * repeats):
+            # A command comes before the word that belongs to it.
+            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and answers() == answered:
+                pass
+            if answers() > answered:
                 break
-            # A datagram may be lost, and before its first command the other side may not have been listening.
+            # A datagram may be lost, and before its first answer the other side may not have been listening.
             simulator.get_system().ForcedPublish(simulator.get_context())
         else:
-            missed += 1
             break
         steps += 1
         simulator.AdvanceTo(steps * kIiwaLcmStatusPeriod)
     return steps * kIiwaLcmStatusPeriod
 
 
-def drive_in_step(simulator: Simulator, lcm: DrakeLcm, seconds: float, patience: float) -> None:
-    """Advances a hardware station at the pace of the robot's own clock: a step for each status that arrives.
+class StepByStep:
+    """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
 
-    Raises:
-        InputError: if the robot falls silent.
+    After each it says so, for `serve`, which waits for it.
     """
-    statuses = Subscriber(lcm, STATUS_CHANNEL, lcmt_iiwa_status)
-    start = simulator.get_context().get_time()
-    steps = round(seconds / PLANT_PERIOD)
-    for step in range(steps):
-        seen = statuses.count
-        for _ in range(10):
-            lcm.HandleSubscriptions(int(1000 * patience / 10))
-            if statuses.count > seen:
-                break
-        else:
-            raise InputError("the robot fell silent: look at its driver and start again")
-        simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
+
+    def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str = STATUS_CHANNEL):
+        """
+        Args:
+            lcm: the bus.
+            patience: how long to wait for a status [s]; then steps go without, and the station's watchdog notices.
+            channel: of the statuses.
+        """
+        self._lcm, self._patience, self._answers = lcm, patience, channel + TAKEN
+        self._statuses = NewMessages(lcm, channel)
+        self._taken = self._said = 0
+        self._is_silent = False
+
+    def begin(self) -> None:
+        """Called when a simulator was initialized, with the newest status: asks for the next."""
+        self._lcm.HandleSubscriptions(0)
+        self._taken = self._statuses.count
+        self._say()
+
+    def advance(self, simulator: Simulator, steps: int) -> None:
+        """Advances by so many periods of `PLANT_PERIOD`."""
+        start = simulator.get_context().get_time()
+        for step in range(steps):
+            # A robot that has fallen silent is not waited for again and again.
+            patience = PLANT_PERIOD if self._is_silent else self._patience
+            for _ in range(10):
+                if self._statuses.count > self._taken:
+                    break
+                self._lcm.HandleSubscriptions(max(1, int(1000 * patience / 10)))
+            self._is_silent = self._statuses.count == self._taken
+            self._taken = self._statuses.count
+            simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
+            self._say()
+
+    def _say(self) -> None:
+        self._said += 1
+        self._lcm.Publish(self._answers, struct.pack(">q", self._said))
+
+
+def drive_in_step(simulator: Simulator, lcm: DrakeLcm, seconds: float, patience: float) -> None:
+    """Advances a hardware station step by step: see `StepByStep`."""
+    pace = StepByStep(lcm, patience)
+    pace.begin()
+    pace.advance(simulator, round(seconds / PLANT_PERIOD))

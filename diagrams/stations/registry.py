@@ -23,6 +23,7 @@ class StationKind:
         world: the kind of world that it works on: "workcell" for whoever puts a workpiece into a fixture.
         options: a model of further options of the environment; none unless given.
         words: what it is, in a line.
+        simulated: whether it is a simulation, which a reset can put to any state.
     """
 
     name: str
@@ -30,6 +31,7 @@ class StationKind:
     world: str
     options: type[Options] | None
     words: str
+    simulated: bool = True
 
 
 STATIONS: Registry[StationKind] = Registry(
@@ -41,18 +43,18 @@ STATIONS: Registry[StationKind] = Registry(
 
 
 def register_station(
-    name: str, *, world: str, options: type[Options] | None = None
+    name: str, *, world: str, options: type[Options] | None = None, simulated: bool = True
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
     """A decorator that adds a station; it decorates a class or a function that takes a world and its options.
 
     Args:
         name: what `station=` calls it.
-        world, options: see `StationKind`.
+        world, options, simulated: see `StationKind`.
     """
 
     def add(build: Any) -> Any:
         words = str(build.__doc__ or "").strip().splitlines()
-        STATIONS.register(name, StationKind(name, build, world, options, words[0] if words else ""))
+        STATIONS.register(name, StationKind(name, build, world, options, words[0] if words else "", simulated))
         return build
 
     return add

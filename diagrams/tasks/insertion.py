@@ -44,7 +44,12 @@ class InsertionTask(Task):
     """What a reset draws; made once, as it remembers what is hidden in a run."""
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Where the workpiece really is in the fixture, (6,): position and rotation vector, offsets included."""
+        """Where the workpiece really is in the fixture, (6,): position and rotation vector, offsets included.
+
+        Only a simulation knows that.
+        """
+        if not station.HasOutputPort("body_poses"):
+            return {}
         plant = station.plant
         relative = RelativePoses(plant, [plant.GetBodyByName(self.workpiece)], plant.GetBodyByName(self.fixture))
         builder.AddNamedSystem(f"{self.workpiece}_in_{self.fixture}", relative)

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pydrake.common.value import Value
+from pydrake.lcm import DrakeLcm
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, LeafSystem, OutputPort, ValueProducer
 
@@ -18,6 +19,7 @@ import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.models.joint_status import StatusLimits
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.skills import load_skill
@@ -53,6 +55,7 @@ def built():
     skill, frames = load_skill("pouring"), {"mug_tip": RigidTransform()}
     body, other = arm.tool[0], plant.world_body()
     gains = systems.ImpedanceGains(np.eye(6), np.ones(6), np.zeros(7))
+    safety = systems.SafetyLimits((1.0,) * 7, (1.0,) * 7, (1.0,) * 7, decay_time=1.0)
     condition = systems.Condition("success", {"u": 2}, lambda u: False)
     term = systems.RewardTerm("cost", {"u": 2}, lambda u: 0.0)
     browser = SimpleNamespace(AddSlider=lambda *arguments: None)
@@ -64,6 +67,7 @@ def built():
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.ContactLever(0.5),
         systems.ContactWatch(plant, [body], [other], PERIOD),
+        systems.DesiredPoseRamp(period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
         systems.GuidanceLaw(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
@@ -84,6 +88,9 @@ def built():
         systems.SafetyLedger(PERIOD),
         systems.SctInputMapping(skill, frames, PERIOD),
         systems.SctStateMachine(skill, frames, PERIOD),
+        systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
+        systems.TorqueGuard(plant, safety, period=PERIOD),
+        systems.TorquePublisher(DrakeLcm("memq://"), "torques", lambda time, torque: b"", 7, period=PERIOD),
         systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_centre, RotationMatrix(), PERIOD, 0.0),
     ]
     return {type(instance).__name__: instance for instance in instances}

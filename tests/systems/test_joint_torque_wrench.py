@@ -53,3 +53,22 @@ def test_filter_is_a_first_order_low_pass(arm):
 def test_refuses_what_makes_no_sense(arm, wrong):
     with pytest.raises(InputError):
         estimate(arm, np.zeros(6), **wrong)
+
+
+@pytest.mark.parametrize("port", ["positions", "external_torque"])
+def test_a_sample_that_is_no_number_is_left_out(arm, port):
+    plant, model = arm
+    system = JointTorqueWrench(plant, model.target, model.tool_centre, period=0.01, time_constant=0.1)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    sound = {"positions": READY_POSTURE, "external_torque": np.linspace(-1.0, 1.0, 7)}
+    values = {name: system.GetInputPort(name).FixValue(context, value) for name, value in sound.items()}
+    simulator.AdvanceTo(0.025)
+    before = system.get_wrench_output_port().Eval(context).copy()
+    values[port].GetMutableData().set_value(np.full(7, np.nan))
+    simulator.AdvanceTo(0.035)
+    np.testing.assert_array_equal(system.get_wrench_output_port().Eval(context), before)
+    values[port].GetMutableData().set_value(sound[port])
+    simulator.AdvanceTo(1.0)
+    assert np.isfinite(system.get_wrench_output_port().Eval(context)).all()
+    assert np.linalg.norm(system.get_wrench_output_port().Eval(context) - before) > 0.1

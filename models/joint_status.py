@@ -1,0 +1,168 @@
+"""What a robot's driver says of its joints, whether it may be believed, and what may stop an arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+
+
+class Fault(IntEnum):
+    """Why an arm stops. The first that holds counts."""
+
+    NONE = 0
+    NO_STATUS = 1
+    STALE = 2
+    OUT_OF_ORDER = 3
+    FUTURE = 4
+    MALFORMED = 5
+    WRONG_SIZE = 6
+    NOT_FINITE = 7
+    POSITION_JUMP = 8
+    VELOCITY_JUMP = 9
+    VELOCITY = 10
+    WORKSPACE = 11
+    FORCE = 12
+    EXTERNAL_TORQUE = 13
+    TORQUE = 14
+    ASKED = 15
+
+
+FAULTS = {
+    Fault.NONE: "none",
+    Fault.NO_STATUS: "no status has come, or not for long enough",
+    Fault.STALE: "the status is old: it stopped, or comes late",
+    Fault.OUT_OF_ORDER: "a status is older than the one before it",
+    Fault.FUTURE: "a status is from the future: the robot's clock has jumped",
+    Fault.MALFORMED: "a status can't be read",
+    Fault.WRONG_SIZE: "a status is of another number of joints",
+    Fault.NOT_FINITE: "a status holds numbers that are none",
+    Fault.POSITION_JUMP: "a joint's position has jumped",
+    Fault.VELOCITY_JUMP: "a joint's velocity has jumped",
+    Fault.VELOCITY: "a joint is too fast",
+    Fault.WORKSPACE: "the tool, or where it is told to go, is outside of the workspace",
+    Fault.FORCE: "the force on the tool is too great",
+    Fault.EXTERNAL_TORQUE: "the surroundings load a joint too much",
+    Fault.TORQUE: "the wanted torques are no numbers",
+    Fault.ASKED: "somebody asked for it",
+}
+"""Each fault in words."""
+
+
+@dataclass(frozen=True)
+class JointStatus:
+    """A status as it came.
+
+    Attributes:
+        time: of the robot's clock [s]; NaN where the message could not be read.
+        positions, velocities, external_torque: (n,) [rad, rad/s, Nm], of whatever size and values came.
+    """
+
+    time: float
+    positions: np.ndarray
+    velocities: np.ndarray
+    external_torque: np.ndarray
+
+    def __deepcopy__(self, memo: object) -> JointStatus:
+        """Itself: Drake copies values all the time, and nobody writes into this one."""
+        return self
+
+    @property
+    def is_readable(self) -> bool:
+        """Whether the message could be read."""
+        return bool(np.isfinite(self.time))
+
+    def values(self) -> np.ndarray:
+        """Positions, velocities and external torques in one vector."""
+        return np.concatenate([self.positions, self.velocities, self.external_torque])
+
+
+UNREADABLE = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
+"""What stands for a message that could not be read."""
+
+
+@dataclass(frozen=True)
+class StatusLimits:
+    """What a status must keep to.
+
+    Args:
+        velocity: of each joint, beyond which nothing moves (n,) [rad/s], positive: what positions may change by.
+        max_age: beyond which a status is stale [s], positive. Some of them may be lost on the way.
+        max_lead: by which a status may be ahead of this clock [s], positive.
+        position_jump: beyond what the velocity explains [rad], positive.
+        velocity_jump: from one status to the next [rad/s], positive; a collision is not slower than 1.
+        settling: for how long statuses must have been sound before they are believed [s], not negative: the time for
+            which a driver that has just been started wants no commands.
+        clock_drift: of the two clocks against each other [s/s], not negative: slower changes are no fault.
+    """
+
+    velocity: tuple[float, ...]
+    max_age: float = 0.03
+    max_lead: float = 0.03
+    position_jump: float = 0.02
+    velocity_jump: float = 1.5
+    settling: float = 0.25
+    clock_drift: float = 1e-3
+
+    def __post_init__(self) -> None:
+        positive = (*self.velocity, self.max_age, self.max_lead, self.position_jump, self.velocity_jump)
+        if not self.velocity or not all(0.0 < value < np.inf for value in positive):
+            raise InputError("the limits of a robot's status must be positive")
+        if not min(self.settling, self.clock_drift) >= 0.0:
+            raise InputError("a robot's settling time and its clock's drift must not be negative")
+
+
+@dataclass(frozen=True)
+class Heard:
+    """What is remembered of the last readable status.
+
+    Attributes:
+        time: of the robot's clock [s]; NaN where there was none yet.
+        offset: from the robot's clock to this one [s].
+        values: as `JointStatus.values`, (3n,).
+    """
+
+    time: float
+    offset: float
+    values: np.ndarray
+
+
+def judge_status(status: JointStatus | None, last: Heard, now: float, limits: StatusLimits) -> Fault:
+    """What is wrong with a status that comes after another.
+
+    Args:
+        status: the newest; None where none has come.
+        last: what is remembered.
+        now: of this clock [s].
+        limits: what it must keep to.
+    """
+    if status is None:
+        return Fault.NO_STATUS
+    if not status.is_readable:
+        return Fault.MALFORMED
+    num_joints = len(limits.velocity)
+    if {len(part) for part in (status.positions, status.velocities, status.external_torque)} != {num_joints}:
+        return Fault.WRONG_SIZE
+    values = status.values()
+    if not np.isfinite(values).all():
+        return Fault.NOT_FINITE
+    if not np.isfinite(last.time):
+        return Fault.NONE
+    is_repeated = status.time == last.time and np.array_equal(values, last.values)
+    if status.time <= last.time and not is_repeated:
+        return Fault.OUT_OF_ORDER
+    age = now - (status.time + last.offset)
+    if age < -limits.max_lead:
+        return Fault.FUTURE
+    if age > limits.max_age:
+        return Fault.STALE
+    change = np.abs(values - last.values)
+    reachable = limits.position_jump + np.array(limits.velocity) * (status.time - last.time)
+    if (change[:num_joints] > reachable).any():
+        return Fault.POSITION_JUMP
+    if (change[num_joints : 2 * num_joints] > limits.velocity_jump).any():
+        return Fault.VELOCITY_JUMP
+    return Fault.NONE

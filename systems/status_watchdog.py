@@ -1,0 +1,175 @@
+"""Watches what a robot's driver says, and passes on only what can be believed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
+
+from guiderail.models.joint_status import Fault, Heard, JointStatus, StatusLimits, judge_status
+from guiderail.systems.support.caching import declare_cache
+from guiderail.systems.support.sampling import check_period
+
+# Entries of the state besides the last readable status itself.
+_CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT = range(7)
+_FORGOTTEN = (0.0, np.nan, 0.0, 0.0, 0.0, float(Fault.NO_STATUS), 0.0)
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    """Of the newest status: what is wrong with it, whether it was seen before, and what is believed, (3n,)."""
+
+    fault: Fault
+    is_new: bool
+    believed: np.ndarray
+
+
+class StatusWatchdog(LeafSystem):
+    """Judges every status of a robot, passes the last sound one on, and says what is wrong.
+
+    `judge_status` names the fault. A fault is reported until statuses have been sound for the settling time, so that
+    after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
+    when the first status comes, slowly after that, and anew after a fault or a silence: then the next status is judged
+    by the one that was at fault, if its numbers were sound.
+
+    .. pydrake_system::
+
+        name: StatusWatchdog
+        input_ports:
+        - status
+        output_ports:
+        - state
+        - external_torque
+        - fault
+        - age
+
+    ``status`` is an abstract value: the newest `JointStatus`, or None. ``state`` is (2n,), positions and velocities
+    [rad, rad/s], and ``external_torque`` (n,) [Nm], both of the last sound status and zero before it. ``fault`` is
+    (1,), a code of `Fault`. ``age`` is (1,), for how long no new sound status has come [s].
+    """
+
+    def __init__(self, limits: StatusLimits, *, period: float):
+        """
+        Args:
+            limits: what a status must keep to.
+            period: at which statuses are checked [s], positive: how often they come.
+
+        Raises:
+            InputError: if an argument is out of range.
+        """
+        super().__init__()
+        check_period(period)
+        self._limits, self._period = limits, period
+        self._num_joints = num_joints = len(limits.velocity)
+        self._status_port = self.DeclareAbstractInputPort("status", Value[object]())
+        self._memory = self.DeclareDiscreteState(_FORGOTTEN)
+        self._last = self.DeclareDiscreteState(3 * num_joints)  # readable, whether sound or not
+        self._believed = self.DeclareDiscreteState(3 * num_joints)
+        tickets = {
+            self._status_port.ticket(),
+            self.discrete_state_ticket(self._memory),
+            self.discrete_state_ticket(self._last),
+            self.discrete_state_ticket(self._believed),
+        }
+        self._verdict = declare_cache(self, "verdict", self._judge, prerequisites_of_calc=tickets)
+        verdict = {self._verdict.ticket()}
+        self._state_port = self.DeclareVectorOutputPort(
+            "state", 2 * num_joints, self._calc_state, prerequisites_of_calc=verdict
+        )
+        self._external_torque_port = self.DeclareVectorOutputPort(
+            "external_torque", num_joints, self._calc_external_torque, prerequisites_of_calc=verdict
+        )
+        self._fault_port = self.DeclareVectorOutputPort(
+            "fault", 1, self._calc_fault, prerequisites_of_calc=verdict | tickets
+        )
+        self._age_port = self.DeclareVectorOutputPort("age", 1, self._calc_age, prerequisites_of_calc=verdict | tickets)
+        self.DeclareInitializationDiscreteUpdateEvent(self._forget)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
+
+    def get_status_input_port(self) -> InputPort:
+        """The newest status, an abstract `JointStatus` or None."""
+        return self._status_port
+
+    def get_state_output_port(self) -> OutputPort:
+        """Positions and velocities of the last sound status, (2n,) [rad, rad/s]."""
+        return self._state_port
+
+    def get_external_torque_output_port(self) -> OutputPort:
+        """External torques of the last sound status, (n,) [Nm]."""
+        return self._external_torque_port
+
+    def get_fault_output_port(self) -> OutputPort:
+        """What is, or shortly was, wrong with the status, (1,): a code of `Fault`."""
+        return self._fault_port
+
+    def get_age_output_port(self) -> OutputPort:
+        """For how long no new sound status has come, (1,) [s]."""
+        return self._age_port
+
+    def _memory_of(self, context: Context) -> np.ndarray:
+        return context.get_discrete_state(self._memory).value()
+
+    def _judge(self, context: Context) -> _Verdict:
+        status: JointStatus | None = self._status_port.Eval(context)
+        memory, values = self._memory_of(context), context.get_discrete_state(self._last).value()
+        last = Heard(float(memory[_TIME]), float(memory[_OFFSET]), values)
+        believed = context.get_discrete_state(self._believed).value().copy()
+        fault = judge_status(status, last, float(memory[_CLOCK]), self._limits)
+        if status is None or fault in (Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE):
+            return _Verdict(fault, False, believed)
+        newest = status.values()
+        is_new = status.time != last.time or not np.array_equal(newest, values)
+        return _Verdict(fault, is_new, newest if is_new and not fault else believed)
+
+    def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._memory, _FORGOTTEN)
+        for group in (self._last, self._believed):
+            discrete_state.set_value(group, np.zeros(3 * self._num_joints))
+        return EventStatus.Succeeded()
+
+    def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        verdict, memory = self._verdict.Eval(context), self._memory_of(context).copy()
+        now = memory[_CLOCK]
+        if verdict.is_new:
+            status: JointStatus = self._status_port.Eval(context)
+            wanted = now - status.time
+            is_in_step = verdict.fault == Fault.NONE and np.isfinite(memory[_TIME])
+            is_late = verdict.fault == Fault.STALE and now - memory[_HEARD_AT] <= self._limits.max_age
+            if is_in_step or is_late:
+                drift = self._limits.clock_drift * self._period
+                wanted = memory[_OFFSET] + np.clip(wanted - memory[_OFFSET], -drift, drift)
+            memory[_TIME], memory[_OFFSET], memory[_HEARD_AT] = status.time, wanted, now
+            discrete_state.set_value(self._last, status.values())
+            if not verdict.fault:
+                memory[_BELIEVED_AT] = now
+                discrete_state.set_value(self._believed, verdict.believed)
+        # Added up instead of read, so that what is remembered can be carried over to a diagram with another clock.
+        memory[_CLOCK] = now + self._period
+        if verdict.fault:
+            memory[_FAULT], memory[_FAULT_AT] = verdict.fault, now
+        elif memory[_CLOCK] - memory[_FAULT_AT] > self._limits.settling:
+            memory[_FAULT] = Fault.NONE
+        discrete_state.set_value(self._memory, memory)
+        return EventStatus.Succeeded()
+
+    def _calc_state(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._verdict.Eval(context).believed[: 2 * self._num_joints])
+
+    def _calc_external_torque(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._verdict.Eval(context).believed[2 * self._num_joints :])
+
+    def _calc_fault(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(self._verdict.Eval(context).fault or self._memory_of(context)[_FAULT]))
+
+    def _calc_age(self, context: Context, output: BasicVector) -> None:
+        verdict, memory = self._verdict.Eval(context), self._memory_of(context)
+        is_fresh = verdict.is_new and not verdict.fault
+        output.SetAtIndex(0, 0.0 if is_fresh else float(memory[_CLOCK] - memory[_BELIEVED_AT]))

@@ -1,0 +1,66 @@
+"""Sends torques over a bus, or nothing."""
+
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.lcm import DrakeLcmInterface
+from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem
+
+from guiderail.models.errors import InputError
+from guiderail.systems.support.sampling import check_period
+
+
+class TorquePublisher(LeafSystem):
+    """Sends the torques once a period while it may, and nothing at all otherwise: not even zeros.
+
+    .. pydrake_system::
+
+        name: TorquePublisher
+        input_ports:
+        - torque
+        - sending
+
+    ``torque`` is (n,) [Nm]. ``sending`` is (1,): nothing goes out while it is 0.
+    """
+
+    def __init__(
+        self,
+        lcm: DrakeLcmInterface,
+        channel: str,
+        encode: Callable[[float, np.ndarray], bytes],
+        num_joints: int,
+        *,
+        period: float,
+    ):
+        """
+        Args:
+            lcm: the bus.
+            channel: its channel.
+            encode: from the time [s] and the torques (n,) to a message.
+            num_joints: n, at least 1.
+            period: [s], positive.
+
+        Raises:
+            InputError: if an argument is out of range.
+        """
+        super().__init__()
+        check_period(period)
+        if num_joints < 1:
+            raise InputError(f"torques are sent to at least one joint, not {num_joints}")
+        self._lcm, self._channel, self._encode = lcm, channel, encode
+        self._torque_port = self.DeclareVectorInputPort("torque", num_joints)
+        self._sending_port = self.DeclareVectorInputPort("sending", 1)
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+
+    def get_torque_input_port(self) -> InputPort:
+        """What is sent, (n,) [Nm]."""
+        return self._torque_port
+
+    def get_sending_input_port(self) -> InputPort:
+        """0 while nothing is sent, (1,)."""
+        return self._sending_port
+
+    def _publish(self, context: Context) -> EventStatus:
+        if self._sending_port.Eval(context)[0] > 0.0:
+            self._lcm.Publish(self._channel, self._encode(context.get_time(), self._torque_port.Eval(context)))
+        return EventStatus.Succeeded()

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.errors import InputError
+from guiderail.systems.desired_pose_ramp import DesiredPoseRamp
+
+PERIOD, SPEED, ANGULAR_SPEED = 0.125, 0.2, 0.4
+MEASURED = np.array([0.1, -0.2, 0.3, 1.0, 0.0, 0.0])
+
+
+class Ramped:
+    def __init__(self, desired):
+        self.system = DesiredPoseRamp(period=PERIOD, speed=SPEED, angular_speed=ANGULAR_SPEED)
+        self.simulator = Simulator(self.system)
+        context = self.simulator.get_mutable_context()
+        self.desired = self.system.get_desired_pose_input_port().FixValue(context, desired)
+        self.pose = self.system.get_pose_input_port().FixValue(context, MEASURED)
+        self.authority = self.system.get_authority_input_port().FixValue(context, [0.0])
+        self.simulator.Initialize()
+
+    def go(self, steps=1):
+        """The poses just before each of the next instants."""
+        poses = []
+        for _ in range(steps):
+            self.simulator.AdvanceTo(self.simulator.get_context().get_time() + PERIOD)
+            poses.append(self.system.get_limited_pose_output_port().Eval(self.simulator.get_context()).copy())
+        return np.array(poses)
+
+    def take_over(self):
+        self.go()
+        self.authority.GetMutableData().set_value([0.1])
+        return self
+
+
+def test_stays_where_the_robot_is_while_it_stands_by():
+    ramped = Ramped(np.zeros(6))
+    np.testing.assert_array_equal(ramped.go(3), np.tile(MEASURED, (3, 1)))
+    pushed = MEASURED + 0.05
+    ramped.pose.GetMutableData().set_value(pushed)
+    np.testing.assert_array_equal(ramped.go()[0], pushed)
+
+
+def test_goes_from_there_along_a_straight_line_never_faster_than_it_may():
+    goal = np.array([0.4, 0.2, 0.3, 0.5, 0.3, 0.0])
+    ramped = Ramped(goal).take_over()
+    first = ramped.system.get_limited_pose_output_port().Eval(ramped.simulator.get_context())
+    assert np.linalg.norm((first - MEASURED)[:3]) <= SPEED * PERIOD + 1e-12
+    assert np.abs((first - MEASURED)[3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
+    poses = ramped.go(30)
+    steps = np.diff(poses, axis=0)
+    assert np.linalg.norm(steps[:, :3], axis=1).max() <= SPEED * PERIOD + 1e-12
+    assert np.abs(steps[:, 3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
+    np.testing.assert_array_equal(poses[-1], goal)
+    across = np.cross(poses[:, :3] - MEASURED[:3], (goal - MEASURED)[:3])
+    np.testing.assert_allclose(across, 0.0, atol=1e-12)
+
+
+def test_turns_the_shorter_way():
+    ramped = Ramped(np.array([*MEASURED[:3], -3.1, 0.0, 0.0]))
+    ramped.pose.GetMutableData().set_value([*MEASURED[:3], 3.1, 0.0, 0.0])
+    poses = ramped.take_over().go(4)
+    np.testing.assert_array_equal(poses[-1][3:], [-3.1, 0.0, 0.0])
+
+
+def test_what_keeps_to_the_speed_is_passed_on_as_it_is():
+    ramped = Ramped(MEASURED).take_over()
+    ramped.go()
+    for step in range(5):
+        desired = MEASURED + [0.9 * SPEED * PERIOD * step, 0.0, 0.0, 0.9 * ANGULAR_SPEED * PERIOD * step, 0.0, 0.0]
+        ramped.desired.GetMutableData().set_value(desired)
+        now = ramped.system.get_limited_pose_output_port().Eval(ramped.simulator.get_context())
+        np.testing.assert_array_equal(now, desired)
+        ramped.go()
+
+
+@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"speed": 0.0}, {"angular_speed": np.inf}])
+def test_refuses_what_makes_no_sense(wrong):
+    with pytest.raises(InputError):
+        DesiredPoseRamp(**({"period": PERIOD} | wrong))

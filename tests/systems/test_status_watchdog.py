@@ -1,0 +1,172 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.errors import InputError
+from guiderail.models.joint_status import FAULTS, UNREADABLE, Fault, JointStatus, StatusLimits
+from guiderail.systems.status_watchdog import StatusWatchdog
+
+PERIOD = 1.0 / 256.0
+LIMITS = StatusLimits(velocity=(1.0, 1.0))
+CLOCK = 1000.0  # of the robot, when this one starts
+
+
+class Watched:
+    """A watchdog whose robot's joints move at 0.1 rad/s; a status comes just before each check."""
+
+    def __init__(self, limits=LIMITS):
+        self.system = StatusWatchdog(limits, period=PERIOD)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.port = self.system.get_status_input_port().FixValue(self.context, Value[object](None))
+        self.step = 0
+        self.simulator.Initialize()
+
+    def sound(self):
+        time = self.step * PERIOD
+        return JointStatus(CLOCK + time, np.array([0.1, 0.1]) * time, np.full(2, 0.1), np.array([3.0, 4.0]))
+
+    def check(self, status):
+        """What is found when this is the newest status, before the watchdog's own event and after it."""
+        self.port.GetMutableData().set_value(status)
+        found = self.fault
+        self.step += 1
+        self.simulator.AdvanceTo(self.step * PERIOD)
+        return found
+
+    def settle(self):
+        for _ in range(round(LIMITS.settling / PERIOD) + 3):
+            self.check(self.sound())
+        assert self.fault == Fault.NONE
+        return self
+
+    @property
+    def fault(self):
+        return Fault(int(self.system.get_fault_output_port().Eval(self.context)[0]))
+
+    @property
+    def state(self):
+        return self.system.get_state_output_port().Eval(self.context).copy()
+
+    @property
+    def age(self):
+        return self.system.get_age_output_port().Eval(self.context)[0]
+
+
+def test_passes_on_what_is_sound_at_once():
+    watched = Watched().settle()
+    status = watched.sound()
+    watched.check(status)
+    np.testing.assert_array_equal(watched.state, status.values()[:4])
+    np.testing.assert_array_equal(watched.system.get_external_torque_output_port().Eval(watched.context), [3.0, 4.0])
+    assert watched.age <= PERIOD
+
+
+def test_believes_nobody_before_the_settling_time():
+    watched = Watched()
+    assert watched.check(None) == Fault.NO_STATUS
+    faults = [watched.check(watched.sound()) for _ in range(round(LIMITS.settling / PERIOD))]
+    assert set(faults) == {Fault.NO_STATUS}
+    watched.settle()
+
+
+WRONG = {
+    Fault.OUT_OF_ORDER: lambda sound: replace(sound, time=sound.time - 3 * PERIOD),
+    Fault.FUTURE: lambda sound: replace(sound, time=sound.time + 1.0),
+    Fault.MALFORMED: lambda sound: UNREADABLE,
+    Fault.WRONG_SIZE: lambda sound: replace(sound, velocities=np.zeros(3)),
+    Fault.NOT_FINITE: lambda sound: replace(sound, external_torque=np.array([np.nan, 0.0])),
+    Fault.POSITION_JUMP: lambda sound: replace(sound, positions=sound.positions + [0.0, 0.05]),
+    Fault.VELOCITY_JUMP: lambda sound: replace(sound, velocities=sound.velocities + [2.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("fault", WRONG, ids=lambda fault: fault.name)
+def test_names_the_fault_believes_nothing_of_it_and_recovers(fault):
+    watched = Watched().settle()
+    before = watched.state
+    wrong = WRONG[fault](watched.sound())
+    assert watched.check(wrong) == fault
+    np.testing.assert_array_equal(watched.state, before)
+    assert watched.age > 0.0
+    # A glitch: what comes after it is judged by it at first, and nothing of it is ever believed.
+    steps = 0
+    while watched.fault:
+        steps += 1
+        watched.check(watched.sound())
+        assert np.abs(watched.state).max() < 0.2
+    assert LIMITS.settling <= steps * PERIOD <= LIMITS.settling + 4 * PERIOD
+    np.testing.assert_array_equal(watched.state, replace_time(watched).values()[:4])
+
+
+def replace_time(watched):
+    watched.step -= 1
+    status = watched.sound()
+    watched.step += 1
+    return status
+
+
+def test_silence_is_stale_and_a_repeated_status_is_silence():
+    watched = Watched().settle()
+    last = watched.sound()
+    found = [watched.check(last) for _ in range(20)]
+    first = found.index(Fault.STALE)
+    assert LIMITS.max_age < first * PERIOD < LIMITS.max_age + 3 * PERIOD
+    assert set(found[first:]) == {Fault.STALE}
+    assert watched.age == pytest.approx(20 * PERIOD, abs=1.5 * PERIOD)
+    # Time went on for both: the next status is a new one, and nothing is believed until it has settled.
+    assert watched.check(watched.sound()) == Fault.STALE
+    watched.settle()
+
+
+def test_statuses_that_come_late_are_stale():
+    watched = Watched().settle()
+    queue = []
+    found = []
+    for step in range(40):
+        queue.append(watched.sound())
+        found.append(watched.check(queue[step // 2]))  # a queue that grows
+    assert Fault.STALE in found
+
+
+def test_two_clocks_may_drift_apart():
+    watched = Watched().settle()
+    for _ in range(3000):
+        status = watched.sound()
+        assert watched.check(replace(status, time=CLOCK + 1.0003 * (status.time - CLOCK))) == Fault.NONE
+
+
+def test_the_robots_clock_may_start_anew():
+    """Its driver was started again: it is a fault once, and then another clock."""
+    watched = Watched().settle()
+    assert watched.check(replace(watched.sound(), time=1.0)) == Fault.OUT_OF_ORDER
+    start = watched.step
+    for _ in range(round(LIMITS.settling / PERIOD) + 3):
+        watched.check(replace(watched.sound(), time=1.0 + (watched.step - start + 1) * PERIOD))
+    assert watched.fault == Fault.NONE
+
+
+def test_an_initialization_forgets():
+    watched = Watched().settle()
+    watched.simulator.Initialize()
+    assert watched.fault == Fault.NO_STATUS
+
+
+def test_every_fault_is_in_words():
+    assert set(FAULTS) == set(Fault)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"velocity": ()}, {"max_age": 0.0}, {"position_jump": np.nan}, {"settling": -1.0}, {"clock_drift": -1.0}]
+)
+def test_refuses_limits_that_make_no_sense(wrong):
+    with pytest.raises(InputError):
+        StatusLimits(**({"velocity": (1.0,)} | wrong))
+
+
+def test_refuses_a_period_that_is_none():
+    with pytest.raises(InputError):
+        StatusWatchdog(LIMITS, period=0.0)

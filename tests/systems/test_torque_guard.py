@@ -1,0 +1,226 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.stations.arm import controller_model
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.models.errors import InputError
+from guiderail.models.joint_status import Fault
+from guiderail.models.robots.robot import DEFAULT_ROBOT, find_robot
+from guiderail.systems.torque_guard import Phase, SafetyLimits, TorqueGuard
+
+PERIOD = 1.0 / 256.0
+n = 7
+LIMITS = SafetyLimits(
+    velocity=(1.0,) * n, torque=(20.0,) * n, external_torque=(10.0,) * n, damping_time=0.25, ramp_time=0.125
+)
+POSTURE = np.array(find_robot(DEFAULT_ROBOT).home)
+WANTED = np.linspace(-6.0, 6.0, n)
+SPEED = np.linspace(0.1, 0.2, n)
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return controller_model(BncWorkcell())[0]
+
+
+class Guarded:
+    """A guard whose arm moves, with all well; it has taken over unless told otherwise."""
+
+    def __init__(self, plant, running=True):
+        self.plant = plant
+        self.system = TorqueGuard(plant, LIMITS, period=PERIOD)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        ok = {
+            "torque": WANTED,
+            "state": [*POSTURE, *SPEED],
+            "external_torque": np.zeros(n),
+            "wrench": np.zeros(6),
+            "pose": np.zeros(6),
+            "desired_pose": np.zeros(6),
+            "status_fault": [0.0],
+            "status_age": [0.0],
+            "holding": [0.0],
+        }
+        self.ports = {name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in ok.items()}
+        self.ok = ok
+        if running:
+            self.simulator.Initialize()
+            self.go(LIMITS.ramp_time + 4 * PERIOD)
+            assert self.phase == Phase.RUNNING
+
+    def set(self, **values):
+        for name, value in values.items():
+            self.ports[name].GetMutableData().set_value(value)
+
+    def go(self, seconds):
+        for _ in range(round(seconds / PERIOD)):
+            self.simulator.AdvanceTo(self.context.get_time() + PERIOD)
+
+    def __getitem__(self, port):
+        return self.system.GetOutputPort(port).Eval(self.context).copy()
+
+    @property
+    def phase(self):
+        return Phase(int(self["phase"][0]))
+
+    @property
+    def fault(self):
+        return Fault(int(self["fault"][0]))
+
+    def damping(self, age=0.0):
+        context = self.plant.CreateDefaultContext()
+        self.plant.SetPositionsAndVelocities(context, [*POSTURE, *SPEED])
+        momentum = self.plant.CalcMassMatrix(context) @ SPEED
+        return -momentum * np.exp(-age / LIMITS.decay_time) / LIMITS.decay_time
+
+
+def test_passes_on_what_is_wanted_while_all_is_well(plant):
+    guarded = Guarded(plant)
+    np.testing.assert_array_equal(guarded["safe_torque"], WANTED)
+    assert (guarded.fault, guarded["sending"][0], guarded["not_following"][0]) == (Fault.NONE, 1.0, 0.0)
+
+
+def test_sends_nothing_before_the_status_is_sound_and_then_takes_over_gradually(plant):
+    guarded = Guarded(plant, running=False)
+    guarded.set(status_fault=[Fault.NO_STATUS])
+    guarded.simulator.Initialize()
+    guarded.go(0.5)
+    assert guarded.phase == Phase.WAITING
+    assert guarded["sending"][0] == 0.0
+    np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
+    guarded.set(status_fault=[0.0])
+    shares = []
+    while guarded.phase != Phase.RUNNING:
+        guarded.go(PERIOD)
+        share = guarded["authority"][0]
+        if guarded.phase == Phase.RAMPING:
+            shares.append(share)
+            assert guarded["not_following"][0] == 1.0
+            expected = np.clip(share * WANTED + (1.0 - share) * guarded.damping(), -20.0, 20.0)
+            np.testing.assert_allclose(guarded["safe_torque"], expected, atol=1e-12)
+    assert len(shares) >= LIMITS.ramp_time / PERIOD - 1
+    np.testing.assert_allclose(np.diff(shares), PERIOD / LIMITS.ramp_time)
+
+
+WRONG = {
+    Fault.STALE: {"status_fault": [Fault.STALE]},
+    Fault.VELOCITY: {"state": [*POSTURE, *SPEED[:-1], -1.01]},
+    Fault.WORKSPACE: {"pose": [0.0, 0.0, 0.31, 0.0, 0.0, 0.0]},
+    Fault.FORCE: {"wrench": [40.0, 0.0, -50.0, 0.0, 0.0, 0.0]},
+    Fault.EXTERNAL_TORQUE: {"external_torque": [0.0] * 6 + [-10.1]},
+    Fault.TORQUE: {"torque": [*WANTED[:-1], np.nan]},
+}
+
+
+@pytest.mark.parametrize("fault", WRONG, ids=lambda fault: fault.name)
+def test_stops_at_once_says_why_and_goes_on_only_when_told(plant, fault):
+    guarded = Guarded(plant)
+    guarded.set(**WRONG[fault])
+    assert guarded.fault == fault
+    assert (guarded["safe_torque"] * guarded["safe_torque"] <= 400.0).all()
+    assert not np.isclose(guarded["safe_torque"], WANTED).any()
+    guarded.go(2 * PERIOD)
+    guarded.set(**{name: guarded.ok[name] for name in WRONG[fault]})
+    assert (guarded.phase, guarded.fault) == (Phase.DAMPING, fault)
+    np.testing.assert_allclose(guarded["safe_torque"], np.clip(guarded.damping(), -20.0, 20.0), atol=1e-12)
+    with pytest.raises(InputError, match="is damping"):
+        guarded.system.resume(guarded.context)
+    guarded.go(LIMITS.damping_time)
+    assert (guarded.phase, guarded.fault) == (Phase.OFF, fault)
+    np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
+    guarded.go(1.0)
+    assert guarded.phase == Phase.OFF
+    guarded.system.resume(guarded.context)
+    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (Phase.RAMPING, Fault.NONE, 0.0)
+    guarded.go(LIMITS.ramp_time + 2 * PERIOD)
+    assert guarded.phase == Phase.RUNNING
+
+
+def test_is_not_told_to_leave_the_workspace(plant):
+    guarded = Guarded(plant)
+    guarded.set(desired_pose=[0.21, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert guarded.fault == Fault.WORKSPACE
+
+
+@pytest.mark.parametrize("port", ["state", "external_torque", "wrench", "pose", "desired_pose"])
+def test_what_is_no_number_is_within_no_limit(plant, port):
+    guarded = Guarded(plant)
+    guarded.set(**{port: np.full(len(guarded.ok[port]), np.nan)})
+    assert guarded.fault != Fault.NONE
+
+
+def test_does_not_go_on_while_something_is_wrong(plant):
+    guarded = Guarded(plant)
+    guarded.set(status_fault=[Fault.NOT_FINITE])
+    guarded.go(1.0)
+    with pytest.raises(InputError, match="numbers that are none"):
+        guarded.system.resume(guarded.context)
+    assert guarded.phase == Phase.OFF
+
+
+def test_never_sends_more_than_the_limits(plant):
+    guarded = Guarded(plant)
+    guarded.set(torque=np.linspace(-200.0, 200.0, n))
+    np.testing.assert_array_equal(guarded["safe_torque"], np.clip(np.linspace(-200.0, 200.0, n), -20.0, 20.0))
+
+
+def test_damping_takes_away_no_more_than_the_arm_had(plant):
+    """Where no status comes, the speed is that of the last one for ever: what is taken away in all is its momentum."""
+    guarded = Guarded(plant)
+    guarded.set(state=[*POSTURE, *(0.1 * SPEED)], status_fault=[Fault.STALE])
+    taken = np.zeros(n)
+    for step in range(round(LIMITS.damping_time / PERIOD)):
+        guarded.set(status_age=[(step + 0.5) * PERIOD])
+        taken += PERIOD * guarded["safe_torque"]
+        guarded.go(PERIOD)
+    np.testing.assert_allclose(taken, 0.1 * LIMITS.decay_time * guarded.damping(), rtol=0.01)
+
+
+def test_a_silent_robot_is_sent_no_torque_and_then_nothing(plant):
+    guarded = Guarded(plant)
+    guarded.set(status_fault=[Fault.STALE])
+    sent = []
+    for _ in range(round(0.5 / PERIOD)):
+        guarded.go(PERIOD)
+        sent.append(guarded["safe_torque"] if guarded["sending"][0] else None)
+    last = [torque for torque in sent if torque is not None][-5:]
+    np.testing.assert_array_equal(last, 0.0)
+    assert sent[-1] is None
+    guarded.set(status_fault=[0.0])
+    np.testing.assert_array_equal(guarded["sending"], 1.0)
+    np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
+
+
+def test_stops_when_asked(plant):
+    guarded = Guarded(plant)
+    guarded.system.stop(guarded.context)
+    assert (guarded.phase, guarded.fault) == (Phase.DAMPING, Fault.ASKED)
+    with pytest.raises(InputError):
+        guarded.system.resume(guarded.context)
+    guarded.go(LIMITS.damping_time + 2 * PERIOD)
+    assert guarded.phase == Phase.OFF
+
+
+def test_only_a_stopped_arm_goes_on(plant):
+    guarded = Guarded(plant)
+    with pytest.raises(InputError, match="is running"):
+        guarded.system.resume(guarded.context)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"velocity": (1.0,)}, {"torque": (0.0,) * n}, {"force": np.nan}, {"lower": (1.0, 1.0, 1.0)}, {"ramp_time": 0.0}],
+)
+def test_refuses_limits_that_make_no_sense(wrong):
+    with pytest.raises(InputError):
+        SafetyLimits(**({"velocity": (1.0,) * n, "torque": (1.0,) * n, "external_torque": (1.0,) * n} | wrong))
+
+
+def test_refuses_another_number_of_joints_and_a_stop_that_is_too_fast(plant):
+    ones = (1.0,)
+    with pytest.raises(InputError, match="7 joints"):
+        TorqueGuard(plant, SafetyLimits(ones, ones, ones), period=PERIOD)
+    with pytest.raises(InputError, match="come to rest"):
+        TorqueGuard(plant, LIMITS, period=LIMITS.decay_time)

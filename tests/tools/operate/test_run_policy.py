@@ -1,0 +1,159 @@
+"""A policy on a robot, both sides of the bus in one process: neither waits for the wall's clock."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from drake import lcmt_iiwa_command
+from pydrake.lcm import DrakeLcm
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.make import make_skill, resolve
+from guiderail.diagrams.stations.hardware import HardwareStation, SimulatedIiwa
+from guiderail.diagrams.stations.station import PLANT_PERIOD
+from guiderail.models.errors import InputError
+from guiderail.models.joint_status import Fault
+from guiderail.systems.policy_system import PolicyError
+from guiderail.tools.command import main
+from guiderail.tools.operate import run_policy
+from guiderail.tools.operate.run_policy import Operation
+from guiderail.tools.operate.serve_iiwa import START
+
+OPTIONS = {"station": "hardware", "guidance": "kmp", "uncertainty": "known"}
+
+
+class Together:
+    """Steps a simulated robot and whoever drives it in turn; at some step something may happen."""
+
+    def __init__(self, workcell, lcm, start):
+        self.robot = SimulatedIiwa(workcell, lcm)
+        self.simulator = Simulator(self.robot)
+        self.robot.set_pose(self.simulator.get_mutable_context(), start)
+        self.simulator.Initialize()
+        self.step, self.happens, self.is_silent = 0, {}, False
+
+    def begin(self):
+        pass
+
+    def advance(self, simulator, steps):
+        start = simulator.get_context().get_time()
+        for step in range(steps):
+            self.step += 1
+            self.happens.get(self.step, lambda: None)()
+            if not self.is_silent:
+                self.simulator.AdvanceTo(self.step * PLANT_PERIOD)
+            simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
+
+
+@pytest.fixture
+def operated(monkeypatch):
+    """From where the robot starts, and a policy, to an operation and its robot."""
+
+    def operated(start=START, policy=lambda observation: np.zeros(2), num_steps=20, is_stopped=lambda: False):
+        lcm = DrakeLcm("memq://")
+        with monkeypatch.context() as patch:
+            # The skill's station makes its own bus from a URL, and a bus in memory is known to its maker alone.
+            patch.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
+            skill = make_skill("BncConnector", policy, **OPTIONS)
+        task = resolve("BncConnector", OPTIONS).task
+        monkeypatch.setattr(type(task), "num_steps", num_steps)
+        pace = Together(task.world(), lcm, start)
+        skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
+        return Operation(task, skill, pace, is_stopped), pace
+
+    return operated
+
+
+def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
+    operation, pace = operated(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert all(check.is_well for check in operation.checks())
+    said = []
+    outcome = operation.run(said.append)
+    assert (outcome.words, outcome.steps, outcome.exit_code) == ("done", 20, 0)
+    begin = operation._start
+    np.testing.assert_allclose(operation.trace.measured[0][:3], begin[:3], atol=3e-3)
+    assert (operation.trace.signals["phase"] == 2).all()
+    context = pace.simulator.get_context()
+    velocities = pace.robot.plant.GetVelocities(pace.robot.plant.GetMyContextFromRoot(context))
+    assert np.abs(velocities).max() < 0.01
+    path = operation.write(tmp_path, {"outcome": outcome.words})
+    ledger = pd.read_parquet(path)
+    assert len(ledger) == 20
+    assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(ledger)
+    assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "done"
+
+
+def test_a_policy_that_returns_no_action_leaves_the_arm_at_rest(operated):
+    operation, pace = operated(policy=lambda observation: np.full(2, np.nan))
+    commands = []
+    operation._station.lcm.Subscribe(
+        "IIWA_COMMAND", lambda message: commands.append(lcmt_iiwa_command.decode(message).joint_torque)
+    )
+    with pytest.raises(PolicyError):
+        operation.run(print)
+    assert commands[-1] == (0.0,) * 7
+    velocities = pace.robot.plant.GetVelocities(pace.robot.plant.GetMyContextFromRoot(pace.simulator.get_context()))
+    assert np.abs(velocities).max() < 0.01
+
+
+def test_a_status_that_stops_ends_it(operated):
+    operation, pace = operated()
+    pace.happens[300] = lambda: setattr(pace, "is_silent", True)
+    outcome = operation.run(print)
+    assert (outcome.fault, outcome.exit_code) == (Fault.STALE, 1)
+
+
+def test_a_person_stops_it(operated):
+    pressed = []
+    operation, pace = operated(is_stopped=lambda: bool(pressed))
+    pace.happens[200] = lambda: pressed.append(1)
+    outcome = operation.run(print)
+    assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.ASKED, 1, 0)
+
+
+def test_too_much_force_ends_it(operated):
+    """The least force is too much here: the impedance's own, on its way to the start."""
+    operation, _ = operated()
+    operation._task.collision = type(operation._task.collision)("contact_force", 0.01)
+    outcome = operation.run(print)
+    assert (outcome.fault, outcome.exit_code) == (Fault.FORCE, 1)
+    assert "more than the task's" in outcome.words
+
+
+def test_a_robot_far_from_the_start_is_not_moved(operated):
+    operation, _ = operated(START + [0.0, 0.0, 0.16, 0.0, 0.0, 0.0])
+    (wrong,) = [check for check in operation.checks() if not check.is_well]
+    assert wrong.name == "start"
+
+
+def test_no_task_without_a_start_and_no_simulated_station(monkeypatch):
+    with pytest.raises(InputError, match="is a simulation"):
+        run_policy._on_a_robot("BncConnector", {}, "rails")
+    environment = resolve("BncConnector", {"station": "arm", "robot": "panda"}).values
+    assert "end_effector" not in run_policy._on_a_robot("BncConnector", environment, "hardware")
+
+
+def test_what_a_person_gave_wrong_ends_with_2(capsys, tmp_path):
+    with pytest.raises(SystemExit) as end:
+        main(["run", str(tmp_path), "--rehearse"])
+    assert end.value.code == 2
+    assert "not a run" in capsys.readouterr().err
+
+
+def test_nobody_confirms_for_a_person(monkeypatch):
+    with pytest.raises(InputError, match="--yes"):
+        run_policy._confirm()
+    monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    monkeypatch.setattr("builtins.input", lambda words: "no")
+    with pytest.raises(InputError, match="nothing has moved"):
+        run_policy._confirm()
+    monkeypatch.setattr("builtins.input", lambda words: "yes")
+    run_policy._confirm()
+
+
+def test_the_stations_of_an_operation_have_the_same_limits():
+    station = HardwareStation(resolve("BncConnector", {}).task.world(), DrakeLcm("memq://"), robot="panda")
+    alike = station.alike(resolve("BncConnector", {}).task.world())
+    assert (alike.limits, alike.impedance, alike.driver) == (station.limits, station.impedance, station.driver)
+    assert alike.lcm is station.lcm
