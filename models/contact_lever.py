@@ -6,7 +6,7 @@ import numpy as np
 
 
 def contact_lever(wrench: np.ndarray, least_force: float) -> np.ndarray:
-    """(−τ_y, τ_x) / f_z of a wrench (6,) about a tool centre: from where it pushes to there, (2,) [m].
+    """(−τ_y, τ_x) / f_z of a wrench (6,) about a tool centre: from there to where it pushes, (2,) [m].
 
     Zero where f_z is less than `least_force` [N]: a torque divided by next to nothing says nothing.
     """

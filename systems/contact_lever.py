@@ -1,7 +1,5 @@
 """Where a contact pushes, told from what it pushes with."""
 
-from __future__ import annotations
-
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.contact_lever import contact_lever
@@ -14,8 +12,8 @@ class ContactLever(LeafSystem):
 
         lever = (−τ_y, τ_x) / f_z where f_z ≥ least_force, and 0 elsewhere
 
-    A single point that pushes along z at p has τ = p × f, so that the lever is −p: it leads from the point to the tool
-    centre, however hard it pushes.
+    A single point that pushes along z at p has τ = p × f, so that the lever is p: it leads from the tool centre to the
+    point, however hard that pushes.
 
     .. pydrake_system::
 
@@ -50,7 +48,7 @@ class ContactLever(LeafSystem):
         return self._wrench_port
 
     def get_lever_output_port(self) -> OutputPort:
-        """From where it pushes to the tool centre, (2,) [m]."""
+        """From the tool centre to where it pushes, (2,) [m]."""
         return self._lever_port
 
     def _calc_lever(self, context: Context, output: BasicVector) -> None:

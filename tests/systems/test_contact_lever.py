@@ -13,10 +13,10 @@ def lever(wrench, least_force=0.5):
 
 
 @pytest.mark.parametrize("force", [0.5, 2.0, 30.0])
-def test_leads_from_where_a_force_acts_to_the_tool_centre_however_large_it_is(force):
+def test_leads_from_the_tool_centre_to_where_a_force_acts_however_large_it_is(force):
     point = np.array([0.003, -0.004, 0.0])
     pushed = np.array([0.0, 0.0, force])
-    np.testing.assert_allclose(lever([*pushed, *np.cross(point, pushed)]), -point[:2])
+    np.testing.assert_allclose(lever([*pushed, *np.cross(point, pushed)]), point[:2])
 
 
 @pytest.mark.parametrize("force", [0.49, 0.0, -5.0])

@@ -26,7 +26,7 @@ STANDS = SEARCH[0] - 0.2  # [s] when the plug may stand on the rim
 
 
 def lever_rule(observation: np.ndarray) -> np.ndarray:
-    """From where the command is a step along the lever, from the point that bears the plug towards its axis; (2,).
+    """From where the command is a step along the lever, towards the point that bears the plug: there is the jack; (2,).
 
     Once the plug has dropped in it stays. Without a memory: what was commanded before is observed.
 
