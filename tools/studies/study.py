@@ -308,9 +308,11 @@ def _policy_folder(job: Job, mark: int) -> Path:
 
 def _digest(job: Job, judged: JudgedOn | None = None) -> str:
     """What a file was evaluated with: other episodes of the same name, or another method's, are not taken for these."""
-    method = job.study.methods[job.method].model_dump_json(include={"env", "policy", "grid"})
+    method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
     said = "" if judged is None else judged.model_dump_json(exclude={"name", "file"})
-    return hashlib.blake2b((said + method + json.dumps(job.study.env)).encode(), digest_size=4).hexdigest()
+    # As resolved: what a difficulty stands for may change, and what was evaluated before is then another task.
+    environment = json.dumps(job.config(1).environment, sort_keys=True, default=str)
+    return hashlib.blake2b((said + method + environment).encode(), digest_size=4).hexdigest()
 
 
 def _evaluated(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
