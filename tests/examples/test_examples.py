@@ -1,5 +1,6 @@
 """Every example runs as it stands, is short, and is understood by a type checker without being told any path."""
 
+import json
 import os
 import subprocess
 import sys
@@ -12,12 +13,21 @@ FILES = sorted(EXAMPLES.glob("*.py"))
 LINES = 60
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
-def test_an_example_runs_from_anywhere(file, tmp_path):
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    """What each of them printed, away from the repository."""
     environment = os.environ | {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
-    result = subprocess.run([sys.executable, str(file)], cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.strip()
+    program = [sys.executable, str(Path(__file__).with_name("run_all.py")), *map(str, FILES)]
+    folder = tmp_path_factory.mktemp("elsewhere")
+    finished = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True)
+    assert finished.returncode == 0, finished.stderr
+    return json.loads(finished.stdout.splitlines()[-1])
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
+def test_an_example_runs_from_anywhere(file, found):
+    assert not found[str(file)]["wrong"], found[str(file)]["wrong"]
+    assert found[str(file)]["printed"].strip()
     assert len(file.read_text().splitlines()) <= LINES
 
 
