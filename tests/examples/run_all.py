@@ -10,8 +10,9 @@ import runpy
 import sys
 import traceback
 
-found = {}
-for file in sys.argv[1:]:
+files, found = sys.argv[1:], {}
+for file in files:
+    sys.argv = [file]
     printed, wrong = io.StringIO(), ""
     with contextlib.redirect_stdout(printed):
         try:
