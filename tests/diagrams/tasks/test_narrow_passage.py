@@ -348,7 +348,7 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
     monkeypatch.setattr(cameras.ctypes, "CDLL", missing)
     for arguments in ({"observation": "image"}, {"render_mode": "rgb_array"}):
         with pytest.raises(InputError, match=r"libEGL\.so\.1.*libegl1"):
-            make("kmp", **arguments)
+            make("kmp", horizon=17, **arguments)  # of which no diagram is there yet
     make("kmp")  # needs no picture
 
 
