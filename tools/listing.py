@@ -51,7 +51,7 @@ def task(name: str) -> dict[str, Any]:
         "stations": stations_for(declared.world_kind),
         "rewards": list(declared.rewards),
         "observations": list(declared.observations),
-        "difficulties": list(declared.difficulties),
+        "difficulties": {level: dict(settings) for level, settings in declared.difficulties.items()},
         "defaults": {**declared.defaults, **declared.learner},
         "options": described(declared.Options),
         "reset_options": described(declared.Reset),
@@ -83,6 +83,10 @@ def options_in_words(name: str) -> dict[str, str]:
             if {"minimum", "maximum"} <= row.keys():
                 among = f"from {row['minimum']:g} to {row['maximum']:g}; "
             words[row["name"]] = f"{row['description']}: {among}{resolved.values[row['name']]!r} unless given"
+    for difficulty, settings in declared.difficulties.items():
+        if settings:
+            stands_for = ", ".join(f"{key}={_said(value)}" for key, value in settings.items())
+            words[f"difficulty={difficulty}"] = f"stands for {stands_for}"
     reset = {f"reset: {row['name']}": row["description"] for row in described(declared.Reset)}
     return words | reset
 
@@ -107,6 +111,13 @@ def _station(name: str) -> dict[str, Any]:
         "outputs": list(STATION_OUTPUTS),
         "options": described(kind.options),
     }
+
+
+def _said(value: Any) -> str:
+    """A setting as `--env` takes it, without the rounding of the last bit."""
+    if isinstance(value, tuple | list):
+        return f"[{','.join(map(_said, value))}]"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _first_line(thing: object) -> str:

@@ -218,6 +218,9 @@ def test_lists_can_be_read_by_a_program(capsys):
     assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
     assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["hold"]
     assert "ten in a row" in call(capsys, "list", "metrics")[1]
+    # What `hard` stands for can be given option by option.
+    assert "offset_range=[0.0026,0.003]" in call(capsys, "list", "BncConnector")[1]
+    assert json.loads(call(capsys, "list", "GridClamp", "--json")[1])["difficulties"]["hard"]["force_limit"] == 10.0
 
 
 def test_what_learned_nothing_stands_beside_the_policy(capsys, trained):
