@@ -4,6 +4,6 @@ from hypothesis import HealthCheck, settings
 
 CALM = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
-settings.register_profile("quick", max_examples=40, derandomize=True, **CALM)
+settings.register_profile("quick", max_examples=30, derandomize=True, **CALM)
 settings.register_profile("long", max_examples=2500, **CALM)
 settings.load_profile("quick")
