@@ -168,6 +168,25 @@ def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains
     )
 
 
+def add_controller(
+    builder: DiagramBuilder, known: KnownArm, impedance: Impedance, period: float, *, compensate_gravity: bool
+) -> tuple[CartesianImpedanceController, ImpedanceMonitor]:
+    """Adds an arm's controller, sampled once in `period` [s], and what watches its wrench; the caller wires both."""
+    controller = builder.AddNamedSystem(
+        "controller",
+        CartesianImpedanceController(
+            known.plant,
+            known.arm.target,
+            known.arm.tool_centre,
+            impedance_gains(impedance, known.posture),
+            period=period,
+            compensate_gravity=compensate_gravity,
+        ),
+    )
+    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
+    return controller, monitor
+
+
 def add_impedance_control(
     builder: DiagramBuilder,
     known: KnownArm,
@@ -182,18 +201,7 @@ def add_impedance_control(
 
     Its watchdog checks commands once in `period` [s].
     """
-    controller = builder.AddNamedSystem(
-        "controller",
-        CartesianImpedanceController(
-            known.plant,
-            known.arm.target,
-            known.arm.tool_centre,
-            impedance_gains(impedance, known.posture),
-            period=period,
-            compensate_gravity=compensate_gravity,
-        ),
-    )
-    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
+    controller, monitor = add_controller(builder, known, impedance, period, compensate_gravity=compensate_gravity)
     builder.Connect(state, controller.get_state_input_port())
     builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
     export_station_ports(

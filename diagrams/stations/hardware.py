@@ -21,7 +21,7 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, Seriali
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.options import Number, Options
-from guiderail.diagrams.stations.arm import KnownArm, add_arm, impedance_gains
+from guiderail.diagrams.stations.arm import KnownArm, add_arm, add_controller
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     PLANT_PERIOD,
@@ -38,10 +38,8 @@ from guiderail.models.registry import did_you_mean
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.panda import PANDA
 from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector, Robot, find_robot
-from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.desired_pose_ramp import DesiredPoseRamp
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.status_watchdog import StatusWatchdog
 from guiderail.systems.torque_guard import SafetyLimits, TorqueGuard
@@ -272,18 +270,7 @@ class HardwareStation(Station):
         )
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period))
         ramp = builder.AddNamedSystem("ramp", DesiredPoseRamp(period=period))
-        controller = builder.AddNamedSystem(
-            "controller",
-            CartesianImpedanceController(
-                known.plant,
-                known.arm.target,
-                known.arm.tool_centre,
-                impedance_gains(impedance, known.posture),
-                period=period,
-                compensate_gravity=False,
-            ),
-        )
-        monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
+        controller, monitor = add_controller(builder, known, impedance, period, compensate_gravity=False)
         self._guard = guard = builder.AddNamedSystem("guard", TorqueGuard(known.plant, limits, period=period))
         publisher = builder.AddNamedSystem(
             "command_publisher",
