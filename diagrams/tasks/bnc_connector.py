@@ -24,7 +24,7 @@ from guiderail.diagrams.tasks.bnc_observation import (
     sides_of_the_rim,
 )
 from guiderail.diagrams.tasks.bnc_options import HARD, BncOptions
-from guiderail.diagrams.tasks.bnc_rewards import reward_terms
+from guiderail.diagrams.tasks.bnc_rewards import REWARDS, reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
@@ -60,12 +60,12 @@ def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
 
 @register_task("BncConnector")
 class BncConnector(InsertionTask):
-    """Insert, align and lock: "sparse" is the thesis's reward (4.27, 4.28), "shaped" adds the depth gained."""
+    """Insert, align and lock: "sparse" is the thesis's reward (4.27, 4.28); "shaped" and "aligned" add to it."""
 
     Options = BncOptions
     options: BncOptions
     workpiece, fixture = "plug", "jack"
-    rewards = ("sparse", "shaped")
+    rewards = REWARDS
     observations = OBSERVATIONS
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
     defaults = {"guidance": "skgrl", "station": "rails", "hold": 10, "explored": (0, 1), "history_variance": RHO}

@@ -89,3 +89,8 @@ def test_pouring_names_its_weights_and_its_speed():
     sparse = told("Pouring", {"reward": "sparse"})
     assert any("1.7 times" in one for one in sparse)
     assert not any("equation 3.7" in one for one in sparse)
+
+
+def test_the_connectors_dimensions_are_the_runs_own():
+    told = " ".join(differences(configure("BncConnector", {"difficulty": "hard"})))
+    assert "chamfer of 0.1 mm" in told
