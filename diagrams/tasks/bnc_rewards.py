@@ -25,8 +25,8 @@ REWARDS = ("sparse", "shaped", "aligned")
 def reward_terms(reward: str, num_actions: int) -> list[RewardTerm]:
     """ "sparse" is the thesis's reward, "shaped" adds the depth gained, "aligned" nearness to the jack's axis, too.
 
-    Where the axis is, only a simulation knows: it is rewarded and not observed. What is added is gained from control step
-    to control step, a difference of potentials.
+    Where the axis is, only a simulation knows: it is rewarded and not observed. What is added is gained from step to
+    step, a difference of potentials.
     """
     terms = [
         RewardTerm("action_cost", {"action": num_actions}, lambda action: -ACTION_WEIGHT * float(action @ action)),
