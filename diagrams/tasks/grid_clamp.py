@@ -47,8 +47,8 @@ def make_skill() -> Skill:
 @register_task("GridClamp")
 class GridClamp(InsertionTask):
     """Insert the clamp: "shaped" is the thesis's reward (3.11, 3.12), "no_force" the same without the cost of force,
-    "sparse" without the distance gained, "aligned" with nearness to the holes' axis. Without `active_constraints` only the impedance's own limits of force hold a
-    policy back."""
+    "sparse" without the distance gained, "aligned" with nearness to the holes' axis. Without `active_constraints` only
+    the impedance's own limits of force hold a policy back."""
 
     Options = GridClampOptions
     options: GridClampOptions
