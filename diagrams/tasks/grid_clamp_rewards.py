@@ -10,7 +10,7 @@ from guiderail.systems.reward_system import RewardTerm
 
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
-# Of coming nearer to the holes' axis [1/m], and of an end by too much force: a step nearer is a part of a millimetre, and
+# Of coming nearer to the holes' axis [1/m], and of an end by too much force: steps are parts of a millimetre, and
 # whoever presses gently and long must not lose more than whoever gives up at once.
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 
