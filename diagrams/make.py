@@ -24,7 +24,7 @@ from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of, randomizes
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 
 
@@ -94,7 +94,7 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
     if unknown:
         elsewhere = [place for place in places if unknown[0] in (STATIONS.get(place).options or Options).model_fields]
         remedy = f"it is one of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
-        raise InputError(f"{name} has no option {unknown[0]!r} here: {remedy}")
+        raise InputError(f"{name} has no option {brief(unknown[0])} here: {remedy}")
     checked = {
         part: validated(model, {key: merged[key] for key in model.model_fields if key in merged}, name)
         for part, model in models.items()
