@@ -36,12 +36,14 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
     """
     names = []
     for module in modules:
-        path = Path(module)
         try:
+            path = Path(module)
             names.append(_import_file(path) if path.suffix == ".py" else import_module(module).__name__)
-        except (ModuleNotFoundError, FileNotFoundError) as error:
+        except (ModuleNotFoundError, FileNotFoundError, ValueError, TypeError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
-                f"--import takes a module or a file (.py), and there is none for {module!r}: {error}"
+                f"--import takes a module or a file (.py), and there is none for {brief(module)}: {error}"
             ) from None
     register_envs()
     return tuple(names)

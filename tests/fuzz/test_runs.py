@@ -4,10 +4,12 @@ import csv
 import io
 import json
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,7 +20,9 @@ from guiderail.models.policy import Policy
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.configure import SUMMARY, configure
 from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import _resume
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.tables import table_text
 from guiderail.tools.tasks import check_environment
@@ -202,3 +206,55 @@ def test_policies_with_entries_changed_that_have_their_digest(folder, data):
     Policy(LAYERS, DESCRIPTION).save(folder.path)
     (folder.path / "policy.json").write_text(json.dumps(tree, default=str))
     try_policy("policy, entries changed", folder, None)
+
+
+@pytest.fixture(scope="module")
+def resumable(folder):
+    """A small learner that has seen something, and what a checkpoint of it holds."""
+    env = Line()
+    settings = {"units": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_every": 1}
+    learner = LEARNERS.get("tqc")(
+        resolve_preset("robust", "tqc", settings), env, hold=1, seed=0, decisions=12, symmetry=None
+    )
+    arrays, values = learner.state()
+    arrays = {key: array.copy() for key, array in arrays.items()}
+    values = {"rows": ROWS, "learner": values, "environment": env.np_random.bit_generator.state}
+    return env, learner, arrays, json.loads(json.dumps(values))
+
+
+class Line(gymnasium.Env):
+    """The two spaces and the random numbers that a learner and a checkpoint ask for."""
+
+    observation_space = spaces.Box(-1, 1, (3,), np.float32)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+
+@given(st.data())
+def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable, data):
+    env, learner, arrays, values = resumable
+    changed = dict(arrays)
+    for name in data.draw(st.lists(st.sampled_from(sorted(arrays)), max_size=2)):
+        what = data.draw(st.sampled_from(["remove", "reshape", "type", "number", "rename", "longer"]))
+        array = changed.pop(name, arrays[name])
+        if what == "reshape":
+            changed[name] = array.reshape(-1, 1)
+        elif what == "type":
+            changed[name] = array.astype(data.draw(st.sampled_from(["f2", "f8", "i4", "u1"])))
+        elif what == "number":
+            changed[name] = np.full_like(array, data.draw(st.integers(0, 9)))
+        elif what == "rename":
+            changed[data.draw(st.sampled_from(["", "x", "optimizer/x", f"{name}/0"]))] = array
+        elif what == "longer":
+            changed[name] = np.concatenate([array.ravel(), array.ravel()])
+    tree = values if data.draw(st.booleans()) and changed.keys() else data.draw(changed_trees([values]))
+    save_checkpoint(folder.checkpoint, changed, tree)
+    folder.write_episodes(ROWS[: data.draw(st.sampled_from([3, len(ROWS)]))])
+    rows = attempt("checkpoint, other content", InputError, lambda: _resume(folder, learner, env))
+    if rows is not None:
+        assert rows == tree["rows"]
+        found, known = learner.state()
+        assert json.loads(json.dumps(known)) == tree["learner"]
+        assert found.keys() == changed.keys()
+        for name, array in changed.items():
+            np.testing.assert_array_equal(found[name], array, strict=True)
+        assert env.np_random.bit_generator.state == tree["environment"]
