@@ -229,6 +229,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         push=_push(station) if task.pushable else None,
         query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
         symmetry=task.symmetry(),
+        near_symmetry=task.near_symmetry(),
         declaration=task,
     )
 
