@@ -2,6 +2,7 @@
 
     python tests/fuzz/fuzz.py                       # 25,000 inputs, some ten minutes
     python tests/fuzz/fuzz.py --inputs 200 runs     # fewer, and of tests/fuzz/test_runs.py alone
+    python tests/fuzz/fuzz.py --seed 1 --add FILE   # others, added to what FILE counts from earlier calls
 
 An input is accepted, and then means what it says to an independent reader, or refused in one sentence; within 2 s of
 CPU and 200 MB. Everything else is counted as a traceback, a hang, too large or a wrong number, shown with the smallest
@@ -15,7 +16,6 @@ import json
 import os
 import sys
 import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -69,12 +69,14 @@ def main() -> int:
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(files)}; all unless given")
     parser.add_argument("--inputs", type=int, default=1000, help="the most that each test tries")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--add", type=Path, metavar="FILE", help="a JSON file with counts, which grow")
     given = parser.parse_args()
     if unknown := set(given.kinds) - set(files):
         parser.error(f"there is no {', '.join(sorted(unknown))}: choose of {', '.join(files)}")
     os.chdir(FOLDER.parents[1])
     found: Counter[tuple[str, str]] = Counter()
-    started = time.perf_counter()
+    if given.add and given.add.exists():
+        found.update({(target, outcome): n for target, outcome, n in json.loads(given.add.read_text())})
     for kind in given.kinds or files:
         with tempfile.NamedTemporaryFile() as into:
             child = os.fork()
@@ -90,6 +92,8 @@ def main() -> int:
             found.update({(target, outcome): n for target, outcome, n in json.loads(written)})
         else:
             found[kind, "hangs"] += 1  # the process ended early: it was stuck for a minute, or crashed
+    if given.add:
+        given.add.write_text(json.dumps([[*key, n] for key, n in found.items()], indent=1))
     targets = list(dict.fromkeys(target for target, _ in found))
     width = max(map(len, targets))
     print("\n" + "  ".join([" " * width, *(f"{outcome:>13}" for outcome in OUTCOMES)]))
@@ -97,7 +101,6 @@ def main() -> int:
         print("  ".join([f"{target:<{width}}", *(f"{found[target, outcome]:13d}" for outcome in OUTCOMES)]))
     together = {outcome: sum(found[target, outcome] for target in targets) for outcome in OUTCOMES}
     print("  ".join([f"{'together':<{width}}", *(f"{n:13d}" for n in together.values())]))
-    print(f"in {time.perf_counter() - started:.0f} s")
     return int(any(together[outcome] for outcome in FAILED))
 
 
