@@ -91,7 +91,7 @@ def main() -> int:
         if written:
             found.update({(target, outcome): n for target, outcome, n in json.loads(written)})
         else:
-            found[kind, "hangs"] += 1  # the process ended early: it was stuck for a minute, or crashed
+            found[kind, "hangs"] += 1  # the process ended early: it was stuck, or crashed
     if given.add:
         given.add.write_text(json.dumps([[*key, n] for key, n in found.items()], indent=1))
     targets = list(dict.fromkeys(target for target, _ in found))
