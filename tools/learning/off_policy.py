@@ -377,7 +377,8 @@ class OffPolicyLearner(Learner):
 
 
 def _bits(array: np.ndarray | None) -> tuple[Any, ...]:
-    return () if array is None else (array.shape, array.dtype, array.tobytes())
+    """What two arrays have in common that are the same; files know no number without a dimension."""
+    return () if array is None else (np.atleast_1d(array).shape, array.dtype, array.tobytes())
 
 
 class SacLearner(OffPolicyLearner):
