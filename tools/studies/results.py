@@ -48,14 +48,14 @@ def write_results(folders: Sequence[Path], out: Path) -> Path:
         InputError: if a folder holds neither, or there is nothing to write of.
     """
     for folder in folders:
-        tables = [folder / f"{name}.csv" for name in shipped_studies() if (folder / f"{name}.csv").is_file()]
+        finished = [folder / f"{name}.csv" for name in shipped_studies() if (folder / f"{name}.csv").is_file()]
         figures = [folder / f"{name}.json" for name in MADE.values() if (folder / f"{name}.json").is_file()]
-        if not tables and not figures:
+        if not finished and not figures:
             raise InputError(
                 f"{folder} holds no table of a study and no figure: give a folder that guiderail study or guiderail "
                 "reproduce finished"
             )
-        for file in tables:
+        for file in finished:
             write_atomically(out / file.name, table_text(read_table(file)).encode())
         for file in figures:
             write_atomically(out / file.name, json.dumps(_figure(file), indent=1).encode() + b"\n")
@@ -91,7 +91,7 @@ def _figures(made: Mapping[str, Mapping[str, Any]], studies: Sequence[str]) -> s
         beside = [f"[{name}](#{name})" for name in studies if number in FIGURES.get(name, ())]
         found = made.get(number, {})
         claims = [f"{_words(key)}: {cell(value)}" for key, value in found.items() if key not in NO_CLAIM]
-        told = [number, words, "; ".join([*claims, *(["study " + ", ".join(beside)] if beside else [])])]
+        told: list[Any] = [number, words, "; ".join([*claims, *(["study " + ", ".join(beside)] if beside else [])])]
         told += [found.get("seeds"), f"{found['seconds'] / 60:.1f} min" if found else None, found.get("condition")]
         command = found.get(
             "command", f"guiderail reproduce {number!r}" if " " in number else f"guiderail reproduce {number}"
