@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench docs kills newest clean
+.PHONY: demo test lint bench docs kills fuzz mutants newest clean
 
 demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
@@ -19,9 +19,16 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy -p guiderail
 
-# Minutes each, and no part of `make test`: runs that are killed at random, and the newest versions of everything.
+# Minutes each, the last one hours, and no part of `make test`: runs that are killed at random, the newest versions of
+# everything, inputs made at random, and the safety code changed place by place.
 kills: $(VENV)/.ready
 	$(BIN)/python tests/kills/kill.py --kills 40
+
+fuzz: $(VENV)/.ready
+	$(BIN)/python tests/fuzz/fuzz.py
+
+mutants: $(VENV)/.ready
+	$(BIN)/python tests/mutation/mutate.py --results mutants.json
 
 newest:
 	.ci/newest python3.12

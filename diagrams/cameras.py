@@ -13,7 +13,6 @@ from pydrake.geometry import (
     DepthRenderCamera,
     MakeRenderEngineVtk,
     Meshcat,
-    MeshcatAnimation,
     MeshcatParams,
     MeshcatVisualizer,
     MeshcatVisualizerParams,
@@ -29,6 +28,7 @@ from pydrake.systems.sensors import CameraInfo, RgbdSensor
 from guiderail.models.errors import InputError
 
 _RENDERER = "vtk"
+PUBLISH_PERIOD = 1 / 50  # s, between two pictures of a browser view
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,8 @@ def check_rendering() -> None:
         ) from None
 
 
-def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> tuple[Meshcat, MeshcatVisualizer]:
-    """Adds a browser view, on this machine only: Meshcat would listen on every interface by default.
+def open_meshcat() -> tuple[Meshcat, MeshcatVisualizer]:
+    """A browser view, on this machine only: Meshcat would listen on every interface by default.
 
     Raises:
         InputError: if the environment forbids Drake to open a port at all.
@@ -121,20 +121,17 @@ def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> tuple[Meshcat, Me
         raise InputError(
             f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"
         ) from error
-    parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=1 / 50)
-    visualizer = builder.AddNamedSystem("meshcat", MeshcatVisualizer(meshcat, parameters))
-    builder.Connect(query, visualizer.query_object_input_port())
-    return meshcat, visualizer
+    parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=PUBLISH_PERIOD)
+    return meshcat, MeshcatVisualizer(meshcat, parameters)
 
 
-def clear_meshcat(meshcat: Meshcat) -> None:
-    """Makes a browser view what it was when it was opened; who is connected to it stays.
+def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> Meshcat:
+    """Adds a browser view to a diagram, with which it stays.
 
-    A view is closed only with the diagram that publishes to it. So is its port, and whoever needs a view next gets it.
+    Raises:
+        InputError: as `open_meshcat`.
     """
-    meshcat.Delete("/drake")
-    meshcat.Delete("/guiderail")
-    meshcat.DeleteRecording()
-    meshcat.SetAnimation(MeshcatAnimation())
-    meshcat.DeleteAddedControls()
-    meshcat.ResetRenderMode()
+    meshcat, visualizer = open_meshcat()
+    builder.AddNamedSystem("meshcat", visualizer)
+    builder.Connect(query, visualizer.query_object_input_port())
+    return meshcat

@@ -3,6 +3,7 @@
 import re
 import weakref
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from pydrake.systems.framework import PortDataType
 
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.trace import Trace
+from guiderail.diagrams.view import View
 from guiderail.models.errors import InputError
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.policy_system import PolicyError
@@ -84,7 +86,8 @@ class GuidedEnv(DrakeGymEnv):
             raise InputError(f"hold is the number of control steps an action lasts: give an integer from 1, not {hold}")
         diagram = task.diagram
         _check_view(task, render_mode)
-        self.task = task
+        view = None if render_mode != "human" or task.query is None else View(task.query)
+        self.task = task = replace(task, view=view)
         self.hold = int(hold)
         # The parent class writes into whatever `metadata` it finds; this one is our own, not every environment's.
         self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / (hold * task.control_period))}
@@ -100,8 +103,9 @@ class GuidedEnv(DrakeGymEnv):
         )
         self.metadata["render_modes"] = ["human", "rgb_array"]
         self.render_mode = render_mode
-        if render_mode == "human":
+        if view is not None:
             self.simulator.set_target_realtime_rate(1.0)
+            self.simulator.set_monitor(view.follow)
 
         context = self.simulator.get_mutable_context()
         self._neutral = np.zeros(self.action_space.shape)
@@ -128,8 +132,10 @@ class GuidedEnv(DrakeGymEnv):
         self._release.atexit = False
 
     def close(self) -> None:
-        """Ends the environment; what it recorded stays."""
+        """Ends the environment and its view; what it recorded stays."""
         self._running, self._closed = False, True
+        self.simulator.clear_monitor()
+        self.task = replace(self.task, view=None)
         self._release()
 
     def __reduce_ex__(self, protocol):
@@ -244,7 +250,8 @@ class GuidedEnv(DrakeGymEnv):
             return None
         if self.render_mode == "rgb_array":
             return self.render_rgb_port.Eval(self.simulator.get_context()).data[:, :, :3].copy()
-        self.simulator.get_system().ForcedPublish(self.simulator.get_context())
+        if self.task.view is not None:
+            self.task.view.publish(self.simulator.get_context())
         return None
 
     def push(self, displacement) -> None:
@@ -308,7 +315,7 @@ def check_render_mode(render_mode: str | None) -> None:
 
 def _check_view(task: TaskDiagram, render_mode: str | None) -> None:
     check_render_mode(render_mode)
-    if render_mode == "human" and task.meshcat is None:
-        raise InputError("this environment has no Meshcat: make it with render_mode='human'")
+    if render_mode == "human" and task.query is None:
+        raise InputError("this environment has no scene for Meshcat to show: leave render_mode out")
     if render_mode == "rgb_array" and not task.diagram.HasOutputPort("rgb_image"):
         raise InputError("this environment has no camera: make it with render_mode='rgb_array'")

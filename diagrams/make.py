@@ -12,7 +12,6 @@ from pydantic import Field
 from pydrake.systems.framework import Diagram, System
 from threadpoolctl import threadpool_limits
 
-from guiderail.diagrams.cameras import clear_meshcat
 from guiderail.diagrams.env import GuidedEnv, check_render_mode
 from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.registry import GUIDANCE, build_guidance, check_guidance, possible_guidance
@@ -24,7 +23,7 @@ from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of, randomizes
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 
 
@@ -94,7 +93,7 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
     if unknown:
         elsewhere = [place for place in places if unknown[0] in (STATIONS.get(place).options or Options).model_fields]
         remedy = f"it is one of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
-        raise InputError(f"{name} has no option {unknown[0]!r} here: {remedy}")
+        raise InputError(f"{name} has no option {brief(unknown[0])} here: {remedy}")
     checked = {
         part: validated(model, {key: merged[key] for key in model.model_fields if key in merged}, name)
         for part, model in models.items()
@@ -152,12 +151,13 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
             "in a simulation, and run what was learned by guiderail run"
         )
     threadpool_limits(1)
-    key = _key(resolved, render_mode)
-    built = _POOL.take(key, lambda: _build(resolved, render_mode))
+    exported = render_mode if render_mode == "rgb_array" else None
+    key = _key(resolved, exported)
+    built = _POOL.take(key, lambda: _build(resolved, exported))
     # What a run hides is the task's: it is this environment's own, whoever had the diagram before.
     reset = randomizes(resolved.task, built.station, built.guidance)
     diagram = replace(built.diagram, randomize=reset, declaration=resolved.task)
-    release = partial(_release, key, built)
+    release = partial(_POOL.give_back, key, built)
     return GuidedEnv(diagram, hold=resolved.task.choice.hold, render_mode=render_mode, release=release)
 
 
@@ -169,12 +169,6 @@ class _Built:
 
 
 _POOL: Pool[_Built] = Pool()
-
-
-def _release(key: Hashable, built: _Built) -> None:
-    if built.diagram.meshcat is not None:
-        clear_meshcat(built.diagram.meshcat)
-    _POOL.give_back(key, built)
 
 
 def _build(resolved: Resolved, render_mode: str | None) -> _Built:

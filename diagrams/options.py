@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 
 
@@ -43,12 +43,12 @@ class PrimitiveOptions(Options):
 
     kappa: Number = Field(1.0, gt=0, description="κ: a constant action of ±1 ends √3 κ standard deviations away")
     explored: Integers | None = Field(None, description="the outputs that an action moves, by number; none named: all")
-    history: Integer = Field(10, ge=1, description="P, past outputs that sKGRL's motion passes through")
+    history: Integer = Field(10, ge=1, le=1000, description="P, past outputs that sKGRL's motion passes through")
     history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], how exactly it does")
     history_source: Literal["commanded", "measured"] = Field("commanded", description="what counts as the past")
     adaptive_history: bool = Field(False, description="whether the history shrinks in contact")
     gains: Numbers | None = Field(None, description="raw null-space units per action, instead of those from κ")
-    horizon: Integer = Field(40, ge=0, description="H, future points at which constraints are kept")
+    horizon: Integer = Field(40, ge=0, le=1000, description="H, future points at which constraints are kept")
     lambda_: Number = Field(6.0, ge=0, description="λ of problem 4.5")
     beta: Number = Field(6.0, gt=0, description="β of problem 4.5")
     inverse_length: Number = Field(2.0, gt=0, description="of the kernel")
@@ -80,7 +80,7 @@ def validated(model: type[Model], values: Mapping[str, Any], whose: str) -> Mode
     """
     unknown = [name for name in values if name not in model.model_fields]
     if unknown:
-        raise InputError(f"{whose} has no option {unknown[0]!r}: {did_you_mean(unknown[0], model.model_fields)}")
+        raise InputError(f"{whose} has no option {brief(unknown[0])}: {did_you_mean(unknown[0], model.model_fields)}")
     try:
         return model(**values)
     except ValidationError as error:
@@ -94,7 +94,7 @@ def choose(name: str, value: Any, choices: list[str], whose: str) -> str:
         InputError: if it is none of them.
     """
     if value not in choices:
-        raise InputError(f"{whose} has no {name} {value!r}: {did_you_mean(value, choices)}")
+        raise InputError(f"{whose} has no {name} {brief(value)}: {did_you_mean(value, choices)}")
     return str(value)
 
 
@@ -126,11 +126,11 @@ def _sentence(error: Any, values: Mapping[str, Any]) -> str:
     value, kind, context = values.get(name), error["type"], error.get("ctx", {})
     if kind == "literal_error":
         choices = [word.strip().strip("'") for word in context["expected"].replace(" or ", ", ").split(",")]
-        return f"there is no {name} {value!r}: {did_you_mean(value, choices)}"
+        return f"there is no {name} {brief(value)}: {did_you_mean(value, choices)}"
     bounds = {"greater_than": "more than", "greater_than_equal": "at least", "less_than": "less than"}
     bounds["less_than_equal"] = "at most"
     if kind in bounds:
         (bound,) = context.values()
-        return f"{name} must be {bounds[kind]} {bound:g}, not {value!r}"
+        return f"{name} must be {bounds[kind]} {bound:g}, not {brief(value)}"
     message = str(error["msg"]).removeprefix("Value error, ")
-    return f"{name} cannot be {value!r}: {message[:1].lower()}{message[1:]}"
+    return f"{name} cannot be {brief(value)}: {message[:1].lower()}{message[1:]}"

@@ -10,8 +10,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, OutputPort
 
+from guiderail.diagrams.view import View
 from guiderail.models.errors import InputError
 
 _GRID = 2.0**-40
@@ -124,7 +125,8 @@ class TaskDiagram:
             into the context and returns what `info` should say about them. Refuses an unknown option by `InputError`.
         push: called with the root context and a displacement; moves the measured pose by it, as a person would who
             pushes the robot. None where a task has no such thing.
-        meshcat: where the diagram publishes to, for `render_mode="human"`.
+        query: of the scene, for a browser view.
+        view: the browser view of an environment made with `render_mode="human"`.
         symmetry: of the task, where it has one; a learner may learn from what it saw, seen from the other side.
         near_symmetry: the same, with sides from which only most of an episode stays what it is.
         declaration: the `Task` that this was assembled of, where it was.
@@ -138,10 +140,16 @@ class TaskDiagram:
     ledger_fields: tuple[str, ...]
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]] = _nothing_to_randomize
     push: Callable[[Context, np.ndarray], None] | None = None
-    meshcat: Meshcat | None = None
+    query: OutputPort | None = None
+    view: View | None = None
     symmetry: Symmetry | None = None
     near_symmetry: Symmetry | None = None
     declaration: Any = None
+
+    @property
+    def meshcat(self) -> Meshcat | None:
+        """The page of the browser view, where there is one."""
+        return None if self.view is None else self.view.meshcat
 
     def __post_init__(self):
         missing = [name for name in (*PORTS, *self.reward_terms) if not self.diagram.HasOutputPort(name)]

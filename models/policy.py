@@ -1,17 +1,24 @@
 """A trained policy as it leaves a run: weights that hold no code, and the NumPy that evaluates them."""
 
 import json
+import math
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load, save
 
+from guiderail.models.digest import digest
 from guiderail.models.errors import InputError
+from guiderail.models.reading import read_bytes
 
-FORMAT = "guiderail policy 1"
+FORMAT = "guiderail policy 2"
+WITHOUT_DIGEST = "guiderail policy 1"  # what earlier versions wrote
+MOST_WEIGHTS = 200_000_000  # [bytes] a policy of 256 × 256 units has 0.3 million
+MOST_DESCRIPTION = 1_000_000  # [bytes]
 
 
 class Policy:
@@ -30,7 +37,8 @@ class Policy:
                 is averaged over.
 
         Raises:
-            ValueError: for an activation that it does not know.
+            ValueError: for an activation that it does not know, layers that don't follow each other from observation to
+                action, or a number that is not finite.
         """
         self._layers = layers
         self.description = dict(description)
@@ -41,6 +49,28 @@ class Policy:
         self._normalizes = activation == "normalized_relu"
         self._low = np.asarray(description["action_low"], np.float32)
         self._high = np.asarray(description["action_high"], np.float32)
+        self._check()
+
+    def _check(self) -> None:
+        """Raises a ValueError where what is known of the policy doesn't fit together."""
+        if any(type(n) is not int or n < 1 for n in (*self._shape, self.description.get("pool", 1))):
+            raise ValueError("a shape, and the side of a square of pixels, are positive whole numbers")
+        if self._low.ndim != 1 or self._low.shape != self._high.shape or not (self._low < self._high).all():
+            raise ValueError("an action has a lower limit below an upper one for each of its numbers")
+        sizes = [self._num_features(), *(len(bias) for _, bias in self._layers)]
+        expected = [(out, into) for into, out in pairwise(sizes)]
+        if not self._layers or [weight.shape for weight, _ in self._layers] != expected or sizes[-1] != len(self._low):
+            raise ValueError(f"layers lead from {sizes[0]} features to {len(self._low)} actions, one after the other")
+        numbers = [self._low, self._high, *(array for layer in self._layers for array in layer)]
+        if any(array.dtype != np.float32 or not np.isfinite(array).all() for array in numbers):
+            raise ValueError("weights and limits are finite and of single precision")
+
+    def _num_features(self) -> int:
+        """How many numbers the first layer sees of an observation."""
+        if len(self._shape) != 3:
+            return math.prod(self._shape)
+        height, width, channels = self._shape
+        return (height // self.description["pool"]) * (width // self.description["pool"]) * channels
 
     @classmethod
     def load(cls, folder: Path) -> "Policy":
@@ -54,27 +84,29 @@ class Policy:
             if not path.is_file():
                 raise InputError(f"{folder} holds no {path.name}: train it first, or finish it with --resume")
         try:
-            values = json.loads(description.read_text(encoding="utf-8"))
-            if values["format"] != FORMAT:
-                raise ValueError("another format")
-            arrays = load_file(weights)
-            count = len(arrays) // 2
-            layers = [(arrays[f"layers.{i}.weight"], arrays[f"layers.{i}.bias"]) for i in range(count)]
-            policy = cls(layers, values)
-            policy(np.zeros(policy._shape))
-        except (SafetensorError, ValueError, KeyError, TypeError, OSError) as error:
+            values = json.loads(read_bytes(description, "description of a policy", MOST_DESCRIPTION))
+            arrays = load(read_bytes(weights, "policy's weights", MOST_WEIGHTS))
+            whole = values["format"] == WITHOUT_DIGEST or values.pop("digest") == _digest(arrays, values)
+            if not whole or values["format"] not in (FORMAT, WITHOUT_DIGEST):
+                raise ValueError("another format, or not what was written")
+            if len(arrays) % 2:
+                raise ValueError("a layer has a weight and a bias")
+            layers = [(arrays[f"layers.{i}.weight"], arrays[f"layers.{i}.bias"]) for i in range(len(arrays) // 2)]
+            return cls(layers, values)
+        except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(
                 f"the policy in {folder} is damaged or of another version: write it anew with guiderail train --resume"
             ) from error
-        return policy
 
     def save(self, folder: Path, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
         """Writes `policy.safetensors` and `policy.json`; `write` is how, such as a whole file or none."""
         arrays: dict[str, np.ndarray] = {}
         for index, (weight, bias) in enumerate(self._layers):
             arrays |= {f"layers.{index}.weight": weight, f"layers.{index}.bias": bias}
+        values = self.description | {"format": FORMAT}
+        values["digest"] = _digest(arrays, values)
         write(folder / "policy.safetensors", save(arrays))
-        write(folder / "policy.json", json.dumps(self.description, indent=2).encode() + b"\n")
+        write(folder / "policy.json", json.dumps(values, indent=2).encode() + b"\n")
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """The action for one observation, in the units of the action space.
@@ -107,3 +139,7 @@ class Policy:
         image = observation[: height * side, : width * side].astype(np.float32) / np.float32(255)
         image = image.reshape(height, side, width, side, channels).mean((1, 3), dtype=np.float32)
         return image.transpose(2, 0, 1).ravel()
+
+
+def _digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:
+    return digest(arrays, json.dumps(description, sort_keys=True))

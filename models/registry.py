@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Generic, TypeVar, overload
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 
 Entry = TypeVar("Entry")
 
@@ -76,7 +76,7 @@ class Registry(Generic[Entry]):
             if name not in self._entries:  # its module may have registered it while it was imported
                 self.register(name, value)
         if name not in self._entries:
-            raise InputError(f"there is no {self.noun} {name!r}: {did_you_mean(name, self.names())}")
+            raise InputError(f"there is no {self.noun} {brief(name)}: {did_you_mean(name, self.names())}")
         return self._entries[name]
 
     def names(self) -> list[str]:

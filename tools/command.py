@@ -346,14 +346,15 @@ def report(
 @command("results studies --out docs/results")
 def results(
     studies: Annotated[
-        list[Path] | None, _arg("Folders of finished studies; none: the stored ones.", "STUDY...")
+        list[Path] | None, _arg("Folders of finished studies and figures; none: what is stored.", "FOLDER...")
     ] = None,
     out: Annotated[Path, _opt("The folder of results: a table for each study, and the page.")] = Path("docs/results"),
 ) -> None:
-    """Write what was reproduced as a page, from the tables that studies left.
+    """Write what was reproduced as a page, from what studies and figures left.
 
-    It keeps their tables, so that the page can be written anew without them: each study with what the thesis says,
-    every seed, the time it took, and in what its setting differs.
+    It keeps their tables and numbers, so that the page can be written anew without them: each figure and table of the
+    thesis with what it says and what came out here; each study with every seed, the time it took, and in what its
+    setting differs.
     """
     from guiderail.tools.studies.results import write_results
 

@@ -1,14 +1,19 @@
 """Tables: exact as CSV, readable as Markdown."""
 
 import csv
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 import pandas as pd
 
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
+
+_WHOLE = re.compile(r"-?[0-9]{1,18}")
+_NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|-?inf|nan")
 
 Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[str, Any]]
 
@@ -22,20 +27,33 @@ def table_text(rows: Rows) -> str:
 def read_table(path: Path) -> pd.DataFrame:
     """A CSV file; an empty cell is NaN in a column of numbers and an empty word in one of words.
 
+    A column of numbers holds nothing else, each to the last bit as Python reads it.
+
     Raises:
-        InputError: if the file is missing or is no table.
+        InputError: if the file is missing or is no table: rows of one length below names that are all different.
     """
     if not path.is_file():
         raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            if len({len(row) for row in csv.reader(file)}) != 1:
-                raise ValueError("rows of unequal length")
-        table = pd.read_csv(path, keep_default_na=False, na_values=[""])
+            header, *rows = csv.reader(file, strict=True)
+        if not all(header) or len({*header}) != len(header):
+            raise ValueError("names that are missing, or there twice")
+        columns = zip(*rows, strict=True) if rows else ([] for _ in header)
+        return pd.DataFrame({name: _column(cells) for name, cells in zip(header, columns, strict=True)})
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is not a table of episodes: restore it, or train anew") from error
-    words = table.select_dtypes(exclude="number").columns
-    return table.assign(**{name: table[name].astype(object).fillna("") for name in words})
+
+
+def _column(cells: Sequence[str]) -> pd.Series:
+    """What a column's cells say, all in the same way."""
+    if all(map(_WHOLE.fullmatch, cells)):
+        return pd.Series([*map(int, cells)], dtype=np.int64 if cells else object)
+    if all(cell == "" or _NUMBER.fullmatch(cell) for cell in cells):
+        return pd.Series([float(cell or "nan") for cell in cells])
+    if {*cells} <= {"True", "False"}:
+        return pd.Series([cell == "True" for cell in cells], dtype=object)
+    return pd.Series(cells, dtype=object)
 
 
 def write_table(path: Path, rows: Rows) -> Path:

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
-import yaml
 from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
 from guiderail.diagrams.register import register_envs
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
+from guiderail.models.yaml_files import parse_yaml
 
 
 def known_tasks() -> list[str]:
@@ -36,12 +36,14 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
     """
     names = []
     for module in modules:
-        path = Path(module)
         try:
+            path = Path(module)
             names.append(_import_file(path) if path.suffix == ".py" else import_module(module).__name__)
-        except (ModuleNotFoundError, FileNotFoundError) as error:
+        except (ModuleNotFoundError, FileNotFoundError, ValueError, TypeError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
-                f"--import takes a module or a file (.py), and there is none for {module!r}: {error}"
+                f"--import takes a module or a file (.py), and there is none for {brief(module)}: {error}"
             ) from None
     register_envs()
     return tuple(names)
@@ -67,7 +69,7 @@ def task_options(task: str) -> dict[str, Any]:
     if task in TASKS.names():
         return check_environment(task, {})
     if task not in known_tasks():
-        raise InputError(f"there is no task {task!r}: {did_you_mean(task, known_tasks())}")
+        raise InputError(f"there is no task {brief(task)}: {did_you_mean(task, known_tasks())}")
     entry = gymnasium.spec(environment_id(task)).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
     taken = inspect.signature(creator).parameters.items()
@@ -87,9 +89,9 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     options = task_options(task)
     for name, value in arguments.items():
         if name not in options:
-            raise InputError(f"{task} has no option {name!r}: {did_you_mean(name, options)}")
+            raise InputError(f"{task} has no option {brief(name)}: {did_you_mean(name, options)}")
         if not _is_like(value, options[name]):
-            raise InputError(f"{task}'s {name} cannot be {value!r}: give a value such as {options[name]!r}")
+            raise InputError(f"{task}'s {name} cannot be {brief(value)}: give a value such as {options[name]!r}")
     given = {name: arguments.get(name, default) for name, default in options.items()}
     return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
 
@@ -106,10 +108,10 @@ def _is_like(value: Any, default: Any) -> bool:
 
 
 def as_value(text: str) -> Any:
-    """A typed value: what YAML reads, and 1e-8 too, which YAML takes for a word."""
+    """A typed value: what YAML reads; what is no YAML is a word."""
     try:
-        return _numbers(yaml.safe_load(text))
-    except yaml.YAMLError:
+        return _numbers(parse_yaml(text))
+    except InputError:
         return text
 
 

@@ -161,7 +161,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         task: the declaration.
         station: where it is done.
         guidance: a diagram with the ports of `Guidance`.
-        render_mode: None, "human" (a browser view) or "rgb_array".
+        render_mode: "rgb_array" exports the picture of the task's camera; a browser view is no part of it.
 
     Raises:
         InputError: if a signal that the task names doesn't exist here, or a port has the wrong size.
@@ -214,7 +214,8 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
         builder.ExportOutput(port, name)
-    meshcat = _add_view(builder, task, station, render_mode)
+    if render_mode == "rgb_array":
+        _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
     return TaskDiagram(
@@ -226,7 +227,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         ledger_fields=SafetyLedger.FIELDS,
         randomize=randomizes(task, station, guidance),
         push=_push(station) if task.pushable else None,
-        meshcat=meshcat,
+        query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
         symmetry=task.symmetry(),
         near_symmetry=task.near_symmetry(),
         declaration=task,
@@ -292,7 +293,9 @@ def assemble_skill(
         builder.ExportOutput(station.GetOutputPort(name), name)
     for name in OUTPUTS:
         builder.ExportOutput(guidance.GetOutputPort(name), name)
-    meshcat = _add_view(builder, task, station, render_mode)
+    meshcat = add_meshcat(builder, station.GetOutputPort("query")) if render_mode == "human" else None
+    if render_mode == "rgb_array":
+        _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(f"{task.name.replace('/', '_')}_skill")
     return SkillDiagram(diagram, station.control_period, task.num_steps, randomizes(task, station, guidance), meshcat)
@@ -339,14 +342,10 @@ def _push(station: Station) -> Any:
     return push
 
 
-def _add_view(builder: DiagramBuilder, task: Task, station: Station, render_mode: str | None) -> Meshcat | None:
-    """Adds a browser view for "human", and for "rgb_array" the task's camera, whose image is exported."""
-    if render_mode == "human":
-        return add_meshcat(builder, station.GetOutputPort("query"))[0]
-    if render_mode == "rgb_array":
-        camera = task.camera()
-        if camera is None:
-            raise InputError(f"{task.name} has no camera: leave render_mode='rgb_array' out")
-        picture = add_camera(builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera)
-        builder.ExportOutput(picture, "rgb_image")
-    return None
+def _add_picture(builder: DiagramBuilder, task: Task, station: Station) -> None:
+    """Adds the task's camera, whose image is exported."""
+    camera = task.camera()
+    if camera is None:
+        raise InputError(f"{task.name} has no camera: leave render_mode='rgb_array' out")
+    picture = add_camera(builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera)
+    builder.ExportOutput(picture, "rgb_image")

@@ -13,6 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from fuzz.changes import edited, edits
 from fuzz.tally import attempt
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
@@ -100,22 +101,6 @@ def test_arrays_of_any_kind_and_shape(folder, arrays, compressed):
     loaded = attempt("npz, arrays", InputError, lambda: Demonstrations.load(path))
     if loaded is not None:
         same(loaded, npz_demonstrations(path))
-
-
-@st.composite
-def edits(draw, most=6):
-    """Changes to a sequence: where, how much is taken out, and what comes in."""
-    return [
-        (draw(st.floats(0, 1)), draw(st.sampled_from([0, 0, 1, 1, 2, 4, 8, 50])), draw(st.binary(max_size=8)))
-        for _ in range(draw(st.integers(1, most)))
-    ]
-
-
-def edited(data: bytes, changes) -> bytes:
-    for where, out, into in changes:
-        at = int(where * len(data))
-        data = data[:at] + into + data[at + out :]
-    return data
 
 
 def archive(compression) -> bytes:

@@ -1,13 +1,14 @@
 """Changes the safety code one place at a time, and asks whether a test notices.
 
-    python tests/mutation/mutate.py                         # everything, about an hour
+    python tests/mutation/mutate.py                         # everything, some hours
+    python tests/mutation/mutate.py --every 8               # an eighth of it, chosen by hashes of the mutants' names
     python tests/mutation/mutate.py step least_norm         # these files
     python tests/mutation/mutate.py --results mutants.json  # goes on where it was stopped
 
 Every operator below is applied at every place of a file that it fits: comparisons, arithmetic, logic, numbers,
 branches, statements, calls that have a counterpart, slices, keyword arguments. A mutant is tried by the tests that
-execute its line, the quickest first. One that no test notices survives: `survivors.md` says of each why that makes no
-difference, and a survivor that it does not name is an error.
+execute its line, the quickest first. One that no test notices survives: `survivors.yaml` says of each why that makes no
+difference. A survivor that it does not name is an error, and so is a name in it that no mutant has or that is killed.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import hashlib
 import importlib
 import importlib.abc
 import importlib.util
@@ -22,32 +24,51 @@ import json
 import os
 import resource
 import sys
+import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import yaml
+
 ROOT = Path(__file__).parents[2]
 PRIMITIVES = ["tests/models/primitives"]
 SKILLS = ["tests/models/skills"]
 TARGETS = {
-    "models/primitives/least_norm.py": PRIMITIVES,
-    "models/primitives/step.py": PRIMITIVES,
-    "models/primitives/lc_ns_kmp.py": PRIMITIVES,
-    "models/primitives/constraints.py": PRIMITIVES,
-    "models/primitives/gains.py": PRIMITIVES,
-    "models/primitives/features.py": PRIMITIVES,
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("least_norm", "step", "lc_ns_kmp", "constraints")},
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp", "mixture")},
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "arrays", "demonstrations")},
     "models/skills/active_constraints.py": SKILLS,
     "models/skills/skill.py": SKILLS,
     "models/skills/geometry.py": SKILLS,
     "models/keep_out.py": ["tests/models/test_keep_out.py", "tests/models/test_keep_out_properties.py"],
-    "models/cartesian_impedance.py": ["tests/models/test_cartesian_impedance.py"],
+    "models/cartesian_impedance.py": [
+        "tests/models/test_cartesian_impedance.py",
+        "tests/models/test_cartesian_impedance_law.py",
+    ],
+    **{
+        f"systems/{path.name}": [f"tests/systems/test_{path.name}"]
+        for path in sorted((ROOT / "systems").glob("*.py"))
+        if path.stem != "__init__"
+    },
+    "systems/support/command_watch.py": [
+        "tests/systems/test_command_watchdog.py",
+        "tests/systems/test_torque_guard.py",
+    ],
 }
-SURVIVORS = ROOT / "tests" / "mutation" / "survivors.md"
+SURVIVORS = ROOT / "tests" / "mutation" / "survivors.yaml"
 # Imported once, before a process is forked for each mutant: what takes seconds and is never mutated.
 HEAVY = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
 HEAVY += ("scipy.optimize", "scipy.sparse", "scipy.spatial.transform", "sklearn.mixture", "yaml", "matplotlib.figure")
+HEAVY += (
+    "pydrake.multibody.plant",
+    "pydrake.systems.analysis",
+    "pydrake.systems.framework",
+    "pydrake.systems.primitives",
+)
 
 
 # --- what is changed ---
@@ -156,6 +177,9 @@ def _with(node: ast.AST, **fields) -> ast.AST:
     return other
 
 
+Path_ = tuple[tuple[str, int | None], ...]
+
+
 @dataclass(frozen=True)
 class Mutant:
     """One change of one file; `name` says which, whatever its line number is."""
@@ -164,7 +188,18 @@ class Mutant:
     name: str
     line: int
     last_line: int
-    tree: ast.Module
+    path: Path_
+    change: int
+
+    def tree(self) -> ast.Module:
+        """The file with the change."""
+        tree = ast.parse((ROOT / self.file).read_text())
+        _replace(tree, self.path, list(changes(_at(tree, self.path)))[self.change])
+        return ast.fix_missing_locations(tree)
+
+    def is_in_sample(self, every: int) -> bool:
+        """Whether it is one of a part of all, which is the same wherever and whenever."""
+        return int.from_bytes(hashlib.sha256(f"{self.file}: {self.name}".encode()).digest()[:8], "big") % every == 0
 
 
 def mutants(file: str) -> list[Mutant]:
@@ -172,22 +207,18 @@ def mutants(file: str) -> list[Mutant]:
     tree = ast.parse((ROOT / file).read_text())
     found, seen = [], Counter()
     for path in list(_places(tree)):
-        for i in range(len(list(changes(_at(tree, path))))):
-            mutated = copy.deepcopy(tree)
-            node = _at(mutated, path)
-            before = _statement(tree, path)
-            _replace(mutated, path, list(changes(node))[i])
-            ast.fix_missing_locations(mutated)
-            after = _statement(mutated, path)
-            name = f"{_function(tree, path)}: {_difference(_said(before), _said(after))}"
+        for i, _ in enumerate(changes(_at(tree, path))):
+            depth = _depth_of_statement(tree, path)
+            before = _at(tree, path[:depth])
+            mutated = ast.Module([copy.deepcopy(before)], [])
+            inside = (("body", 0), *path[depth:])
+            _replace(mutated, inside, list(changes(_at(mutated, inside)))[i])
+            name = f"{_function(tree, path)}: {_difference(_said(before), _said(mutated.body[0]))}"
             seen[name] += 1
             if seen[name] > 1:
                 name += f" ({seen[name]})"
-            found.append(Mutant(file, name, before.lineno, before.end_lineno or before.lineno, mutated))
+            found.append(Mutant(file, name, before.lineno, before.end_lineno or before.lineno, path, i))
     return found
-
-
-Path_ = tuple[tuple[str, int | None], ...]
 
 
 def _places(node: ast.AST, path: Path_ = ()) -> Iterator[Path_]:
@@ -222,9 +253,9 @@ def _replace(tree: ast.Module, path: Path_, new: ast.AST | None) -> None:
         getattr(holder, field)[i] = new
 
 
-def _statement(tree: ast.Module, path: Path_) -> ast.stmt:
-    """The innermost statement around a place."""
-    return next(node for n in range(len(path), -1, -1) if isinstance(node := _at(tree, path[:n]), ast.stmt))
+def _depth_of_statement(tree: ast.Module, path: Path_) -> int:
+    """How long the path to the innermost statement around a place is."""
+    return next(n for n in range(len(path), -1, -1) if isinstance(_at(tree, path[:n]), ast.stmt))
 
 
 def _said(statement: ast.stmt) -> str:
@@ -272,27 +303,27 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def exec_module(self, module):
         module.__file__ = str(ROOT / self.mutant.file)
-        exec(compile(self.mutant.tree, module.__file__, "exec"), module.__dict__)
+        exec(compile(self.mutant.tree(), module.__file__, "exec"), module.__dict__)
 
 
 class _Coverage:
-    """Which tests execute which lines of a file, and how long each takes."""
+    """Which tests execute which lines of the files that can be changed, and how long each takes."""
 
-    def __init__(self, file: str):
-        self.file = str(ROOT / file)
-        self.own: dict[object, bool] = {}
-        self.lines: dict[str, set[int]] = defaultdict(set)
+    def __init__(self):
+        self.files = {str(ROOT / file): file for file in TARGETS}
+        self.own: dict[object, str | None] = {}
+        self.lines: dict[str, dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
         self.seconds: dict[str, float] = defaultdict(float)
         self.test = ""
 
     def trace(self, frame, event, argument):
         code = frame.f_code
         if code not in self.own:
-            self.own[code] = os.path.realpath(code.co_filename) == self.file
+            self.own[code] = self.files.get(os.path.realpath(code.co_filename))
         return self._line if self.own[code] else None
 
     def _line(self, frame, event, argument):
-        self.lines[self.test].add(frame.f_lineno)
+        self.lines[self.own[frame.f_code]][self.test].add(frame.f_lineno)
         return self._line
 
     def pytest_runtest_logstart(self, nodeid):
@@ -312,96 +343,112 @@ def _pytest(arguments: list[str], plugins=()) -> int:
     return int(pytest.main([*quiet, *arguments], plugins=list(plugins)))
 
 
-def _forked(work, cpu_seconds: float) -> tuple[int, str]:
-    """Runs `work` in a process of its own, silent and limited; its exit status, and what it returned as text."""
-    reader, writer = os.pipe()
+def _forked(work, cpu_seconds: float) -> int:
+    """Runs `work` in a process of its own, silent and limited; the exit status that it returns."""
     child = os.fork()
     if child == 0:
-        os.close(reader)
         silent = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silent, 1)
         os.dup2(silent, 2)
         resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_seconds), int(cpu_seconds) + 5))
         resource.setrlimit(resource.RLIMIT_AS, (8 * 2**30, 8 * 2**30))
-        status, text = 3, ""
+        status = 3
         try:
-            status, text = work()
+            status = work()
         finally:
-            os.write(writer, text.encode()) if len(text) < 60_000 else None
             os._exit(status)
-    os.close(writer)
-    with os.fdopen(reader) as pipe:
-        text = pipe.read()
     _, status = os.waitpid(child, 0)
-    return os.waitstatus_to_exitcode(status), text
+    return os.waitstatus_to_exitcode(status)
 
 
-def coverage(file: str, tests: list[str], store: Path) -> tuple[dict[str, list[int]], dict[str, float]]:
-    """Lines and CPU seconds of each test, measured with nothing changed."""
+def coverage(tests: list[str], store: Path) -> dict:
+    """The lines of each file that each test executes, and each test's CPU seconds, with nothing changed.
 
-    def work():
-        watcher = _Coverage(file)
-        status = _pytest(tests, [watcher])
-        lines = {test: sorted(found) for test, found in watcher.lines.items()}
-        store.write_text(json.dumps({"lines": lines, "seconds": watcher.seconds}))
-        return status, ""
+    It is measured once for tests that several files share; `store` keeps it, as this takes longer than many mutants.
+    """
+    key = f"{' '.join(tests)} {_newest(tests)}"
+    kept = json.loads(store.read_text()) if store.exists() else {}
+    if key not in kept:
 
-    status, _ = _forked(work, 3600)
-    if status != 0:
-        raise SystemExit(f"the tests of {file} fail without any change (status {status}): mend them first")
-    measured = json.loads(store.read_text())
-    store.unlink()
-    return measured["lines"], measured["seconds"]
+        def work():
+            watcher = _Coverage()
+            status = _pytest(tests, [watcher])
+            lines = {file: {test: sorted(n) for test, n in of.items()} for file, of in watcher.lines.items()}
+            store.write_text(json.dumps(kept | {key: {"lines": lines, "seconds": watcher.seconds}}))
+            return status
+
+        status = _forked(work, 3600)
+        if status != 0:
+            raise SystemExit(f"{' '.join(tests)} fails without any change (status {status}): mend it first")
+        kept = json.loads(store.read_text())
+    return kept[key]
 
 
-def survives(mutant: Mutant, lines: dict[str, list[int]], seconds: dict[str, float], tests: list[str]) -> bool:
+def _newest(tests: list[str]) -> float:
+    """When what the tests are made of, or what they test, was last changed."""
+    places = [ROOT / test for test in tests] + [ROOT / file for file in TARGETS]
+    files = [file for place in places for file in (place.rglob("*.py") if place.is_dir() else [place])]
+    return max(file.stat().st_mtime for file in files)
+
+
+def survives(mutant: Mutant, covered: dict) -> bool:
     """True if every test passes that executes the changed line."""
-    here = range(mutant.line, mutant.last_line + 1)
-    chosen = [test for test in seconds if any(line in here for line in lines.get(test, ()))]
-    # What is executed on import, such as a default or a constant, belongs to no test: any may notice.
+    here, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
+    lines = covered["lines"].get(mutant.file, {})
+    chosen = {test for test in seconds if any(line in here for line in lines.get(test, ()))}
+    # Of a fixture that several tests share only the first executes the line; what is executed on import, such as a
+    # default or a constant, belongs to no test at all.
+    chosen |= {test for test in seconds if Path(test.split("::")[0]).stem == f"test_{Path(mutant.file).stem}"}
     chosen = sorted(chosen or seconds, key=lambda test: seconds[test])
     limit = 10 + 5 * sum(seconds[test] for test in chosen)
 
     def work():
         sys.meta_path.insert(0, _Mutated(mutant))
-        return _pytest(chosen), ""
+        return _pytest(chosen)
 
-    status, _ = _forked(work, limit)
-    return status == 0
+    return _forked(work, limit) == 0
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("files", nargs="*", help="names of files, without .py; all unless given")
+    parser.add_argument("--every", type=int, default=1, help="try one of so many mutants")
     parser.add_argument("--results", type=Path, help="a JSON file that keeps what was tried")
     parser.add_argument("--again", action="store_true", help="try those again that survived")
     arguments = parser.parse_args()
     os.chdir(ROOT)
     for name in HEAVY:
         importlib.import_module(name)
-    tried = json.loads(arguments.results.read_text()) if arguments.results and arguments.results.exists() else {}
-    explained = SURVIVORS.read_text() if SURVIVORS.exists() else ""
-    unexplained, total, killed = 0, 0, 0
-    for file, tests in TARGETS.items():
-        if arguments.files and Path(file).stem not in arguments.files:
+    with tempfile.TemporaryDirectory() as folder:
+        results = arguments.results.absolute() if arguments.results else Path(folder) / "mutants.json"
+        files = [file for file in TARGETS if not arguments.files or Path(file).stem in arguments.files]
+        wrong, total, killed = np.sum([try_file(file, arguments.every, results, arguments.again) for file in files], 0)
+    print(f"together: {killed} of {total} killed ({killed / max(total, 1):.1%}); {wrong} to be explained or mended")
+    return min(int(wrong), 1)
+
+
+def try_file(file: str, every: int, kept: Path, again: bool) -> tuple[int, int, int]:
+    """How many of a file's survivors are unexplained or wrongly explained, how many were tried and how many killed."""
+    tried = json.loads(kept.read_text()) if kept.exists() else {}
+    results, reasons = tried.setdefault(file, {}), yaml.safe_load(SURVIVORS.read_text()).get(file, {})
+    everything = mutants(file)
+    found = [mutant for mutant in everything if mutant.is_in_sample(every)]
+    for mutant in found:
+        if mutant.name in results and not (again and results[mutant.name] == "survived"):
             continue
-        results = tried.setdefault(file, {})
-        found = mutants(file)
-        waiting = [m for m in found if m.name not in results or (arguments.again and results[m.name] == "survived")]
-        if waiting:
-            lines, seconds = coverage(file, tests, Path(f"{arguments.results or 'mutants'}.coverage"))
-        for mutant in waiting:
-            results[mutant.name] = "survived" if survives(mutant, lines, seconds, tests) else "killed"
-            if results[mutant.name] == "survived" and mutant.name not in explained:
-                print(f"{file}:{mutant.line}: {mutant.name}", flush=True)
-            if arguments.results:
-                arguments.results.write_text(json.dumps(tried, indent=1, ensure_ascii=False))
-        survivors = [mutant for mutant in found if results[mutant.name] == "survived"]
-        new = [mutant for mutant in survivors if mutant.name not in explained]
-        unexplained, total, killed = unexplained + len(new), total + len(found), killed + len(found) - len(survivors)
-        print(f"{file}: {len(found) - len(survivors)} of {len(found)} killed, {len(new)} unexplained", flush=True)
-    print(f"together: {killed} of {total} killed ({killed / max(total, 1):.1%}), {unexplained} survivors unexplained")
-    return min(unexplained, 1)
+        covered = coverage(TARGETS[file], kept.with_suffix(".coverage"))
+        results[mutant.name] = "survived" if survives(mutant, covered) else "killed"
+        if results[mutant.name] == "survived" and mutant.name not in reasons:
+            print(f"{file}:{mutant.line}: survives: {mutant.name}", flush=True)
+        kept.write_text(json.dumps(tried, indent=1, ensure_ascii=False))
+    survivors = {mutant.name for mutant in found if results[mutant.name] == "survived"}
+    killed = {mutant.name for mutant in found} - survivors
+    stale = (set(reasons) - {mutant.name for mutant in everything}) | (killed & set(reasons))
+    for name in sorted(stale):
+        print(f"{file}: explained, but no survivor: {name}", flush=True)
+    known = len(survivors & set(reasons))
+    print(f"{file}: {len(killed)} of {len(found)} killed, {known} explained, {len(survivors) - known} not", flush=True)
+    return len(survivors) - known + len(stale), len(found), len(killed)
 
 
 if __name__ == "__main__":

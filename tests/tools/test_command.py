@@ -205,7 +205,17 @@ def test_any_option_of_an_environment_can_be_trained_with(capsys, tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("1e-8", 1e-8), ("[0, 1]", (0, 1)), ("[1e3, 2]", (1000.0, 2)), ("true", True), ("arm", "arm"), ("null", None)],
+    [
+        ("1e-8", 1e-8),
+        ("[0, 1]", (0, 1)),
+        ("[1e3, 2]", (1000.0, 2)),
+        ("true", True),
+        ("arm", "arm"),
+        ("null", None),
+        ("2001-99-99", "2001-99-99"),
+        ("a: b: c", "a: b: c"),
+        ("[" * 99, "[" * 99),
+    ],
 )
 def test_values_are_read_as_what_they_are(text, value):
     read = as_value(text)

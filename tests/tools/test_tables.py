@@ -42,3 +42,20 @@ def test_the_readable_table_says_the_same(tmp_path):
     markdown = write_table(tmp_path / "t", pd.DataFrame({"a_b": [0.123456, 2], "c": ["x", None]}).astype(object))
     assert markdown.read_text().splitlines() == ["| a b | c |", "| --- | --- |", "| 0.1235 | x |", "| 2 | – |"]
     assert read_table(tmp_path / "t.csv")["a_b"].tolist() == [0.123456, 2]
+
+
+def test_a_column_is_of_numbers_only_if_python_reads_each_as_one(tmp_path):
+    (tmp_path / "t.csv").write_text("a,b,c,d\n1,0x10,True,1e400\n,2,False,-inf\n", encoding="utf-8")
+    table = read_table(tmp_path / "t.csv")
+    assert table["a"].tolist()[0] == 1.0
+    assert math.isnan(table["a"][1])
+    assert table["b"].tolist() == ["0x10", "2"]
+    assert table["c"].tolist() == [True, False]
+    assert table["d"].tolist() == [math.inf, -math.inf]
+
+
+@pytest.mark.parametrize("text", ["", "a,a\n1,2\n", ",b\n1,2\n", "a,b\n1\n", 'a\n"1\n', "a\n" + "1" * 200_000 + "\n"])
+def test_what_is_no_table_is_refused(text, tmp_path):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(InputError, match="not a table"):
+        read_table(tmp_path / "t.csv")

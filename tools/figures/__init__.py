@@ -1,6 +1,9 @@
 """Figures and a table of the thesis, made anew: each a picture and a table with the numbers behind it."""
 
 import inspect
+import json
+import shlex
+import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -9,6 +12,7 @@ from typing import Any
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 from guiderail.tools.figures.thesis import THESIS
+from guiderail.tools.files import write_atomically
 
 # What makes each figure; imported when asked for, so that a list of figures costs nothing.
 FIGURES = {
@@ -31,7 +35,8 @@ def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: 
             share runs share them.
 
     Returns:
-        `figure`, `picture`, `table`, what the numbers say, claim by claim, and what the thesis says.
+        `figure`, `picture`, `table`, what the numbers say, claim by claim, and what the thesis says. That is also left
+        as JSON beside the table, with the command and the time it took, for `guiderail results`.
 
     Raises:
         InputError: for an unknown figure or a number out of range.
@@ -46,8 +51,24 @@ def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: 
     make = find_figure(number)
     given: dict[str, Any] = {"seeds": seeds, "episodes": episodes}
     taken = inspect.signature(make).parameters
-    found = make(out, **{k: v for k, v in given.items() if k in taken and v is not None})
-    return {"figure": number, **found, "the thesis": THESIS[number]}
+    given = {k: v for k, v in given.items() if k in taken and v is not None}
+    started = time.perf_counter()
+    found = {"figure": number, **make(out, **given), "the thesis": THESIS[number]}
+    words = [f"guiderail reproduce {number!r}" if " " in number else f"guiderail reproduce {number}"]
+    command = " ".join(words + [f"--{key} {value}" for key, value in given.items()])
+    left = {
+        "command": command,
+        "seconds": round(time.perf_counter() - started, 1),
+        "seeds": given.get("seeds"),
+        **found,
+    }
+    write_atomically(out / f"{FIGURES[number]}.json", json.dumps(left, indent=1, default=str).encode() + b"\n")
+    return found
+
+
+def command_of(number: str) -> str:
+    """The command that makes a figure as it is."""
+    return f"guiderail reproduce {shlex.quote(number)}"
 
 
 def find_figure(number: str) -> Callable[..., dict[str, Any]]:

@@ -1,6 +1,5 @@
 """All that a run needs to go on as if it had never stopped, in one file that holds no code."""
 
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from guiderail.models.digest import digest
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 
@@ -18,7 +18,7 @@ def save_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], values: Mappin
     """Writes arrays and JSON values with a digest of both; a run killed while writing keeps its last checkpoint."""
     arrays = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
     text = json.dumps(values)
-    write_atomically(path, save(arrays, {"values": text, "digest": _digest(arrays, text)}))
+    write_atomically(path, save(arrays, {"values": text, "digest": digest(arrays, text)}))
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -34,19 +34,10 @@ def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             metadata = file.metadata()
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (it is no dictionary)
         text = metadata["values"]
-        if metadata["digest"] != _digest(arrays, text):
+        if metadata["digest"] != digest(arrays, text):
             raise ValueError("the digest differs")
         return arrays, json.loads(text)
-    except (SafetensorError, ValueError, KeyError, TypeError, OSError) as error:
+    except (SafetensorError, ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         raise InputError(
             f"the checkpoint {path} is damaged: restore a copy, or start anew in another folder"
         ) from error
-
-
-def _digest(arrays: Mapping[str, np.ndarray], text: str) -> str:
-    """A digest of names, types, shapes and contents."""
-    digest = hashlib.blake2b(text.encode())
-    for key in sorted(arrays):
-        digest.update(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode())
-        digest.update(arrays[key].tobytes())
-    return digest.hexdigest()

@@ -8,6 +8,7 @@ group `guiderail.learners`.
 
 import copy
 import inspect
+import json
 import random
 from collections.abc import Mapping
 from typing import Any
@@ -325,7 +326,7 @@ class OffPolicyLearner(Learner):
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Becomes what it was when `state` was called. KeyError, ValueError or RuntimeError where it does not fit."""
+        """Becomes what it was when `state` was called; raises something, a ValueError at last, where that can't be."""
         arrays, values = older.checkpoint(arrays, values)
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
         for name, module in self._modules().items():
@@ -357,6 +358,14 @@ class OffPolicyLearner(Learner):
         version, state, gauss = values["python"]
         random.setstate((version, tuple(state), gauss))
         self.random.bit_generator.state = values["own"]
+        self._check_restored(arrays, values)
+
+    def _check_restored(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Raises a ValueError if it is not what it should have become: some of that has no place here, or no sense."""
+        found, known = self.state()
+        different = {key for key in {*found, *arrays} if _bits(found.get(key)) != _bits(arrays.get(key))}
+        if different or json.dumps(known, sort_keys=True) != json.dumps(values, sort_keys=True):
+            raise ValueError(f"this learner has another {', '.join(sorted(different)) or 'state'}")
 
     def _entropy(self) -> Any:
         """The logarithm of the entropy's coefficient where it is learned."""
@@ -365,6 +374,11 @@ class OffPolicyLearner(Learner):
     @staticmethod
     def _buffer_names() -> tuple[str, ...]:
         return ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+def _bits(array: np.ndarray | None) -> tuple[Any, ...]:
+    """What two arrays have in common that are the same; files know no number without a dimension."""
+    return () if array is None else (np.atleast_1d(array).shape, array.dtype, array.tobytes())
 
 
 class SacLearner(OffPolicyLearner):

@@ -1,13 +1,14 @@
 """How a learner learns: named settings, the thesis's and our own, and single ones replaced."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.dataclasses import dataclass
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.older import SETTINGS as OLDER
@@ -15,33 +16,46 @@ from guiderail.tools.learning.older import SETTINGS as OLDER
 
 def _usable_entropy(entropy: str) -> str:
     initial = entropy.removeprefix("auto").removeprefix("_")
-    if entropy != "auto" and not float(initial) > 0:
+    if entropy != "auto" and not 0 < float(initial) < math.inf:
         raise ValueError("it is auto, auto_<initial value> or a positive number")
     return entropy
 
 
-Count = Annotated[int, Field(ge=1)]
-Least = Annotated[int, Field(ge=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
-Factor = Annotated[float, Field(gt=0, le=1)]
+def _no_truth(value: Any) -> Any:
+    """True is no number."""
+    if isinstance(value, bool):
+        raise ValueError("it is a number")
+    return value
+
+
+# What takes memory or time is bounded by what no machine has.
+Count = Annotated[int, Field(ge=1, le=10**9), BeforeValidator(_no_truth)]
+Batch = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(_no_truth)]
+Width = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(_no_truth)]
+Least = Annotated[int, Field(ge=0, le=10**9), BeforeValidator(_no_truth)]
+Share = Annotated[float, Field(ge=0, le=1), BeforeValidator(_no_truth)]
+Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(_no_truth)]
+Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(_no_truth)]
 Entropy = Annotated[str, BeforeValidator(str), AfterValidator(_usable_entropy)]
 Units = Annotated[
-    tuple[Count, ...], Field(min_length=1), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
+    tuple[Width, ...],
+    Field(min_length=1, max_length=20),
+    BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v),
 ]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Preset:
     """How a learner learns. A decision is one action of the policy; it lasts `hold` control steps."""
 
     algorithm: str = "tqc"  # a learner's name
-    learning_rate: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3e-4  # of actor, critics and entropy
+    learning_rate: Rate = 3e-4  # of actor, critics and entropy
     discount: Factor = 0.995  # of one control step, so that it means the same whatever the hold, or of one decision
     discount_of: Literal["control_step", "decision"] = "control_step"  # what the discount is of
     soft_update: Factor = 0.02  # how far the target critics follow at each gradient step
     train_every: Count = 8  # decisions between two trainings
     gradient_steps: Count = 24  # in one training
-    batch_size: Count = 64  # decisions
+    batch_size: Batch = 64  # decisions
     n_steps: Count = 1  # decisions after which a return is guessed, and until which it is known
     buffer_size: Count = 1_000_000  # decisions that are remembered
     learning_starts: Count = 100  # decisions, uniformly random, before the first training
@@ -125,7 +139,7 @@ def resolve_preset(name: str, algorithm: str, settings: Mapping[str, Any] | None
         InputError: for an unknown preset, algorithm or setting, or a value out of range.
     """
     if name not in PRESETS:
-        raise InputError(f"there is no preset {name!r}: {did_you_mean(name, PRESETS)}")
+        raise InputError(f"there is no preset {brief(name)}: {did_you_mean(name, PRESETS)}")
     LEARNERS.get(algorithm)
     known = {field.name for field in fields(Preset)} - {"algorithm"}
     values = asdict(PRESETS[name]) | {"algorithm": algorithm}
@@ -133,13 +147,12 @@ def resolve_preset(name: str, algorithm: str, settings: Mapping[str, Any] | None
         if key in OLDER:
             raise InputError(f"the setting {key!r} is called {OLDER[key]!r}: give that")
         if key not in known:
-            raise InputError(f"a learner has no setting {key!r}: {did_you_mean(key, known)}")
+            raise InputError(f"a learner has no setting {brief(key)}: {did_you_mean(key, known)}")
         values[key] = value
     try:
         return Preset(**values)
     except ValidationError as error:
         wrong = error.errors()[0]
         key, example = str(wrong["loc"][0]), getattr(PRESETS[name], str(wrong["loc"][0]))
-        raise InputError(
-            f"the learner's {key} cannot be {values[key]!r} ({wrong['msg'].lower()}): give a value such as {example!r}"
-        ) from None
+        said = f"the learner's {key} cannot be {brief(values[key])} ({wrong['msg'].lower()})"
+        raise InputError(f"{said}: give a value such as {example!r}") from None

@@ -11,13 +11,15 @@ from typing import Annotated, Any
 import filelock
 import pandas as pd
 import yaml
-from pydantic import Field
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from guiderail.models.errors import InputError
+from guiderail.models.yaml_files import load_yaml
 from guiderail.tools.files import remove_parts, write_atomically
 from guiderail.tools.learning import older
 from guiderail.tools.learning.presets import Preset
+from guiderail.tools.rollouts.metrics import checked_rows
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import check_environment, import_modules
 
@@ -26,7 +28,7 @@ PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stabl
 LOCK = ".lock"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class RunConfig:
     """Everything that decides how a run goes, resolved: the same file gives the same run."""
 
@@ -34,8 +36,8 @@ class RunConfig:
     environment: dict[str, Any]  # arguments of gymnasium.make
     learner: Preset  # every setting
     preset: str  # the learner's settings started from it
-    episodes: Annotated[int, Field(ge=1)]  # how many in all
-    seed: Annotated[int, Field(ge=0)]  # of everything random
+    episodes: Annotated[int, Field(ge=1, le=10**9, strict=True)]  # how many in all
+    seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # of everything random
     versions: dict[str, str] = field(default_factory=dict)  # that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
     ledger: bool = True  # whether every control step is written down
@@ -148,13 +150,15 @@ class RunFolder:
                 f"{self.path} is not a run: it has no config.yaml; give a folder that guiderail train made"
             )
         try:
-            values = yaml.safe_load(file.read_text(encoding="utf-8"))
+            values = load_yaml(file, "configuration")
             # A setting that did not exist yet was off, as its default is, whatever the preset has become since.
             values["learner"] = Preset(**(asdict(Preset()) | older.settings(values["learner"])))
             values["environment"] = as_arguments(values["environment"])
             values.setdefault("ledger", False)
             config = RunConfig(**values)
-        except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{file} is damaged or of another version: restore it, or train anew") from error
         import_modules(config.imports)
         return config
@@ -169,7 +173,7 @@ class RunFolder:
         Raises:
             InputError: if the file is missing or no such table.
         """
-        return read_table(self.path / "episodes.csv")
+        return checked_rows(read_table(self.path / "episodes.csv"), self.path / "episodes.csv")
 
 
 def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:

@@ -122,15 +122,19 @@ def _resume(folder: RunFolder, learner: Learner, env: Any) -> list[dict[str, Any
     if not folder.checkpoint.exists() and not table.exists():
         return []  # it was killed in its first episode
     arrays, values = load_checkpoint(folder.checkpoint)
-    rows = values["rows"]
-    written = folder.episodes() if table.exists() else []
-    if table_text(written) != table_text(rows[: len(written)]):
-        raise InputError(f"{table} is not the table of its checkpoint: restore it, or remove it to have it rewritten")
     try:
+        rows = values["rows"]
+        written = folder.episodes() if table.exists() else []
+        if table_text(written) != table_text(rows[: len(written)]):
+            raise InputError(
+                f"{table} is not the table of its checkpoint: restore it, or remove it to have it rewritten"
+            )
         learner.restore(arrays, values["learner"])
-    except (KeyError, ValueError, RuntimeError) as error:
+        env.unwrapped.np_random.bit_generator.state = values["environment"]
+    except InputError:
+        raise
+    except Exception as error:  # its digest says that it was written so, and not what was written
         raise InputError(
             f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
         ) from error
-    env.unwrapped.np_random.bit_generator.state = values["environment"]
     return rows

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.trace import Trace, mean_jerk
+from guiderail.models.errors import InputError
 
 TOLERANCE = 1e-9  # what a primitive keeps its bounds to; below it there is only rounding
 
@@ -94,6 +96,25 @@ def episode_row(episode: Episode) -> dict[str, Any]:
     """An episode's row: every column, and each of the reward's terms as `reward_<term>`."""
     row = {column.name: column.of(episode) for column in COLUMNS}
     return row | {f"reward_{name}": value for name, value in episode.terms.items()}
+
+
+COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturations", "fallbacks")
+
+
+def checked_rows(rows: pd.DataFrame, where: Path) -> pd.DataFrame:
+    """A table of episodes that was read from somewhere.
+
+    Raises:
+        InputError: if a column but `termination` holds words, or one that counts no whole numbers.
+    """
+    words = [name for name in rows if name != "termination" and not pd.api.types.is_numeric_dtype(rows[name])]
+    parts = [name for name in COUNTS if name in rows and name not in words and not (rows[name] % 1 == 0).all()]
+    wrong = [*(words if len(rows) else ()), *parts]
+    if not wrong and "success" in rows and not rows["success"].isin([0, 1]).all():
+        wrong = ["success"]
+    if wrong:
+        raise InputError(f"{where} has no number of {wrong[0]} for every episode: restore it, or train anew")
+    return rows
 
 
 def first_in_a_row(good: Iterable[bool], number: int) -> int | None:
@@ -192,5 +213,12 @@ STATISTICS = {metric.name: metric for metric in _STATISTICS}
 
 
 def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "") -> dict[str, Any]:
-    """Statistics of episodes by name, each name with `prefix`; None where there are no episodes."""
-    return {prefix + name: STATISTICS[name].of(rows) if len(rows) else None for name in names}
+    """Statistics of episodes by name, each name with `prefix`; None where there are no episodes.
+
+    Raises:
+        InputError: if the episodes lack a number that a statistic is of.
+    """
+    try:
+        return {prefix + name: STATISTICS[name].of(rows) if len(rows) else None for name in names}
+    except KeyError as error:
+        raise InputError(f"these episodes are of another version: they have no {error.args[0]}; train anew") from error

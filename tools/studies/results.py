@@ -1,14 +1,17 @@
-"""`guiderail results`: pages of what was reproduced, from the tables that studies left."""
+"""`guiderail results`: a page of what was reproduced, from what studies and figures left."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from guiderail.models.errors import InputError
+from guiderail.tools.figures import FIGURES as MADE
 from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.files import write_atomically
 from guiderail.tools.rollouts.metrics import TOLERANCE
@@ -26,38 +29,79 @@ FIGURES = {
     "pouring_sac": ("3.5", "3.7", "3.8"),
     "pouring_tqc": ("3.6", "3.8"),
 }
+# Of what `guiderail reproduce` leaves: the rest are claims.
+NO_CLAIM = ("figure", "the thesis", "command", "seconds", "seeds", "condition")
 COLUMNS = (
     "method", "after", "judged on", "each seed, held out", "converged after, each seed", "worst command",
     "collisions in training", "hours",
 )  # fmt: skip
 
 
-def write_results(studies: Sequence[Path], out: Path) -> Path:
-    """Takes the tables of studies into a folder, and writes its README.md anew from all that are there.
+def write_results(folders: Sequence[Path], out: Path) -> Path:
+    """Takes what studies and figures left into a folder, and writes its README.md anew from all that is there.
 
     Args:
-        studies: folders of studies that come along; none to write the page anew only.
-        out: the folder with a table for each study.
+        folders: of studies that come along, or of what `guiderail reproduce` left; none to write the page anew only.
+        out: the folder with a table for each study and a JSON file for each figure.
 
     Raises:
-        InputError: if a folder holds no table of a study that comes along, or there is nothing to write of.
+        InputError: if a folder holds neither, or there is nothing to write of.
     """
-    for folder in studies:
-        found = [folder / f"{name}.csv" for name in shipped_studies() if (folder / f"{name}.csv").is_file()]
-        if not found:
-            raise InputError(f"{folder} holds no table of a study: give a folder that guiderail study finished")
-        for file in found:
+    for folder in folders:
+        finished = [folder / f"{name}.csv" for name in shipped_studies() if (folder / f"{name}.csv").is_file()]
+        figures = [folder / f"{name}.json" for name in MADE.values() if (folder / f"{name}.json").is_file()]
+        if not finished and not figures:
+            raise InputError(
+                f"{folder} holds no table of a study and no figure: give a folder that guiderail study or guiderail "
+                "reproduce finished"
+            )
+        for file in finished:
             write_atomically(out / file.name, table_text(read_table(file)).encode())
-    tables = {file.stem: file for file in sorted(out.glob("*.csv")) if file.stem in shipped_studies()}
-    if not tables:
-        raise InputError(f"there is no table of a study in {out}: name folders of studies")
-    parts = [_study(name, read_table(file)) for name, file in tables.items()]
+        for file in figures:
+            write_atomically(out / file.name, json.dumps(_figure(file), indent=1).encode() + b"\n")
+    tables = {file.stem: read_table(file) for file in sorted(out.glob("*.csv")) if file.stem in shipped_studies()}
+    made = {number: _figure(out / f"{name}.json") for number, name in MADE.items() if (out / f"{name}.json").is_file()}
+    if not tables and not made:
+        raise InputError(f"there is no table of a study and no figure in {out}: name folders of them")
     head = (
-        "# What was reproduced\n\nWritten by `guiderail results`, from the table beside it for each study. In "
-        "simulation;\nevery seed by itself; held-out episodes are ones that training never drew.\n"
+        "# What was reproduced\n\nWritten by `guiderail results`, from the tables and the figures' numbers beside it. "
+        "In simulation;\nevery seed by itself; held-out episodes are ones that training never drew.\n"
     )
-    write_atomically(out / "README.md", "\n".join([head, *parts]).encode())
+    parts = [head, _figures(made, [*tables]), *(_study(name, rows) for name, rows in tables.items())]
+    write_atomically(out / "README.md", "\n".join(parts).encode())
     return out / "README.md"
+
+
+def _figure(file: Path) -> dict[str, Any]:
+    """What `guiderail reproduce` left of a figure, without where its picture and its table are on some machine."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        kept = {key: value for key, value in found.items() if key not in ("picture", "table")}
+        float(kept["seconds"]), str(kept["command"]), str(kept["figure"])
+        return kept
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise InputError(f"{file} is not what guiderail reproduce leaves: make the figure anew") from error
+
+
+def _figures(made: Mapping[str, Mapping[str, Any]], studies: Sequence[str]) -> str:
+    """Each figure and table of the thesis: what it says, what came out here, and by which command."""
+    columns = ("figure", "the thesis", "here", "seeds", "wall clock", "the setting", "command")
+    lines = ["## The thesis, figure by figure", "", f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+    for number, words in THESIS.items():
+        beside = [f"[{name}](#{name})" for name in studies if number in FIGURES.get(name, ())]
+        found = made.get(number, {})
+        claims = [f"{_words(key)}: {cell(value)}" for key, value in found.items() if key not in NO_CLAIM]
+        told: list[Any] = [number, words, "; ".join([*claims, *(["study " + ", ".join(beside)] if beside else [])])]
+        told += [found.get("seeds"), f"{found['seconds'] / 60:.1f} min" if found else None, found.get("condition")]
+        command = found.get(
+            "command", f"guiderail reproduce {number!r}" if " " in number else f"guiderail reproduce {number}"
+        )
+        lines.append(f"| {' | '.join(cell(one or None).replace('|', '/') for one in told)} | `{command}` |")
+    return "\n".join([*lines, ""])
+
+
+def _words(key: str) -> str:
+    return key.replace("_", " ")
 
 
 def _study(name: str, rows: pd.DataFrame) -> str:

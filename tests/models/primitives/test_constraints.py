@@ -175,3 +175,11 @@ def test_the_same_constraint_at_every_step_is_checked_once_and_any_other_too():
     c[7] = [1.0, 0.0]
     with pytest.raises(InputError, match="at step 7 contradict"):
         LinearConstraints(G, c)
+
+
+def test_the_nearest_of_the_first_step_unless_said():
+    box = LinearConstraints.box([[0.0], [5.0]], [[1.0], [6.0]])
+    np.testing.assert_allclose(box.nearest(np.array([9.0])), [1.0])
+    np.testing.assert_allclose(box.nearest([9], 1), [6.0])
+    inside = [0.25]
+    assert box.nearest(inside) is not inside

@@ -66,3 +66,9 @@ def test_refuses(primitive):
     deaf = LcNsKmp(primitive.reference, beta=0.0, lambda_=12.0, horizon=20)
     with pytest.raises(InputError, match="beta"):
         authority_gains(deaf)
+
+
+def test_gains_are_held_for_one_step_unless_said_and_may_be_a_list(primitive):
+    gains = [0.5, 2.0]
+    np.testing.assert_array_equal(exploration_rms(primitive, gains), exploration_rms(primitive, np.array(gains), 1))
+    np.testing.assert_array_equal(authority(primitive, tuple(gains)), authority(primitive, np.array(gains)))

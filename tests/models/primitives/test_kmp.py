@@ -85,6 +85,7 @@ def test_driven_by_a_state():
         (([0.0, 1.0], [0.0, 0.0], np.eye(2)), "input"),
         ((0.0, [0.0], np.eye(2)), "mean"),
         ((np.nan, [0.0, 0.0], np.eye(2)), "finite"),
+        ((0.0, [0.0, np.inf], np.eye(2)), "finite"),
         ((0.0, [0.0, 0.0], np.zeros((2, 2))), "positive definite"),
         ((0.0, [0.0, 0.0], np.eye(3)), "shape"),
     ],
@@ -105,3 +106,17 @@ def test_refuses_names_and_arguments():
         Kmp(*data(20, 2), lambda_=0.0)
     with pytest.raises(InputError, match="means"):
         Kmp(np.zeros(3), np.zeros((2, 1)), np.ones((2, 1, 1)))
+
+
+def test_a_via_point_is_finite_in_each_of_its_inputs():
+    x = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    primitive = Kmp(x, x, np.tile(np.eye(2), (20, 1, 1)))
+    for place in ([np.nan, 0.0], [0.0, np.inf]):
+        with pytest.raises(InputError, match="finite"):
+            primitive.add_via_point(place, [0.0, 0.0], np.eye(2))
+
+
+def test_lists_make_a_primitive_too():
+    t, means, covariances = data(20, 2)
+    expected = Kmp(t, means, covariances).mean([1.0])
+    np.testing.assert_array_equal(Kmp(t.tolist(), means.tolist(), covariances.tolist()).mean([1.0]), expected)

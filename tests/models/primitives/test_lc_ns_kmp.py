@@ -316,6 +316,8 @@ def test_driven_by_inputs_of_its_own():
     clocked = p.predict(8, np.ones(2) * 5, past)
     assert clocked.constrained
     np.testing.assert_allclose(direct.trajectory, clocked.trajectory, rtol=0, atol=1e-10)
+    lists = [a.tolist() for a in (p.reference.times[steps], *args, p.reference.times[6:8])]
+    np.testing.assert_array_equal(p.predict_at(*lists).trajectory, direct.trajectory)
     states = np.column_stack([np.cos(p.reference.times), np.sin(p.reference.times)])
     output = p.predict_at(states[steps], *args, states[6:8]).output
     assert p.constraints.violation(output) <= 1e-9
@@ -366,6 +368,7 @@ def test_a_long_running_controller_allocates_nothing_that_stays():
         ({"constraints": LinearConstraints(np.eye(3), np.zeros(3))}, "3 outputs"),
         ({"constraints": LinearConstraints(np.zeros((7, 1, 2)), np.zeros((7, 1)))}, "7 steps"),
         ({"solver": "magic"}, "magic"),
+        ({"history": -1}, "numbers of steps"),
     ],
 )
 def test_refuses_at_construction(changes, names):

@@ -47,6 +47,33 @@ def test_demonstrations_share_a_branch():
         assert abs(d.outputs[0][0, column] - d.outputs[1][0, column]) < 0.1
 
 
+def test_a_branch_is_the_nearest_full_turn():
+    """A motion that starts where angles of more than a half turn say so: no less, and no half turn of them."""
+    position, quaternions = turning(0.4)
+    for turns in (-2, -1, 0, 1, 3):
+        near = np.array([2 * np.pi * turns + 2.0, 0.0, 0.0])
+        outputs = pose_outputs(position, quaternions, np.zeros(3), [1, 0, 0, 0], near=near)
+        np.testing.assert_allclose(outputs[0, 3:], [2 * np.pi * turns, 0, 0], atol=1e-12)
+
+
+def test_the_first_demonstration_decides_the_branch_of_all():
+    """Each starts a sixth of a turn further than the one before: the fifth is more than half a turn from the first."""
+    n, starts = 5, np.deg2rad([170.0, 110.0, 50.0])
+    quaternions = [
+        Rotation.from_rotvec(np.outer(np.linspace(start, start - 0.1, n), [0, 0, 1])).as_quat(scalar_first=True)
+        for start in (*starts, np.deg2rad(-15.0))
+    ]
+    d = pose_demonstrations([np.arange(n)] * 4, [np.zeros((n, 3))] * 4, quaternions, np.zeros(3), [1, 0, 0, 0])
+    assert [round(np.rad2deg(y[0, 3])) for y in d.outputs] == [170, 110, 50, 345]
+
+
+def test_lists_are_poses_too():
+    positions, quaternions = turning(1.0)
+    from_arrays = pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0])
+    from_lists = pose_outputs(positions.tolist(), quaternions.tolist(), [0, 0, 0], [1, 0, 0, 0])
+    np.testing.assert_array_equal(from_lists, from_arrays)
+
+
 def test_last_pose_is_the_target_unless_given():
     positions, quaternions = turning(1.0)
     d = pose_demonstrations([np.arange(60)], [positions], [quaternions])
@@ -63,3 +90,11 @@ def test_refuses():
         pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0], "quaternion")
     with pytest.raises(InputError, match="positions"):
         pose_outputs(positions[:, :2], quaternions, np.zeros(3), [1, 0, 0, 0])
+    for where in (positions, quaternions):
+        broken = [positions.copy(), quaternions.copy()]
+        broken[0 if where is positions else 1][3, 1] = np.nan
+        with pytest.raises(InputError, match="NaN"):
+            pose_outputs(*broken, np.zeros(3), [1, 0, 0, 0])
+    with pytest.raises(InputError, match="length zero"):
+        pose_outputs(positions, quaternions, np.zeros(3), [1e-7, 0, 0, 0])
+    pose_outputs(positions, quaternions, np.zeros(3), [1e-5, 0, 0, 0])

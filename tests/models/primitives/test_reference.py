@@ -3,7 +3,7 @@ import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
-from guiderail.models.primitives.mixture import Mixture, regress
+from guiderail.models.primitives.mixture import Mixture, fit_mixture, regress
 
 
 def hourglass(num=9, n=120, seed=0):
@@ -88,3 +88,28 @@ def test_refuses_senseless_mixtures():
         ReferenceTrajectory.from_demonstrations(hourglass(), 0)
     with pytest.raises(InputError, match="floor"):
         ReferenceTrajectory.from_demonstrations(hourglass(), 5, floor=-1)
+
+
+def test_far_from_every_component_the_likeliest_goes_on():
+    """At an instant at which every density is zero to a computer, the mean goes on along a line of its component."""
+    times, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
+    mixture = fit_mixture(times, outputs, components=20, seed=0)
+    far = np.array([-300.0, 300.0, 400.0])
+    means, covariances = regress(mixture, far)
+    assert np.isfinite(means).all()
+    assert (covariances[:, 0, 0] > 0).all()
+    assert means[2, 0] - means[1, 0] == pytest.approx((means[2, 0] - means[0, 0]) / 7, rel=0.2)
+
+
+def test_half_as_many_components_as_steps_and_no_more():
+    times, outputs = np.linspace(0, 1, 12), np.random.default_rng(0).normal(size=(3, 12, 1))
+    assert len(fit_mixture(times, outputs, components=6, seed=0).weights) == 6
+    with pytest.raises(InputError, match="components"):
+        fit_mixture(times, outputs, components=7, seed=0)
+
+
+def test_of_two_numbers_of_components_the_better_is_taken():
+    """Four steps allow one or two: two levels that nothing lies between are two."""
+    rng = np.random.default_rng(0)
+    outputs = np.array([0.0, 0.0, 10.0, 10.0])[:, None] + 0.01 * rng.standard_normal((30, 4, 1))
+    assert len(fit_mixture(np.arange(4.0), outputs, components=None, seed=0).weights) == 2

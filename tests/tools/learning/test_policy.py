@@ -6,7 +6,7 @@ import pytest
 from gymnasium import spaces
 
 from guiderail.models.errors import InputError
-from guiderail.models.policy import Policy
+from guiderail.models.policy import WITHOUT_DIGEST, Policy
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import policy_of
 from guiderail.tools.learning.presets import resolve_preset
@@ -58,7 +58,7 @@ def learner_observation(learner, seed):
 
 
 def test_refuses_an_observation_of_another_shape(learner):
-    policy = policy_of(learner.model.actor, {"observation_shape": [5]})
+    policy = policy_of(learner.model.actor, {"observation_shape": list(learner_observation(learner, 0).shape)})
     with pytest.raises(ValueError, match="trained on observations"):
         policy(np.zeros(4))
 
@@ -78,6 +78,52 @@ def test_a_policy_with_an_unknown_activation_is_refused_in_a_sentence(learner, t
     description = json.loads((tmp_path / "policy.json").read_text())
     (tmp_path / "policy.json").write_text(json.dumps(description | {"activation": "gelu"}))
     with pytest.raises(InputError, match="of another version"):
+        Policy.load(tmp_path)
+
+
+@pytest.mark.parametrize("file", ["policy.safetensors", "policy.json"])
+def test_a_policy_in_which_one_bit_changed_is_refused_in_a_sentence(learner, file, tmp_path):
+    shape = list(learner_observation(learner, 0).shape)
+    policy_of(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+    content = bytearray((tmp_path / file).read_bytes())
+    at = content.index(b"action_high") + 14 if file.endswith("json") else len(content) - 4
+    content[at] ^= 1
+    (tmp_path / file).write_bytes(content)
+    with pytest.raises(InputError, match="damaged"):
+        Policy.load(tmp_path)
+
+
+def test_a_policy_of_an_earlier_version_has_no_digest(learner, tmp_path):
+    observation = learner_observation(learner, 0)
+    policy = policy_of(learner.model.actor, {"observation_shape": list(observation.shape)})
+    policy.save(tmp_path)
+    values = json.loads((tmp_path / "policy.json").read_text())
+    del values["digest"]
+    (tmp_path / "policy.json").write_text(json.dumps(values | {"format": WITHOUT_DIGEST}))
+    np.testing.assert_array_equal(Policy.load(tmp_path)(observation), policy(observation))
+
+
+WRONG = [
+    ("pool", 0), ("observation_shape", [10**13]), ("observation_shape", [-5]), ("observation_shape", [6]),
+    ("action_low", [0.0]), ("action_high", [-1.0, -2.0]), ("action_high", [float("nan"), 3.0]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("entry", "value"), WRONG)
+def test_a_policy_whose_parts_do_not_fit_together_is_refused_in_a_sentence(entry, value, tmp_path):
+    layers = [(np.ones((4, 5), np.float32), np.zeros(4, np.float32)), (np.ones((2, 4), np.float32), np.zeros(2, "f4"))]
+    values = {"observation_shape": [5], "action_low": [-1.0, -2.0], "action_high": [1.0, 3.0], "pool": 1}
+    Policy(layers, values).save(tmp_path)
+    Policy.load(tmp_path)
+    layers[0][0][0, 0] = np.inf
+    for described, of in ((values | {entry: value}, [*layers[1:]]), (values, layers), (values, [])):
+        with pytest.raises(ValueError):
+            Policy(of, described)
+    # Whoever writes such a file gives it the digest that it needs.
+    stored = json.loads((tmp_path / "policy.json").read_text())
+    del stored["digest"]
+    (tmp_path / "policy.json").write_text(json.dumps(stored | {"format": WITHOUT_DIGEST, entry: value}))
+    with pytest.raises(InputError, match="damaged"):
         Policy.load(tmp_path)
 
 

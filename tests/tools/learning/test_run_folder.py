@@ -68,3 +68,48 @@ def test_a_configuration_that_no_learner_can_use_is_refused(bead_config, tmp_pat
     file.write_text(file.read_text().replace("batch_size: 16", "batch_size: -3"))
     with pytest.raises(InputError):
         folder.config()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("batch_size: 16", "batch size: 16"),  # would have been the default
+        ("episodes: 8", "episodes: true"),
+        ("episodes: 8", "episodes: '8'"),
+        ("seed: 5", "seed: 2147483648"),
+        ("seed: 5", "seed: 5\nseeed: 6"),
+        ("seed: 5", "seed: 5\nseed: 6"),
+        ("learner:", "learner: 3\nold:"),
+        ("hold: 1", "hold: 2001-99-99"),
+        ("imports: []", "imports: ['']"),
+        ("imports: []", "imports: [..x]"),
+        ("imports: []", f"imports: [{'[' * 99}"),
+    ],
+)
+def test_a_configuration_that_says_something_else_is_refused(old, new, bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(bead_config)
+    file = tmp_path / "run" / "config.yaml"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(InputError) as error:
+        folder.config()
+    assert "\n" not in str(error.value)
+
+
+TABLE = "episode,return,success,termination,steps\n0,-1.5,0,blocked,12\n1,2.5,1,success,9\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("-1.5", "x"), ("-1.5", "1_0"), ("-1.5", "١"), (",12\n", ",1.5\n"), (",12\n", ",inf\n"), (",12\n", ",\n"),
+        (",1,success", ",7,success"), ("episode,", ","), ("return", "episode"), ("-1.5", '"'),
+    ],
+)  # fmt: skip
+def test_a_table_of_episodes_that_holds_no_numbers_is_refused(old, new, tmp_path):
+    (tmp_path / "episodes.csv").write_text(TABLE, encoding="utf-8")
+    assert RunFolder(tmp_path).episodes()["return"].tolist() == [-1.5, 2.5]
+    (tmp_path / "episodes.csv").write_text(TABLE.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError, match=r"episodes\.csv"):
+        RunFolder(tmp_path).episodes()

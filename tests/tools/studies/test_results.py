@@ -2,6 +2,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.errors import InputError
+from guiderail.tools.figures import reproduce
 from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.studies.declaration import shipped_studies
 from guiderail.tools.studies.results import FIGURES, write_results
@@ -39,12 +40,32 @@ def test_the_page_is_written_anew_from_what_is_stored(finished, tmp_path):
 
 
 def test_what_is_no_study_is_refused(tmp_path):
-    with pytest.raises(InputError, match="holds no table of a study"):
+    with pytest.raises(InputError, match="holds no table of a study and no figure"):
         write_results([tmp_path], tmp_path / "results")
-    with pytest.raises(InputError, match="name folders of studies"):
+    with pytest.raises(InputError, match="name folders of them"):
         write_results([], tmp_path / "results")
 
 
 def test_figures_stand_beside_studies_that_there_are():
     assert set(FIGURES) <= set(shipped_studies())
     assert {number for numbers in FIGURES.values() for number in numbers} <= set(THESIS)
+
+
+def test_every_figure_of_the_thesis_has_its_line_and_those_that_were_made_their_numbers(finished, tmp_path):
+    reproduce("table 4.1", out=tmp_path / "figures")
+    page = write_results([finished, tmp_path / "figures"], tmp_path / "results").read_text()
+    lines = {line.split(" | ")[0].removeprefix("| "): line for line in page.splitlines() if line.startswith("| ")}
+    for number, words in THESIS.items():
+        assert words in lines[number]
+    assert "the presets of that name have the thesis's values: yes, all" in lines["table 4.1"]
+    assert "`guiderail reproduce 'table 4.1'`" in lines["table 4.1"]
+    assert "study [connector](#connector)" in lines["5.9"]
+    assert str(tmp_path) not in page
+    assert write_results([], tmp_path / "results").read_text() == page
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"seconds": "x", "command": "", "figure": ""}', "[" * 9999])
+def test_what_no_figure_left_is_refused(content, tmp_path):
+    (tmp_path / "figure_5_9.json").write_text(content)
+    with pytest.raises(InputError, match="not what guiderail reproduce leaves"):
+        write_results([tmp_path], tmp_path / "results")
