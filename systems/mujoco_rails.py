@@ -112,6 +112,8 @@ class MujocoRails(LeafSystem):
         poses = plant.get_body_poses_output_port()
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._nominal_body_poses_port = self.DeclareAbstractInputPort("nominal_body_poses", poses.Allocate())
+        self._nominal = (model.geom_friction.copy(), model.jnt_stiffness.copy(), model.geom_solref.copy())
+        self._factors = self.DeclareNumericParameter(BasicVector(np.ones(2)))
         self._state = self.DeclareDiscreteState(self._at_rest(np.zeros(POSE_SIZE)))
         state = {self.discrete_state_ticket(self._state)}
         placed = state | {self._nominal_body_poses_port.ticket()}
@@ -168,6 +170,13 @@ class MujocoRails(LeafSystem):
         """Puts the tool at rest at `pose`, (6,); `context` is this system's own."""
         context.SetDiscreteState(self._state, self._at_rest(pose))
 
+    def set_contact(self, context: Context, friction: float, modulus: float) -> None:
+        """Multiplies all friction, and the stiffness of contacts and springs; `context` is this system's own.
+
+        A contact is never made stiffer than two of the engine's steps allow.
+        """
+        context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
+
     def _at_rest(self, pose: np.ndarray) -> np.ndarray:
         self._mujoco.mj_resetData(self.model, self._data)
         self._data.qpos[:POSE_SIZE] = pose
@@ -185,6 +194,7 @@ class MujocoRails(LeafSystem):
         model, data = self.model, self._data
         state = self._values(context)
         self._place(self._nominal_body_poses_port.Eval(context))
+        self._soften(*context.get_numeric_parameter(self._factors).value())
         self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
         data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
         filtered = state[self._filtered]
@@ -203,6 +213,12 @@ class MujocoRails(LeafSystem):
         for body, X in ((self._fixture, X_TFixture), (self._workpiece, X_PWorkpiece)):
             self.model.body_pos[body] = X.translation()
             self.model.body_quat[body] = X.rotation().ToQuaternion().wxyz()
+
+    def _soften(self, friction: float, modulus: float) -> None:
+        frictions, stiffnesses, references = self._nominal
+        self.model.geom_friction[:] = frictions * friction
+        self.model.jnt_stiffness[:] = stiffnesses * modulus
+        self.model.geom_solref[:, 0] = np.maximum(references[:, 0] / np.sqrt(modulus), 2.0 * self.model.opt.timestep)
 
     def _contact_wrench(self) -> np.ndarray:
         """What the contacts do to the joints, turned back: slides are T's axes, about hinges a torque t does a · t."""

@@ -93,6 +93,10 @@ class MujocoStation(Station):
         """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
         self.rails.set_pose(self.rails.GetMyMutableContextFromRoot(context), pose)
 
+    def set_contact(self, context: Context, friction: float, modulus: float) -> None:
+        """Multiplies the engine's friction and compliance; `context` is the root context."""
+        self.rails.set_contact(self.rails.GetMyMutableContextFromRoot(context), friction, modulus)
+
 
 def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Workcell) -> MovedBodies:
     """Adds fixture, tool and workpiece to a plant in which nothing moves, and finalizes it."""

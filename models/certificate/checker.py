@@ -1,0 +1,233 @@
+"""Checks a certificate: `python checker.py FOLDER`. It needs NumPy alone, and nothing of what made the certificate.
+
+It reads what the primitive is, forms problem 4.5 at every step anew from the kernel and the demonstrations, and adds up
+what all sequences of actions can come to. It says yes, or no and where. Exit code 0 or 1; 2 if a file can't be read.
+
+    y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹
+
+W maps the history h on the window and C is the kernel given the history. A correction for constraints G y ≥ c with
+multipliers α ≥ 0 moves the window by S Gᵀ α; its squared size is αᵀ G S Gᵀ α.
+"""
+
+import hashlib
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+QUANTITIES = ("lower", "upper", "speed", "acceleration")
+AGREES = 1e-4  # of a quantity's largest value: how well two ways of calculating it agree
+KEEPS = 1e-7  # of a constraint's size: how well a correction that is shown must keep it
+
+
+class Rejected(Exception):
+    """Why a certificate is not accepted."""
+
+
+def require(condition, words):
+    """Rejects the certificate unless a condition holds."""
+    if not condition:
+        raise Rejected(words)
+
+
+def read(folder):
+    """The primitive with its constraints, the witness and the claims; every file must be the one that was signed."""
+    claims = json.loads((folder / "certificate.json").read_text())
+    told = json.dumps({key: value for key, value in claims.items() if key != "digest"}, sort_keys=True)
+    require(hashlib.sha256(told.encode()).hexdigest() == claims.get("digest"), "certificate.json was changed")
+    files = {}
+    for name in ("primitive.npz", "constraints.npz", "witness.npz"):
+        content = (folder / name).read_bytes()
+        require(hashlib.sha256(content).hexdigest() == claims["digests"].get(name), f"{name} was changed")
+        with np.load(folder / name, allow_pickle=False) as arrays:
+            files[name] = {key: arrays[key] for key in arrays.files}
+    return {**files["primitive.npz"], **files["constraints.npz"]}, files["witness.npz"], claims
+
+
+def solve(A, B):
+    """A⁻¹ B of a positive definite A, in extended precision."""
+    n, L, X = len(A), np.zeros_like(A), B.copy()
+    for j in range(n):
+        L[j:, j] = A[j:, j] - L[j:, :j] @ L[j, :j]
+        L[j:, j] /= np.sqrt(L[j, j])
+    for j in range(n):
+        X[j] = (X[j] - L[j, :j] @ X[:j]) / L[j, j]
+    for j in reversed(range(n)):
+        X[j] = (X[j] - L[j + 1 :, j] @ X[j + 1 :]) / L[j, j]
+    return X
+
+
+class Primitive:
+    """Problem 4.5 at every step."""
+
+    def __init__(self, p):
+        self.means, self.covariances = p["means"], p["covariances"]
+        self.steps, self.outputs = self.means.shape
+        self.past, self.horizon = int(p["history"]), int(p["horizon"])
+        self.beta, self.hbar = float(p["beta"]), float(p["lambda"]) + float(p["beta"])
+        self.noise, self.inverse_length = self.hbar * float(p["history_variance"]), float(p["inverse_length"])
+        self.inputs = p["inputs"].astype(np.longdouble)
+        require(len(self.inputs) == self.past + self.steps + self.horizon, "the clock has not one time for each step")
+        self.G, self.c = p["G"], p["c"]
+        self.known = {}
+
+    def kernel(self, n):
+        """W (H+1, P), and features F of the kernel given the history, F Fᵀ = C."""
+        t = self.inputs[n : n + self.past + self.horizon + 1]
+        key = np.round((t - t[0]).astype(float), 12).tobytes()
+        if key not in self.known:
+            k = np.exp(-np.longdouble(self.inverse_length) * (t[:, None] - t[None, :]) ** 2)
+            P = self.past
+            W = solve(k[:P, :P] + self.noise * np.eye(P, dtype=k.dtype), k[:P, P:]).T
+            values, vectors = np.linalg.eigh((k[P:, P:] - W @ k[:P, P:]).astype(float))
+            kept = values > 1e-15 * values[-1]
+            self.known[key] = W.astype(float), vectors[:, kept] * np.sqrt(values[kept])
+        return self.known[key]
+
+    def window(self, n):
+        """The window's maps from history and action, its offset, L with S = L Lᵀ, and constraints on it, as rows."""
+        W, F = self.kernel(n)
+        O, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
+        precision = np.linalg.inv(self.covariances[at])
+        M = np.einsum("ja,jb,jop->aobp", F, F, precision).reshape(F.shape[1] * O, -1)
+        M += self.hbar * np.eye(len(M))
+        F_bar = np.kron(F, np.eye(O))
+        L = np.linalg.solve(np.linalg.cholesky((M + M.T) / 2), F_bar.T).T
+        weigh = np.einsum("joa,jop->jpa", L.reshape(len(at), O, -1), precision).reshape(F_bar.shape[0], -1)
+        W_bar = np.kron(W, np.eye(O))
+        history = W_bar - L @ (weigh.T @ W_bar)
+        G, c = (self.G[at], self.c[at]) if self.G.ndim == 3 else (np.tile(self.G, (len(at), 1, 1)),) + (
+            np.tile(self.c, (len(at), 1)),
+        )
+        rows = np.zeros((G.shape[0] * G.shape[1], F_bar.shape[0]))
+        for j, f in itertools.product(range(G.shape[0]), range(G.shape[1])):
+            rows[j * G.shape[1] + f, j * O : (j + 1) * O] = G[j, f]
+        return history, self.beta * L @ L[:O].T, L @ (weigh.T @ self.means[at].ravel()), L, rows, c.ravel()
+
+
+def reach(primitive, p, witness):
+    """Free motion, generators, which steps constraints touch, and how far corrections can move each output."""
+    P, N, O = primitive.past, primitive.steps, primitive.outputs
+    moved, claimed = np.flatnonzero(p["gains"]), witness["touched"]
+    require(claimed.shape == (N,), "the witness has not one entry for each step")
+    A = len(moved)
+    middle, spread = np.zeros((P + N, O)), np.zeros((P + N, O, N * A + O))
+    middle[:P], spread[:P, :, N * A :] = p["start"], np.diag(p["start_within"])
+    correction, shown = np.zeros((N, O)), 0
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=A))).reshape(-1, A) if P == 0 else None
+    for n in range(N):
+        history, action, offset, L, rows, c = primitive.window(n)
+        y = history @ middle[n : P + n].ravel() + offset
+        g = history @ spread[n : P + n].reshape(P * O, -1) if P else np.zeros((len(y), N * A + O))
+        by = action[:, moved] * p["gains"][moved]
+        g[:, n * A : (n + 1) * A] += by
+        middle[P + n], spread[P + n] = y[:O], g[:O]
+        touches = len(c) > 0 and bool((rows @ y - np.abs(rows @ g).sum(axis=1) < c - 1e-12).any())
+        require(claimed[n] or not touches or _nearly(rows, y, g, c), f"step {n}: a constraint can be active there")
+        if claimed[n] and P == 0:
+            alphas = witness["multipliers"][shown]
+            shown += 1
+            require(len(alphas) == len(signs), f"step {n}: not every corner of the actions is shown")
+            size = max(
+                _size(y + by @ sign, alpha.ravel(), L, rows, c, n) for sign, alpha in zip(signs, alphas, strict=True)
+            )
+            correction[n] = size * np.linalg.norm(L[:O], axis=1)
+    if P:
+        tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"].reshape(-1, O) != 0).any(axis=0)
+        for _ in range(O):
+            reached = reached | (tied & reached).any(axis=1)
+        correction = np.where(np.logical_or.accumulate(claimed)[:, None] & reached, np.inf, 0.0)
+    return middle, spread, correction
+
+
+def _nearly(rows, y, g, c):
+    """Whether a window that seems to be touched is so by rounding alone."""
+    return bool((rows @ y - np.abs(rows @ g).sum(axis=1) >= c - KEEPS).all())
+
+
+def _size(y, alpha, L, rows, c, n):
+    require((alpha >= 0).all() and alpha.shape == c.shape, f"step {n}: these are no multipliers")
+    force = L.T @ (rows.T @ alpha)
+    kept = rows @ (y + L @ force) - c
+    require((kept >= -KEEPS * (1 + np.abs(c))).all(), f"step {n}: the correction that is shown breaks a constraint")
+    return float(np.linalg.norm(force))
+
+
+def bounds(primitive, p, middle, spread, correction, period):
+    """Both regimes' quantities, each (N, O)."""
+    P, N, O = primitive.past, primitive.steps, primitive.outputs
+    size = np.abs(spread).sum(axis=2)
+    free = {"lower": (middle - size)[P:], "upper": (middle + size)[P:]}
+    for order, name in ((1, "speed"), (2, "acceleration")):
+        change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(spread, order, axis=0)).sum(axis=2)
+        free[name] = np.concatenate([np.zeros((order, O)), change])[-N:] / period**order
+    least, greatest = np.full((N, O), -np.inf), np.full((N, O), np.inf)
+    G, c = np.broadcast_to(p["G"], (N, *p["G"].shape[-2:])), np.broadcast_to(p["c"], (N, p["c"].shape[-1]))
+    for n, f in itertools.product(range(N), range(G.shape[1])):
+        (alone,) = np.nonzero(G[n, f])
+        if len(alone) == 1 and G[n, f, alone[0]] > 0:
+            least[n, alone[0]] = max(least[n, alone[0]], c[n, f] / G[n, f, alone[0]])
+        elif len(alone) == 1:
+            greatest[n, alone[0]] = min(greatest[n, alone[0]], c[n, f] / G[n, f, alone[0]])
+    off = correction > 0
+    low = np.where(off, np.maximum(free["lower"] - correction, least), free["lower"])
+    high = np.where(off, np.minimum(free["upper"] + correction, greatest), free["upper"])
+    always = {"lower": low, "upper": high, "speed": free["speed"].copy(), "acceleration": free["acceleration"].copy()}
+    before = [np.tile(p["start"] + side * p["start_within"], (2, 1)) for side in (-1, 1)]
+    low, high, off = np.vstack([before[0], low]), np.vstack([before[1], high]), np.vstack([np.zeros((2, O), bool), off])
+    for n in range(2, N + 2):
+        if n > 2 or P:
+            new = np.maximum(high[n] - low[n - 1], high[n - 1] - low[n]) / period
+            always["speed"][n - 2] = np.where(off[n - 1 : n + 1].any(axis=0), new, always["speed"][n - 2])
+        if n > 3 or P:
+            up = high[n] - 2 * low[n - 1] + high[n - 2]
+            new = np.maximum(up, 2 * high[n - 1] - low[n] - low[n - 2]) / period**2
+            always["acceleration"][n - 2] = np.where(off[n - 2 : n + 1].any(axis=0), new, always["acceleration"][n - 2])
+    return {"free": free, "always": always}
+
+
+def compare(claims, found):
+    """Rejects a claim that is not what was found; the worst step is named."""
+    for regime, name in itertools.product(found, QUANTITIES):
+        claimed = np.array(claims[regime][name], dtype=float)  # null is NaN: nothing is known
+        unknown = np.inf if name != "lower" else -np.inf
+        claimed, mine = np.where(np.isnan(claimed), unknown, claimed), found[regime][name]
+        require(claimed.shape == mine.shape, f"{regime} {name} has not a bound for each step and output")
+        known = np.isfinite(mine)
+        require((np.isfinite(claimed) == known).all(), f"{regime} {name} is known where it is not, or unknown")
+        scale = np.maximum(np.abs(np.where(known, mine, 0.0)).max(axis=0), 1e-9)
+        wrong = np.where(known, np.abs(np.where(known, claimed - mine, 0.0)) / scale, 0.0)
+        n, o = np.unravel_index(int(wrong.argmax()), wrong.shape)
+        require(wrong[n, o] <= AGREES, f"step {n}: {regime} {name} of output {o} is {mine[n, o]:.6g}, not as claimed")
+
+
+def check(folder):
+    """Raises `Rejected` unless the certificate in a folder holds."""
+    p, witness, claims = read(folder)
+    period = float(claims["period"])
+    require(period > 0 and claims["format"] == "guiderail certificate 1", "the format or the period is none")
+    primitive = Primitive(p)
+    clock = np.diff(primitive.inputs[primitive.past : primitive.past + primitive.steps]).astype(float)
+    require(np.allclose(clock, clock[0]), "the clock is not even, and speeds would have no one period")
+    found = bounds(primitive, p, *reach(primitive, p, witness), period)
+    compare(claims, found)
+    if "limits" in claims:
+        stiffness, limits = np.array(claims["stiffness"]), np.array(claims["limits"])
+        ranges = found["always"]["upper"].max(axis=0) - found["always"]["lower"].min(axis=0)
+        rest = np.linalg.norm(np.minimum(limits, stiffness * ranges)[:3])
+        for name, mine in (("force", np.linalg.norm(limits[:3])), ("rest_force", rest)):
+            require(abs(claims[name] - mine) <= AGREES * mine, f"{name} is {mine:.6g} N, not {claims[name]:.6g} N")
+
+
+if __name__ == "__main__":
+    try:
+        check(Path(sys.argv[1]))
+    except Rejected as why:
+        print(f"no: {why}")
+        sys.exit(1)
+    except (OSError, KeyError, ValueError, TypeError, IndexError, np.linalg.LinAlgError) as error:
+        print(f"no: the files are not readable ({type(error).__name__}: {error})")
+        sys.exit(2)
+    print("yes")
