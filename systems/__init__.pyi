@@ -26,6 +26,7 @@ from .mujoco_rails import MovedBodies as MovedBodies
 from .mujoco_rails import MujocoRails as MujocoRails
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
+from .pose_wrench import PoseWrench as PoseWrench
 from .recorder import Recorder as Recorder
 from .recorder import Recording as Recording
 from .relative_poses import RelativePoses as RelativePoses

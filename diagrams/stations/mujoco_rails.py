@@ -13,6 +13,7 @@ from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
+    ContactOptions,
     Impedance,
     Station,
     export_station_ports,
@@ -24,7 +25,7 @@ from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.mujoco_rails import MovedBodies, MujocoRails
 
 
-@register_station("mujoco", world="workcell")
+@register_station("mujoco", world="workcell", options=ContactOptions)
 class MujocoStation(Station):
     """`RailsStation`'s twin, stepped by MuJoCo: ports, rails, impedance, watchdog and filter are the same.
 
@@ -36,7 +37,7 @@ class MujocoStation(Station):
         self,
         workcell: Workcell,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
-        time_step: float = PLANT_PERIOD,
+        time_step: float | None = None,
         wrench_time_constant: float = 0.01,
         contact: MujocoContact = MujocoContact(),  # noqa: B008 (frozen)
     ):
@@ -44,7 +45,8 @@ class MujocoStation(Station):
         Args:
             workcell: what stands in the world and what is held.
             impedance: of the rails.
-            time_step: at which commands are taken in, and poses and wrenches given out [s]; the engine's is finer.
+            time_step: at which commands are taken in, and poses and wrenches given out [s]; half a control period
+                unless given. The engine's own is finer.
             wrench_time_constant: of the wrench's low-pass filter [s].
             contact: of the engine.
 
@@ -52,6 +54,7 @@ class MujocoStation(Station):
             InputError: if MuJoCo isn't installed, or nobody described the workcell's surfaces as convex solids.
         """
         super().__init__()
+        time_step = time_step or PLANT_PERIOD
         if not isinstance(workcell, ConvexWorkcell):
             raise InputError(
                 f"station='mujoco' collides convex solids, and {type(workcell).__name__} doesn't say which: "
