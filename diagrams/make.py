@@ -113,7 +113,9 @@ def make_station(resolved: Resolved) -> Station:
     """The station of an environment, its world in it."""
     kind, disturbances = resolved.station, resolved.models["disturbances"]
     build = partial(kind.build, resolved.task.world(), **_values(resolved.models["station"]))
-    return disturbed(build, disturbances, kind.simulated, kind.name) if isinstance(disturbances, Disturbances) else build()
+    return (
+        disturbed(build, disturbances, kind.simulated, kind.name) if isinstance(disturbances, Disturbances) else build()
+    )
 
 
 def make_guidance(resolved: Resolved, station: Station) -> Diagram:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class MovedBodies(NamedTuple):
-    """Which bodies of a plant the engine moves, or places anew: the fixture, the tool, and what is fixed to the tool."""
+    """Bodies of a plant that the engine moves, or places anew: the fixture, the tool, and what is fixed to the tool."""
 
     fixture: RigidBody
     tool: RigidBody

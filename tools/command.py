@@ -222,7 +222,8 @@ def robustness(
 
     One thing is changed at a time. What is done is kept: started again, it goes on where it was interrupted.
     """
-    from guiderail.tools.robustness.robustness import breaks, robustness as judge
+    from guiderail.tools.robustness.robustness import breaks
+    from guiderail.tools.robustness.robustness import robustness as judge
 
     environment = _environment(env)
     others = _beside(run, environment, beside)
@@ -240,6 +241,33 @@ def robustness(
         typer.echo(f"{name}: below 90 % at {', '.join(f'{value:.3g}' for value in values) or 'no place'}")
     typer.echo(found["table"])
     typer.echo(found["picture"])
+
+
+@command("certify runs/passage")
+def certify(
+    of: Annotated[str, _arg("The folder of a run; or a task, with --out: {tasks}.", "RUN or TASK")],
+    env: Env = None,
+    out: Annotated[Path | None, _opt("The folder to write.  [default: certificate in the run]")] = None,
+    start_within: Annotated[
+        float | None, _opt("How far beside its start the robot may begin, in the outputs' units.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Bound what a skill can command for all actions, and have the bounds checked by a program that knows no guiderail.
+
+    The certificate lists what it assumes. Check it anywhere: python checker.py FOLDER, with NumPy alone.
+    """
+    from guiderail.tools.certify import certify_skill
+
+    found = certify_skill(of, _environment(env), out=out, start_within=start_within)
+    if as_json:
+        typer.echo(json.dumps(found))
+    else:
+        for name, value in found.items():
+            words = ", ".join("–" if x is None else f"{x:.4g}" for x in value) if isinstance(value, list) else value
+            typer.echo(f"{name.replace('_', ' ')}: {words}")
+    if found["checker"] != "yes":
+        raise typer.Exit(1)
 
 
 @command("replay runs/passage --html replay.html")

@@ -62,9 +62,7 @@ class DisturbedStation(Station):
         builder.Connect(station.get_pose_output_port(), pose.get_measured_input_port())
         outputs = {name: station.GetOutputPort(name) for name in OUTPUTS}
         outputs |= {"pose": pose.get_disturbed_output_port(), "wrench": wrench.get_disturbed_output_port()}
-        export_station_ports(
-            builder, commands.get_sent_input_port(), station.get_command_time_input_port(), **outputs
-        )
+        export_station_ports(builder, commands.get_sent_input_port(), station.get_command_time_input_port(), **outputs)
         for name in SIMULATION_PORTS:
             builder.ExportOutput(station.GetOutputPort(name), name)
         builder.BuildInto(self)
@@ -129,5 +127,7 @@ def _drawn(rng: np.random.Generator, factors: tuple[float, ...]) -> float:
 def _period(d: Disturbances) -> float:
     steps = round(d.control_period / PLANT_PERIOD)
     if steps < 1 or abs(steps * PLANT_PERIOD - d.control_period) > 1e-6:
-        raise InputError(f"control_period is a whole number of the plant's {PLANT_PERIOD:g} s, not {d.control_period} s")
+        raise InputError(
+            f"control_period is a whole number of the plant's {PLANT_PERIOD:g} s, not {d.control_period} s"
+        )
     return steps * PLANT_PERIOD

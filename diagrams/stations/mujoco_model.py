@@ -58,7 +58,9 @@ def mujoco_model(
     mujoco = mujoco_engine()
     pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
     if len(pairs) > MAX_PAIRS:
-        raise InputError(f"station='mujoco' tells at most {MAX_PAIRS} pairs of surfaces apart, and these are {len(pairs)}")
+        raise InputError(
+            f"station='mujoco' tells at most {MAX_PAIRS} pairs of surfaces apart, and these are {len(pairs)}"
+        )
     spec = mujoco.MjSpec()
     spec.modelname = "workcell"
     spec.compiler.autolimits = True

@@ -1,4 +1,4 @@
-"""The tool centre on six rails, in another physics engine: for asking whether a skill is one of Drake's contact only."""
+"""The tool centre on six rails, in another physics engine: is a skill one of Drake's contact only?"""
 
 from __future__ import annotations
 

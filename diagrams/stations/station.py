@@ -149,7 +149,6 @@ class Station(Diagram):
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the robot at rest with its tool centre at `pose`, (6,); `context` is the root context."""
 
-
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
         """Multiplies all friction and all compliance of the contact by a factor, until the next reset.
 

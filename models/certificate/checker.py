@@ -14,9 +14,12 @@ import itertools
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+Arrays = dict[str, np.ndarray]
+Regimes = dict[str, Arrays]
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
 AGREES = 1e-4  # of a quantity's largest value: how well two ways of calculating it agree
 KEEPS = 1e-7  # of a constraint's size: how well a correction that is shown must keep it
@@ -26,18 +29,18 @@ class Rejected(Exception):
     """Why a certificate is not accepted."""
 
 
-def require(condition, words):
+def require(condition: Any, words: str) -> None:
     """Rejects the certificate unless a condition holds."""
     if not condition:
         raise Rejected(words)
 
 
-def read(folder):
+def read(folder: Path) -> tuple[Arrays, Arrays, dict[str, Any]]:
     """The primitive with its constraints, the witness and the claims; every file must be the one that was signed."""
     claims = json.loads((folder / "certificate.json").read_text())
     told = json.dumps({key: value for key, value in claims.items() if key != "digest"}, sort_keys=True)
     require(hashlib.sha256(told.encode()).hexdigest() == claims.get("digest"), "certificate.json was changed")
-    files = {}
+    files: dict[str, Arrays] = {}
     for name in ("primitive.npz", "constraints.npz", "witness.npz"):
         content = (folder / name).read_bytes()
         require(hashlib.sha256(content).hexdigest() == claims["digests"].get(name), f"{name} was changed")
@@ -46,7 +49,7 @@ def read(folder):
     return {**files["primitive.npz"], **files["constraints.npz"]}, files["witness.npz"], claims
 
 
-def solve(A, B):
+def solve(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """A⁻¹ B of a positive definite A, in extended precision."""
     n, L, X = len(A), np.zeros_like(A), B.copy()
     for j in range(n):
@@ -62,7 +65,7 @@ def solve(A, B):
 class Primitive:
     """Problem 4.5 at every step."""
 
-    def __init__(self, p):
+    def __init__(self, p: Arrays):
         self.means, self.covariances = p["means"], p["covariances"]
         self.steps, self.outputs = self.means.shape
         self.past, self.horizon = int(p["history"]), int(p["horizon"])
@@ -71,9 +74,9 @@ class Primitive:
         self.inputs = p["inputs"].astype(np.longdouble)
         require(len(self.inputs) == self.past + self.steps + self.horizon, "the clock has not one time for each step")
         self.G, self.c = p["G"], p["c"]
-        self.known = {}
+        self.known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-    def kernel(self, n):
+    def kernel(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """W (H+1, P), and features F of the kernel given the history, F Fᵀ = C."""
         t = self.inputs[n : n + self.past + self.horizon + 1]
         key = np.round((t - t[0]).astype(float), 12).tobytes()
@@ -86,44 +89,46 @@ class Primitive:
             self.known[key] = W.astype(float), vectors[:, kept] * np.sqrt(values[kept])
         return self.known[key]
 
-    def window(self, n):
+    def window(self, n: int) -> tuple[np.ndarray, ...]:
         """The window's maps from history and action, its offset, L with S = L Lᵀ, and constraints on it, as rows."""
         W, F = self.kernel(n)
-        O, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
+        outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
         precision = np.linalg.inv(self.covariances[at])
-        M = np.einsum("ja,jb,jop->aobp", F, F, precision).reshape(F.shape[1] * O, -1)
+        M = np.einsum("ja,jb,jop->aobp", F, F, precision).reshape(F.shape[1] * outs, -1)
         M += self.hbar * np.eye(len(M))
-        F_bar = np.kron(F, np.eye(O))
+        F_bar = np.kron(F, np.eye(outs))
         L = np.linalg.solve(np.linalg.cholesky((M + M.T) / 2), F_bar.T).T
-        weigh = np.einsum("joa,jop->jpa", L.reshape(len(at), O, -1), precision).reshape(F_bar.shape[0], -1)
-        W_bar = np.kron(W, np.eye(O))
+        weigh = np.einsum("joa,jop->jpa", L.reshape(len(at), outs, -1), precision).reshape(F_bar.shape[0], -1)
+        W_bar = np.kron(W, np.eye(outs))
         history = W_bar - L @ (weigh.T @ W_bar)
-        G, c = (self.G[at], self.c[at]) if self.G.ndim == 3 else (np.tile(self.G, (len(at), 1, 1)),) + (
-            np.tile(self.c, (len(at), 1)),
+        G, c = (
+            (self.G[at], self.c[at])
+            if self.G.ndim == 3
+            else (np.tile(self.G, (len(at), 1, 1)),) + (np.tile(self.c, (len(at), 1)),)
         )
         rows = np.zeros((G.shape[0] * G.shape[1], F_bar.shape[0]))
         for j, f in itertools.product(range(G.shape[0]), range(G.shape[1])):
-            rows[j * G.shape[1] + f, j * O : (j + 1) * O] = G[j, f]
-        return history, self.beta * L @ L[:O].T, L @ (weigh.T @ self.means[at].ravel()), L, rows, c.ravel()
+            rows[j * G.shape[1] + f, j * outs : (j + 1) * outs] = G[j, f]
+        return history, self.beta * L @ L[:outs].T, L @ (weigh.T @ self.means[at].ravel()), L, rows, c.ravel()
 
 
-def reach(primitive, p, witness):
+def reach(primitive: Primitive, p: Arrays, witness: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Free motion, generators, which steps constraints touch, and how far corrections can move each output."""
-    P, N, O = primitive.past, primitive.steps, primitive.outputs
+    P, N, outs = primitive.past, primitive.steps, primitive.outputs
     moved, claimed = np.flatnonzero(p["gains"]), witness["touched"]
     require(claimed.shape == (N,), "the witness has not one entry for each step")
     A = len(moved)
-    middle, spread = np.zeros((P + N, O)), np.zeros((P + N, O, N * A + O))
+    middle, spread = np.zeros((P + N, outs)), np.zeros((P + N, outs, N * A + outs))
     middle[:P], spread[:P, :, N * A :] = p["start"], np.diag(p["start_within"])
-    correction, shown = np.zeros((N, O)), 0
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=A))).reshape(-1, A) if P == 0 else None
+    correction, shown = np.zeros((N, outs)), 0
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=A if P == 0 else 0))).reshape(-1, A)
     for n in range(N):
         history, action, offset, L, rows, c = primitive.window(n)
         y = history @ middle[n : P + n].ravel() + offset
-        g = history @ spread[n : P + n].reshape(P * O, -1) if P else np.zeros((len(y), N * A + O))
+        g = history @ spread[n : P + n].reshape(P * outs, -1) if P else np.zeros((len(y), N * A + outs))
         by = action[:, moved] * p["gains"][moved]
         g[:, n * A : (n + 1) * A] += by
-        middle[P + n], spread[P + n] = y[:O], g[:O]
+        middle[P + n], spread[P + n] = y[:outs], g[:outs]
         touches = len(c) > 0 and bool((rows @ y - np.abs(rows @ g).sum(axis=1) < c - 1e-12).any())
         require(claimed[n] or not touches or _nearly(rows, y, g, c), f"step {n}: a constraint can be active there")
         if claimed[n] and P == 0:
@@ -133,21 +138,21 @@ def reach(primitive, p, witness):
             size = max(
                 _size(y + by @ sign, alpha.ravel(), L, rows, c, n) for sign, alpha in zip(signs, alphas, strict=True)
             )
-            correction[n] = size * np.linalg.norm(L[:O], axis=1)
+            correction[n] = size * np.linalg.norm(L[:outs], axis=1)
     if P:
-        tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"].reshape(-1, O) != 0).any(axis=0)
-        for _ in range(O):
+        tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"].reshape(-1, outs) != 0).any(axis=0)
+        for _ in range(outs):
             reached = reached | (tied & reached).any(axis=1)
         correction = np.where(np.logical_or.accumulate(claimed)[:, None] & reached, np.inf, 0.0)
     return middle, spread, correction
 
 
-def _nearly(rows, y, g, c):
+def _nearly(rows: np.ndarray, y: np.ndarray, g: np.ndarray, c: np.ndarray) -> bool:
     """Whether a window that seems to be touched is so by rounding alone."""
     return bool((rows @ y - np.abs(rows @ g).sum(axis=1) >= c - KEEPS).all())
 
 
-def _size(y, alpha, L, rows, c, n):
+def _size(y: np.ndarray, alpha: np.ndarray, L: np.ndarray, rows: np.ndarray, c: np.ndarray, n: int) -> float:
     require((alpha >= 0).all() and alpha.shape == c.shape, f"step {n}: these are no multipliers")
     force = L.T @ (rows.T @ alpha)
     kept = rows @ (y + L @ force) - c
@@ -155,15 +160,17 @@ def _size(y, alpha, L, rows, c, n):
     return float(np.linalg.norm(force))
 
 
-def bounds(primitive, p, middle, spread, correction, period):
-    """Both regimes' quantities, each (N, O)."""
-    P, N, O = primitive.past, primitive.steps, primitive.outputs
+def bounds(
+    primitive: Primitive, p: Arrays, middle: np.ndarray, spread: np.ndarray, correction: np.ndarray, period: float
+) -> Regimes:
+    """Both regimes' quantities, each (N, outs)."""
+    P, N, outs = primitive.past, primitive.steps, primitive.outputs
     size = np.abs(spread).sum(axis=2)
     free = {"lower": (middle - size)[P:], "upper": (middle + size)[P:]}
     for order, name in ((1, "speed"), (2, "acceleration")):
         change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(spread, order, axis=0)).sum(axis=2)
-        free[name] = np.concatenate([np.zeros((order, O)), change])[-N:] / period**order
-    least, greatest = np.full((N, O), -np.inf), np.full((N, O), np.inf)
+        free[name] = np.concatenate([np.zeros((order, outs)), change])[-N:] / period**order
+    least, greatest = np.full((N, outs), -np.inf), np.full((N, outs), np.inf)
     G, c = np.broadcast_to(p["G"], (N, *p["G"].shape[-2:])), np.broadcast_to(p["c"], (N, p["c"].shape[-1]))
     for n, f in itertools.product(range(N), range(G.shape[1])):
         (alone,) = np.nonzero(G[n, f])
@@ -176,7 +183,11 @@ def bounds(primitive, p, middle, spread, correction, period):
     high = np.where(off, np.minimum(free["upper"] + correction, greatest), free["upper"])
     always = {"lower": low, "upper": high, "speed": free["speed"].copy(), "acceleration": free["acceleration"].copy()}
     before = [np.tile(p["start"] + side * p["start_within"], (2, 1)) for side in (-1, 1)]
-    low, high, off = np.vstack([before[0], low]), np.vstack([before[1], high]), np.vstack([np.zeros((2, O), bool), off])
+    low, high, off = (
+        np.vstack([before[0], low]),
+        np.vstack([before[1], high]),
+        np.vstack([np.zeros((2, outs), bool), off]),
+    )
     for n in range(2, N + 2):
         if n > 2 or P:
             new = np.maximum(high[n] - low[n - 1], high[n - 1] - low[n]) / period
@@ -188,7 +199,7 @@ def bounds(primitive, p, middle, spread, correction, period):
     return {"free": free, "always": always}
 
 
-def compare(claims, found):
+def compare(claims: dict[str, Any], found: Regimes) -> None:
     """Rejects a claim that is not what was found; the worst step is named."""
     for regime, name in itertools.product(found, QUANTITIES):
         claimed = np.array(claims[regime][name], dtype=float)  # null is NaN: nothing is known
@@ -203,7 +214,7 @@ def compare(claims, found):
         require(wrong[n, o] <= AGREES, f"step {n}: {regime} {name} of output {o} is {mine[n, o]:.6g}, not as claimed")
 
 
-def check(folder):
+def check(folder: Path) -> None:
     """Raises `Rejected` unless the certificate in a folder holds."""
     p, witness, claims = read(folder)
     period = float(claims["period"])

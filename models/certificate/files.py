@@ -27,7 +27,11 @@ ASSUMPTIONS = (
 
 
 def certificate_files(
-    skill: Skill, certified: Certified, stiffness: np.ndarray | None, limits: np.ndarray | None, about: Mapping[str, Any]
+    skill: Skill,
+    certified: Certified,
+    stiffness: np.ndarray | None,
+    limits: np.ndarray | None,
+    about: Mapping[str, Any],
 ) -> dict[str, bytes]:
     """What each file of a certificate holds, by its name.
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
-from guiderail.models.objects.bnc_connector import BORE_SIDES, MM, BncDimensions, slot_columns
+from guiderail.models.objects.bnc_connector import BORE_SIDES, BncDimensions, slot_columns
 from guiderail.models.objects.bnc_sdf import FRICTION, PAD
 from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hull, Spring, Surface, ring_hulls
 from guiderail.models.objects.triangle_mesh import cylindrical
@@ -25,7 +27,10 @@ def jack_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list
     pad = Surface(
         "pad", "pad", Cylinder(d.pad_radius, d.pad_thickness), PAD.friction, (0.0, 0.0, pad_centre), spring=spring
     )
-    centre, shape = 0.5 * (d.lug_tip_radius + d.lug_root_radius), Cylinder(d.lug_radius, d.lug_tip_radius - d.lug_root_radius)
+    centre, shape = (
+        0.5 * (d.lug_tip_radius + d.lug_root_radius),
+        Cylinder(d.lug_radius, d.lug_tip_radius - d.lug_root_radius),
+    )
     lugs = [
         Surface(f"lug_{number}", "slots", shape, friction, (side * centre, 0.0, d.lug_height), pitch=np.pi / 2)
         for number, side in enumerate((1.0, -1.0))
@@ -61,9 +66,7 @@ def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
 def slot_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
     """What is left between the mouth and the ring's end once both slots are cut: prisms over, under and beside them."""
     outlines = [*_over_the_slot(dimensions), *_under_the_ramp(dimensions), *_beside_the_slot(dimensions)]
-    return [
-        _prism(np.array(outline) + [turn, 0.0], dimensions) for turn in (0.0, np.pi) for outline in outlines
-    ]
+    return [_prism(np.array(outline) + [turn, 0.0], dimensions) for turn in (0.0, np.pi) for outline in outlines]
 
 
 Outline = list[list[float]]
@@ -107,7 +110,7 @@ def _beside_the_slot(d: BncDimensions) -> list[Outline]:
     begin, end = angles[-1], np.pi + angles[0]
     edges = np.linspace(begin, end, 2 + int((end - begin) / WIDEST))
     outlines = []
-    for left, right in zip(edges[:-1], edges[1:], strict=True):
+    for left, right in itertools.pairwise(edges):
         outline = [[left, 0.0], [right, top], [left, top]]
         if left != begin:
             outline += [[left - wide, BELOW]]

@@ -1,4 +1,4 @@
-"""The grid clamp and its table as convex solids, from their drawing: each hole a ring of prisms, the bead of springs."""
+"""The grid clamp and its table as convex solids, from their drawing: holes are rings of prisms, the bead is sprung."""
 
 from __future__ import annotations
 

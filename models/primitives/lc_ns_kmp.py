@@ -338,7 +338,7 @@ class LcNsKmp:
         return factor.output_map[:, :split], factor.output_map[:, split:], factor.output_offset
 
     def free_constraints(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which windows need no correction: map (m, PO+O) from [history, ξ̂], and what it must lie between, (m,) each."""
+        """Which windows need no correction: map (m, PO+O) of [history, ξ̂], and what it must lie between, (m,) each."""
         factor = self._factor(step)
         return factor.constraint_map, factor.lower, factor.upper
 

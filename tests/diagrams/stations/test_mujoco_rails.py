@@ -15,7 +15,7 @@ from guiderail.models.objects.bnc_motion import CLEAR, insert_and_lock, poses
 from guiderail.models.units import MM
 
 pytest.importorskip("mujoco")
-from guiderail.diagrams.stations.mujoco_rails import MujocoStation  # noqa: E402
+from guiderail.diagrams.stations.mujoco_rails import MujocoStation
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
 STIFFNESS = Impedance().stiffness[2]
