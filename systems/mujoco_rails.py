@@ -63,7 +63,7 @@ class MujocoRails(LeafSystem):
     ``body_poses`` the same with tool and workpiece where they are, ``geometry_poses`` those of all frames with
     geometry. ``wrench`` is the filtered y, (6,), force first, in N and Nm; ``impedance_wrench`` is (6,), what the six
     motors push with, in the order of the pose. All that changes is declared state: the engine's positions, velocities
-    and warm start, the filter, and the motors' wrench.
+    and warm start, and the filter.
     """
 
     def __init__(
@@ -107,8 +107,10 @@ class MujocoRails(LeafSystem):
         self._frames = _geometry_frames(plant)
         size = self._mujoco.mj_stateSize(model, self._parts)
         self._physics = slice(0, size)
-        self._filtered, self._motors = slice(size, size + 6), slice(size + 6, size + 12)
-        self._positions = slice(1, 1 + POSE_SIZE)  # the engine's state begins with its time
+        self._filtered = slice(size, size + 6)
+        # The engine's state begins with its time, the positions and the velocities.
+        self._positions = slice(1, 1 + POSE_SIZE)
+        self._velocities = slice(1 + model.nq, 1 + model.nq + POSE_SIZE)
         poses = plant.get_body_poses_output_port()
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._nominal_body_poses_port = self.DeclareAbstractInputPort("nominal_body_poses", poses.Allocate())
@@ -126,7 +128,12 @@ class MujocoRails(LeafSystem):
 
         self._pose_port = part("pose", self._positions)
         self._wrench_port = part("wrench", self._filtered)
-        self._impedance_wrench_port = part("impedance_wrench", self._motors)
+        self._impedance_wrench_port = self.DeclareVectorOutputPort(
+            "impedance_wrench",
+            6,
+            self._calc_impedance_wrench,
+            prerequisites_of_calc=state | {self._desired_pose_port.ticket()},
+        )
         self._body_poses_port = self.DeclareAbstractOutputPort(
             "body_poses", poses.Allocate, self._calc_body_poses, prerequisites_of_calc=placed
         )
@@ -180,7 +187,7 @@ class MujocoRails(LeafSystem):
     def _at_rest(self, pose: np.ndarray) -> np.ndarray:
         self._mujoco.mj_resetData(self.model, self._data)
         self._data.qpos[:POSE_SIZE] = pose
-        return np.concatenate([self._engine_state(), np.zeros(12)])
+        return np.concatenate([self._engine_state(), np.zeros(6)])
 
     def _engine_state(self) -> np.ndarray:
         state = np.empty(self._physics.stop)
@@ -202,9 +209,7 @@ class MujocoRails(LeafSystem):
             self._mujoco.mj_step(model, data)
             newest = self._contact_wrench()
             filtered = newest + self._decay * (filtered - newest)
-        discrete_state.set_value(
-            self._state, np.concatenate([self._engine_state(), filtered, data.actuator_force[:POSE_SIZE]])
-        )
+        discrete_state.set_value(self._state, np.concatenate([self._engine_state(), filtered]))
         return EventStatus.Succeeded()
 
     def _place(self, poses: list[RigidTransform]) -> None:
@@ -224,6 +229,14 @@ class MujocoRails(LeafSystem):
         """What the contacts do to the joints, turned back: slides are T's axes, about hinges a torque t does a · t."""
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
+
+    def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:
+        """What the motors push with now, by the law that the engine's actuators follow."""
+        model, state = self.model, self._values(context)
+        springs, dampers = model.actuator_gainprm[:POSE_SIZE, 0], -model.actuator_biasprm[:POSE_SIZE, 2]
+        pull = springs * (self._desired_pose_port.Eval(context) - state[self._positions])
+        limits = model.actuator_forcerange[:POSE_SIZE]
+        output.SetFromVector(np.clip(pull - dampers * state[self._velocities], limits[:, 0], limits[:, 1]))
 
     def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
         poses = list(self._nominal_body_poses_port.Eval(context))

@@ -1,4 +1,4 @@
-"""`guiderail certify`: what a skill can command at all, whatever its policy does, as a file that a stranger can check."""
+"""`guiderail certify`: what a skill can command at all, whatever its policy does, as a file that anybody can check."""
 
 from __future__ import annotations
 

@@ -448,12 +448,14 @@ def bench(
     what: Annotated[str, _arg("What is measured: {benchmarks}.", "WHAT", "benchmarks")],
     task: Annotated[str | None, _arg("Whose training is measured: {tasks}.", "TASK", "tasks")] = None,
     env: Env = None,
-    picture: Annotated[Path | None, _opt("Where a picture of the time steps' errors is written.")] = None,
+    picture: Annotated[
+        Path | None, _opt("Where a picture of the time steps' errors, or of the engines, is written.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure how fast the primitive, the simulation or a learner is here, or where a training run's time goes.
 
-    Of the simulation's time_step it measures the error, too.
+    Of the simulation's time_step it measures the error, too, and of two physics engines the forces.
 
     It takes a minute or two.
     """

@@ -65,7 +65,7 @@ def test_known_pose_inserts_and_locks(locked_and_pulled):
 
 
 def test_the_sensor_feels_what_the_impedance_pushes_with(locked_and_pulled):
-    turning = slice(250, 330)
+    turning = slice(250, 315)
     _, recording, _ = locked_and_pulled
     felt = np.linalg.norm(recording["wrench"][turning, :3], axis=1)
     # Sliding over facets rattles: the two agree over a tenth of a second, and not in every sample.
@@ -119,7 +119,7 @@ def test_the_clamp_snaps_in_and_the_snap_gives_way(inserted):
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     resistance = force[z > 0.85].max()
     assert 2.0 < resistance < 8.0
-    assert np.ptp(z[(z < 0.85) & (z > 0.1)]) > 0.0 or z[np.flatnonzero(z < 0.85)[0]] < 0.1  # it jumps past the crest
+    assert z[np.flatnonzero(z < 0.85)[1]] < 0.1  # past the crest it jumps in
     assert recording["wrench"][:, 2].max() > resistance  # only then comes the shoulder
 
 
@@ -169,14 +169,12 @@ def test_what_a_task_draws_is_where_the_engine_has_it():
     env = make_env("BncConnector", station="mujoco", uncertainty="disc", grasp_angle=1.0)
     _, info = env.reset(seed=2)
     station = env.task.diagram.GetSubsystemByName("station")
-    context = station.rails.GetMyContextFromRoot(env.simulator.get_context())
     env.step(np.zeros(2))
     model = station.rails.model
     X_TT = RigidTransform([*info["jack_offset"], 0.0])
     expected = (X_TT @ CONNECTOR.X_JT.inverse()).translation()
     np.testing.assert_allclose(model.body("fixture").pos, expected, atol=1e-12)
     np.testing.assert_allclose(model.body("workpiece").pos[:2], info["grasp_offset"][:2], atol=1e-12)
-    assert context.get_discrete_state_vector().size() > 12
 
 
 class Unknown:
