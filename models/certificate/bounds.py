@@ -6,10 +6,12 @@ are certified.
 
 - *free*: for all sequences, as long as no constraint had to be enforced. Exact.
 - *always*: for all sequences. Up to the first step whose window a constraint can touch it is the free regime. From
-  there on a constrained output is capped by the constraint set. Without a history (KGRL) the correction's size is a
-  convex function of the action, so that it is largest at a corner of the actions, and moves an output by at most that
-  size times the output's own (Cauchy and Schwarz). With a history corrections feed back, and an output that no
-  constraint caps has no bound in this regime.
+  there on a constrained output is capped by the constraint set. Without a history (KGRL) a command is a function of
+  one action, and the actions are cut into cells. Between a cell's corners the mean v̄ of the corners' corrections v_i
+  is a feasible one, and the least one v of any action is no farther from it than ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², where a
+  corner's multipliers bound ‖v‖ from below (weak duality). So a command is between the corners' by that radius times
+  the output's size. With a history corrections feed back, and an output that no constraint caps, and that is tied to
+  one that is constrained, has no bound in this regime.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ import numpy as np
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
-MOST_ACTIONS = 8  # of which all corners are looked at
+CELLS = {1: 8, 2: 4, 3: 2}  # along each action, by how many actions there are; one for more
+MOST_ACTIONS = 6  # of which all corners are looked at
+ROUNDING = 1e-6  # of a squared correction: a radius below its root is none
 
 
 @dataclass(frozen=True)
@@ -63,8 +67,8 @@ class Certified:
     Attributes:
         free, always: the two regimes.
         touched: (N,), whether a constraint can be active in a step's window, whatever the actions before.
-        multipliers: at the steps that are touched, for every corner of the actions (T, 2^A, H+1, F): what proves how
-            large a correction can be; empty with a history.
+        multipliers: at the steps that are touched, for every corner of a cell of the actions (T, (K+1)^A, H+1, F):
+            what proves how far commands go; empty with a history.
     """
 
     free: Bounds
@@ -85,26 +89,31 @@ def certify(skill: Skill) -> Certified:
     touched = _touched(skill, middle, generators)
     if primitive.history:
         unknown = np.logical_or.accumulate(touched)[:, None] & _coupled(primitive)
-        correction = np.where(unknown, np.inf, 0.0)
-        multipliers = _no_multipliers(primitive)
+        reach, multipliers = np.where(unknown, np.inf, np.nan) * np.array([-1.0, 1.0])[:, None, None], _none(primitive)
     else:
-        correction, multipliers = _corrections(skill, touched)
-    return Certified(free, _always(skill, free, correction), touched, multipliers)
+        reach, multipliers = _cellwise(skill, touched)
+    return Certified(free, _always(skill, free, reach), touched, multipliers)
 
 
-def corners(gains: np.ndarray) -> np.ndarray:
-    """(2^A, O): the raw actions at the corners of what a policy may send.
+def nodes(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
+    """The corners (C, O) of all cells of the raw actions, and which of them each cell has.
 
     Raises:
-        InputError: for too many.
+        InputError: for too many actions.
     """
     moved = np.flatnonzero(gains)
     if len(moved) > MOST_ACTIONS:
         raise InputError(f"the corners of {len(moved)} actions are too many to look at: explore {MOST_ACTIONS} at most")
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=len(moved)))).reshape(-1, len(moved))
-    raw = np.zeros((len(signs), len(gains)))
-    raw[:, moved] = signs * gains[moved]
-    return raw
+    along = CELLS.get(len(moved), 1)
+    places = list(itertools.product(range(along + 1), repeat=len(moved)))
+    number = {place: i for i, place in enumerate(places)}
+    raw = np.zeros((len(places), len(gains)))
+    raw[:, moved] = (2.0 * np.array(places).reshape(-1, len(moved)) / along - 1.0) * gains[moved]
+    cells = [
+        [number[tuple(np.add(first, step))] for step in itertools.product((0, 1), repeat=len(moved))]
+        for first in itertools.product(range(along), repeat=len(moved))
+    ]
+    return raw, cells
 
 
 def _reach(skill: Skill) -> tuple[np.ndarray, np.ndarray]:
@@ -153,19 +162,48 @@ def _touched(skill: Skill, middle: np.ndarray, generators: np.ndarray) -> np.nda
     return touched
 
 
-def _corrections(skill: Skill, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far a correction can move each output (N, O), and the multipliers that prove it."""
+def _cellwise(skill: Skill, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest commands (2, N, O) at touched steps, NaN at others, and the multipliers that prove them."""
     primitive = skill.primitive
-    largest, multipliers = np.zeros((primitive.num_steps, primitive.num_outputs)), []
-    for n in np.flatnonzero(touched):
-        found = [primitive.predict(int(n), action) for action in corners(skill.gains)]
+    reach, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
+    actions, cells = nodes(skill.gains)
+    for n in map(int, np.flatnonzero(touched)):
+        found = [primitive.predict(n, action) for action in actions]
         multipliers.append([one.multipliers for one in found])
-        size = max(one.correction_size for one in found)
-        largest[n] = size * primitive.output_sizes(int(n))
-    return largest, np.array(multipliers) if multipliers else _no_multipliers(primitive)
+        rows, lower, upper = primitive.free_constraints(n)
+        empty = np.zeros(next((len(one.correction) for one in found if one.correction is not None), 0))
+        corrections = np.array([empty if one.correction is None else one.correction for one in found])
+        free, outputs, sizes = actions @ rows.T, np.array([one.output for one in found]), primitive.output_sizes(n)
+        ranges = []
+        for cell in cells:
+            least = [_least_sizes(found[k].signed_multipliers, free[cell], lower, upper, corrections[k]) for k in cell]
+            radius = sizes * np.sqrt(min(_squared_radius(corrections[cell], one) for one in least))
+            ranges.append([outputs[cell].min(axis=0) - radius, outputs[cell].max(axis=0) + radius])
+        reach[0, n], reach[1, n] = np.min(ranges, axis=0)[0], np.max(ranges, axis=0)[1]
+    return reach, np.array(multipliers) if multipliers else _none(primitive)
 
 
-def _no_multipliers(primitive: LcNsKmp) -> np.ndarray:
+def _least_sizes(
+    signed: np.ndarray | None, free: np.ndarray, lower: np.ndarray, upper: np.ndarray, correction: np.ndarray
+) -> np.ndarray:
+    """What multipliers say of the size of a cell's corners' corrections at least; zeros where that is nothing."""
+    size = np.linalg.norm(correction)
+    if signed is None or not size > 0.0:
+        return np.zeros(len(free))
+    at_lower, at_upper = signed < 0.0, signed > 0.0
+    short = (lower - free)[:, at_lower] @ -signed[at_lower] + (free - upper)[:, at_upper] @ signed[at_upper]
+    return short / size if (short >= 0.0).all() else np.zeros(len(free))
+
+
+def _squared_radius(corrections: np.ndarray, least: np.ndarray) -> float:
+    """How far the least correction of any action in a cell can be from the mean of the corners' there, squared."""
+    squared = np.sum(corrections**2, axis=1)
+    apart = np.sum((corrections[:, None] - corrections) ** 2, axis=2)
+    between = 0.5 * max(float(np.max((least[:, None] - least) ** 2 - apart)), 0.0)
+    return max(float(np.max(squared - least**2)) + between, ROUNDING * float(squared.max()))
+
+
+def _none(primitive: LcNsKmp) -> np.ndarray:
     return np.zeros((0, 0, primitive.horizon + 1, primitive.constraints.num_constraints))
 
 
@@ -194,11 +232,11 @@ def caps(skill: Skill) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def _always(skill: Skill, free: Bounds, correction: np.ndarray) -> Bounds:
-    corrected = correction > 0.0
+def _always(skill: Skill, free: Bounds, reach: np.ndarray) -> Bounds:
+    corrected = ~np.isnan(reach[0])
     least, greatest = caps(skill)
-    lower = np.where(corrected, np.maximum(free.lower - correction, least), free.lower)
-    upper = np.where(corrected, np.minimum(free.upper + correction, greatest), free.upper)
+    lower = np.where(corrected, np.maximum(reach[0], least), free.lower)
+    upper = np.where(corrected, np.minimum(reach[1], greatest), free.upper)
     speed, acceleration = free.speed.copy(), free.acceleration.copy()
     begin = np.broadcast_to([skill.start - skill.start_within, skill.start + skill.start_within], (2, *lower.shape[1:]))
     for n in range(len(lower)):

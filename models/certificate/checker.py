@@ -4,7 +4,6 @@ It reads what the primitive is, forms problem 4.5 at every step anew from the ke
 what all sequences of actions can come to. It says yes, or no and where. Exit code 0 or 1; 2 if a file can't be read.
 
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹
-
 W maps the history h on the window and C is the kernel given the history. A correction for constraints G y ≥ c with
 multipliers α ≥ 0 moves the window by S Gᵀ α; its squared size is αᵀ G S Gᵀ α.
 """
@@ -23,6 +22,7 @@ Regimes = dict[str, Arrays]
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
 AGREES = 1e-4  # of a quantity's largest value: how well two ways of calculating it agree
 KEEPS = 1e-7  # of a constraint's size: how well a correction that is shown must keep it
+ROUNDING = 1e-6  # of a squared correction: a radius below its root is none
 
 
 class Rejected(Exception):
@@ -78,11 +78,10 @@ class Primitive:
 
     def kernel(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """W (H+1, P), and features F of the kernel given the history, F Fᵀ = C."""
-        t = self.inputs[n : n + self.past + self.horizon + 1]
+        P, t = self.past, self.inputs[n : n + self.past + self.horizon + 1]
         key = np.round((t - t[0]).astype(float), 12).tobytes()
         if key not in self.known:
             k = np.exp(-np.longdouble(self.inverse_length) * (t[:, None] - t[None, :]) ** 2)
-            P = self.past
             W = solve(k[:P, :P] + self.noise * np.eye(P, dtype=k.dtype), k[:P, P:]).T
             values, vectors = np.linalg.eigh((k[P:, P:] - W @ k[:P, P:]).astype(float))
             kept = values > 1e-15 * values[-1]
@@ -95,17 +94,13 @@ class Primitive:
         outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
         precision = np.linalg.inv(self.covariances[at])
         M = np.einsum("ja,jb,jop->aobp", F, F, precision).reshape(F.shape[1] * outs, -1)
-        M += self.hbar * np.eye(len(M))
         F_bar = np.kron(F, np.eye(outs))
-        L = np.linalg.solve(np.linalg.cholesky((M + M.T) / 2), F_bar.T).T
+        L = np.linalg.solve(np.linalg.cholesky((M + M.T) / 2 + self.hbar * np.eye(len(M))), F_bar.T).T
         weigh = np.einsum("joa,jop->jpa", L.reshape(len(at), outs, -1), precision).reshape(F_bar.shape[0], -1)
         W_bar = np.kron(W, np.eye(outs))
         history = W_bar - L @ (weigh.T @ W_bar)
-        G, c = (
-            (self.G[at], self.c[at])
-            if self.G.ndim == 3
-            else (np.tile(self.G, (len(at), 1, 1)),) + (np.tile(self.c, (len(at), 1)),)
-        )
+        G = np.broadcast_to(self.G, (self.steps, *self.G.shape[-2:]))[at]
+        c = np.broadcast_to(self.c, (self.steps, self.c.shape[-1]))[at]
         rows = np.zeros((G.shape[0] * G.shape[1], F_bar.shape[0]))
         for j, f in itertools.product(range(G.shape[0]), range(G.shape[1])):
             rows[j * G.shape[1] + f, j * outs : (j + 1) * outs] = G[j, f]
@@ -113,15 +108,13 @@ class Primitive:
 
 
 def reach(primitive: Primitive, p: Arrays, witness: Arrays) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Free motion, generators, which steps constraints touch, and how far corrections can move each output."""
+    """Free motion, generators, and what corrected commands reach (2, N, outputs): NaN where none is corrected."""
     P, N, outs = primitive.past, primitive.steps, primitive.outputs
-    moved, claimed = np.flatnonzero(p["gains"]), witness["touched"]
+    moved, claimed = np.flatnonzero(p["gains"]), witness["touched"].astype(bool)
     require(claimed.shape == (N,), "the witness has not one entry for each step")
-    A = len(moved)
-    middle, spread = np.zeros((P + N, outs)), np.zeros((P + N, outs, N * A + outs))
+    middle, spread = np.zeros((P + N, outs)), np.zeros((P + N, outs, N * (A := len(moved)) + outs))
     middle[:P], spread[:P, :, N * A :] = p["start"], np.diag(p["start_within"])
-    correction, shown = np.zeros((N, outs)), 0
-    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=A if P == 0 else 0))).reshape(-1, A)
+    corrected = np.full((2, N, outs), np.nan)
     for n in range(N):
         history, action, offset, L, rows, c = primitive.window(n)
         y = history @ middle[n : P + n].ravel() + offset
@@ -129,39 +122,53 @@ def reach(primitive: Primitive, p: Arrays, witness: Arrays) -> tuple[np.ndarray,
         by = action[:, moved] * p["gains"][moved]
         g[:, n * A : (n + 1) * A] += by
         middle[P + n], spread[P + n] = y[:outs], g[:outs]
-        touches = len(c) > 0 and bool((rows @ y - np.abs(rows @ g).sum(axis=1) < c - 1e-12).any())
-        require(claimed[n] or not touches or _nearly(rows, y, g, c), f"step {n}: a constraint can be active there")
+        touches = len(c) > 0 and (rows @ y - np.abs(rows @ g).sum(axis=1) < c - KEEPS).any()
+        require(claimed[n] or not touches, f"step {n}: a constraint can be active there")
         if claimed[n] and P == 0:
-            alphas = witness["multipliers"][shown]
-            shown += 1
-            require(len(alphas) == len(signs), f"step {n}: not every corner of the actions is shown")
-            size = max(
-                _size(y + by @ sign, alpha.ravel(), L, rows, c, n) for sign, alpha in zip(signs, alphas, strict=True)
-            )
-            correction[n] = size * np.linalg.norm(L[:outs], axis=1)
+            corrected[:, n] = cells(y, by, L, rows, c, witness["multipliers"][claimed[:n].sum()], n, outs)
     if P:
         tied, reached = (p["covariances"] != 0).any(axis=0), (p["G"].reshape(-1, outs) != 0).any(axis=0)
         for _ in range(outs):
             reached = reached | (tied & reached).any(axis=1)
-        correction = np.where(np.logical_or.accumulate(claimed)[:, None] & reached, np.inf, 0.0)
-    return middle, spread, correction
+        unknown = np.logical_or.accumulate(claimed)[:, None] & reached
+        corrected[0, unknown], corrected[1, unknown] = -np.inf, np.inf
+    return middle, spread, corrected
 
 
-def _nearly(rows: np.ndarray, y: np.ndarray, g: np.ndarray, c: np.ndarray) -> bool:
-    """Whether a window that seems to be touched is so by rounding alone."""
-    return bool((rows @ y - np.abs(rows @ g).sum(axis=1) >= c - KEEPS).all())
+def cells(
+    y: np.ndarray, by: np.ndarray, L: np.ndarray, rows: np.ndarray, c: np.ndarray, alphas: np.ndarray, n: int, outs: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest corrected command of step n, by cells of the actions whose corners' multipliers are shown.
 
-
-def _size(y: np.ndarray, alpha: np.ndarray, L: np.ndarray, rows: np.ndarray, c: np.ndarray, n: int) -> float:
-    require((alpha >= 0).all() and alpha.shape == c.shape, f"step {n}: these are no multipliers")
-    force = L.T @ (rows.T @ alpha)
-    kept = rows @ (y + L @ force) - c
-    require((kept >= -KEEPS * (1 + np.abs(c))).all(), f"step {n}: the correction that is shown breaks a constraint")
-    return float(np.linalg.norm(force))
+    Between corners the mean of their corrections is feasible, and the least one v is within ‖v̄‖² − ‖v‖² of it.
+    """
+    A, alphas = by.shape[1], alphas.reshape(len(alphas), -1)
+    along = round(len(alphas) ** (1 / A)) - 1
+    require(along >= 1 and (along + 1) ** A == len(alphas), f"step {n}: not every corner of the actions is shown")
+    require((alphas >= 0).all() and alphas.shape[1] == len(c), f"step {n}: these are no multipliers")
+    places = np.array(list(itertools.product(range(along + 1), repeat=A)))
+    free = y + (2.0 * places / along - 1.0) @ by.T
+    v = alphas @ rows @ L
+    short = c - free @ rows.T
+    kept = ((free + v @ L.T) @ rows.T - c >= -KEEPS * (1 + np.abs(c))).all()
+    require(kept, f"step {n}: the correction that is shown breaks a constraint")
+    least, commands = alphas @ short.T, (free + v @ L.T)[:, :outs]
+    found = []
+    for first in itertools.product(range(along), repeat=A):
+        i = np.flatnonzero(((places >= first) & (places <= np.add(first, 1))).all(axis=1))
+        squared, apart = (v[i] ** 2).sum(axis=1), ((v[i][:, None] - v[i]) ** 2).sum(axis=2)
+        radii = []
+        for k in i:
+            d, size = least[k, i], np.linalg.norm(v[k])
+            d = d / size if size > 0 and (d >= 0).all() else 0 * d
+            radii.append((squared - d**2).max() + max(((d[:, None] - d) ** 2 - apart).max(), 0) / 2)
+        radius = np.linalg.norm(L[:outs], axis=1) * np.sqrt(max(min(radii), ROUNDING * squared.max()))
+        found.append((commands[i].min(axis=0) - radius, commands[i].max(axis=0) + radius))
+    return np.min(found, axis=0)[0], np.max(found, axis=0)[1]
 
 
 def bounds(
-    primitive: Primitive, p: Arrays, middle: np.ndarray, spread: np.ndarray, correction: np.ndarray, period: float
+    primitive: Primitive, p: Arrays, middle: np.ndarray, spread: np.ndarray, corrected: np.ndarray, period: float
 ) -> Regimes:
     """Both regimes' quantities, each (N, outs)."""
     P, N, outs = primitive.past, primitive.steps, primitive.outputs
@@ -174,20 +181,19 @@ def bounds(
     G, c = np.broadcast_to(p["G"], (N, *p["G"].shape[-2:])), np.broadcast_to(p["c"], (N, p["c"].shape[-1]))
     for n, f in itertools.product(range(N), range(G.shape[1])):
         (alone,) = np.nonzero(G[n, f])
-        if len(alone) == 1 and G[n, f, alone[0]] > 0:
-            least[n, alone[0]] = max(least[n, alone[0]], c[n, f] / G[n, f, alone[0]])
-        elif len(alone) == 1:
-            greatest[n, alone[0]] = min(greatest[n, alone[0]], c[n, f] / G[n, f, alone[0]])
-    off = correction > 0
-    low = np.where(off, np.maximum(free["lower"] - correction, least), free["lower"])
-    high = np.where(off, np.minimum(free["upper"] + correction, greatest), free["upper"])
+        if len(alone) == 1:
+            cap, o = c[n, f] / G[n, f, alone[0]], (n, alone[0])
+            if G[n, f, o[1]] > 0:
+                least[o] = max(least[o], cap)
+            else:
+                greatest[o] = min(greatest[o], cap)
+    off = ~np.isnan(corrected[0])
+    low = np.where(off, np.maximum(corrected[0], least), free["lower"])
+    high = np.where(off, np.minimum(corrected[1], greatest), free["upper"])
     always = {"lower": low, "upper": high, "speed": free["speed"].copy(), "acceleration": free["acceleration"].copy()}
     before = [np.tile(p["start"] + side * p["start_within"], (2, 1)) for side in (-1, 1)]
-    low, high, off = (
-        np.vstack([before[0], low]),
-        np.vstack([before[1], high]),
-        np.vstack([np.zeros((2, outs), bool), off]),
-    )
+    low, high = np.vstack([before[0], low]), np.vstack([before[1], high])
+    off = np.vstack([np.zeros((2, outs), bool), off])
     for n in range(2, N + 2):
         if n > 2 or P:
             new = np.maximum(high[n] - low[n - 1], high[n - 1] - low[n]) / period

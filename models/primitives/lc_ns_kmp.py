@@ -59,9 +59,14 @@ class Prediction:
         return self._v is not None
 
     @property
-    def correction_size(self) -> float:
-        """How large the correction is, the least that keeps the constraints; zero where none had to be enforced."""
-        return 0.0 if self._v is None else float(np.linalg.norm(self._v))
+    def correction(self) -> np.ndarray | None:
+        """v (r,), the least that keeps the constraints, in units in which `output_sizes` is what it does at most."""
+        return self._v
+
+    @property
+    def signed_multipliers(self) -> np.ndarray | None:
+        """(m,) of the rows of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower bound."""
+        return self._signed
 
     @property
     def multipliers(self) -> np.ndarray:

@@ -14,7 +14,7 @@ PERIOD, POSE = 0.125, -5.0
 def delivered(steps=12, seed=0, **options):
     """What arrives in each period, of commands that count the periods."""
     builder = DiagramBuilder()
-    ramp = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 100.0 * PERIOD], [[0.0, 100.0]]))
+    ramp = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 500.0 * PERIOD], [[0.0, 500.0]]))
     ramp = builder.AddSystem(ramp)
     hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
     pose = builder.AddSystem(ConstantVectorSource([POSE]))
