@@ -57,4 +57,4 @@ class Disturbances(Options):
     @property
     def any(self) -> bool:
         """Whether anything is other than it should be."""
-        return self != type(self)()
+        return self != type(self).model_validate({})

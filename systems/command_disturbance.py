@@ -1,7 +1,5 @@
 """A line that loses commands, or is slow."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.systems.framework import (
     BasicVector,

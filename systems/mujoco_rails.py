@@ -1,7 +1,5 @@
 """A workcell on six rails, stepped by MuJoCo."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -68,7 +66,7 @@ class MujocoRails(LeafSystem):
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        model: "mujoco.MjModel",
         plant: MultibodyPlant,
         moved: MovedBodies,
         X_WT: RigidTransform,

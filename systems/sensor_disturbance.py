@@ -1,7 +1,5 @@
 """A sensor that is not what it should be."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.systems.framework import (
     BasicVector,

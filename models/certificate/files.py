@@ -103,5 +103,6 @@ def _bounds(bounds: Bounds) -> dict[str, Any]:
 
 def _npz(arrays: Mapping[str, Any]) -> bytes:
     content = BytesIO()
-    np.savez(content, **{name: np.asarray(value) for name, value in arrays.items()})
+    values: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+    np.savez(content, **values)
     return content.getvalue()

@@ -113,4 +113,4 @@ def test_a_robot_is_not_disturbed():
 
 
 def test_every_disturbance_is_off_by_default():
-    assert not Disturbances().any
+    assert not Disturbances.model_validate({}).any
