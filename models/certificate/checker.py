@@ -215,7 +215,7 @@ def compare(claims: dict[str, Any], found: Regimes) -> None:
         known = np.isfinite(mine)
         require((np.isfinite(claimed) == known).all(), f"{regime} {name} is known where it is not, or unknown")
         scale = np.maximum(np.abs(np.where(known, mine, 0.0)).max(axis=0), 1e-9)
-        wrong = np.where(known, np.abs(np.where(known, claimed - mine, 0.0)) / scale, 0.0)
+        wrong = np.abs(np.where(known, claimed, 0.0) - np.where(known, mine, 0.0)) / scale
         n, o = np.unravel_index(int(wrong.argmax()), wrong.shape)
         require(wrong[n, o] <= AGREES, f"step {n}: {regime} {name} of output {o} is {mine[n, o]:.6g}, not as claimed")
 
