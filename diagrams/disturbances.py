@@ -7,7 +7,6 @@ from typing import Any
 from pydantic import Field, field_validator
 
 from guiderail.diagrams.options import Integer, Number, Numbers, Options
-from guiderail.diagrams.stations.station import CONTROL_PERIOD
 
 MANY_TIMES = 100.0
 """The largest factor that anything may be off by, either way."""
@@ -36,7 +35,9 @@ class Disturbances(Options):
     pose_bias: Number = Field(0.0, ge=0, le=0.01, description="largest error of measured x, y, z, every episode [m]")
     lost_commands: Number = Field(0.0, ge=0, lt=1, description="how likely a command doesn't arrive")
     late_commands: Integer = Field(0, ge=0, le=50, description="control steps by which a command is late")
-    control_period: Number = Field(CONTROL_PERIOD, gt=0, le=1, description="of the controller's clock [s]")
+    control_period: Number | None = Field(
+        None, gt=0, le=1, description="of the controller's clock [s], the station's own"
+    )
     stiffness_factor: Number = Field(1.0, gt=0, le=MANY_TIMES, description="of the impedance's stiffness")
     payload: Number = Field(0.0, ge=0, le=5, description="mass at an arm's tool that its controller ignores [kg]")
 

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 
 from guiderail.diagrams.disturbances import Disturbances
 from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
     OUTPUTS,
     PLANT_PERIOD,
     POSE_SIZE,
@@ -125,6 +126,8 @@ def _drawn(rng: np.random.Generator, factors: tuple[float, ...]) -> float:
 
 
 def _period(d: Disturbances) -> float:
+    if d.control_period is None:
+        return CONTROL_PERIOD
     steps = round(d.control_period / PLANT_PERIOD)
     if steps < 1 or abs(steps * PLANT_PERIOD - d.control_period) > 1e-6:
         raise InputError(

@@ -90,6 +90,16 @@ def test_lost_and_late_commands_leave_the_tool_behind(plain):
     assert late.trace.measured[-1, 2] > plain[0].trace.measured[24, 2] + 1.0 * MM
 
 
+def test_a_payload_hangs_from_the_arms_tool_and_its_controller_knows_nothing_of_it():
+    env = make_env("GridClamp", station="arm", payload=0.3)
+    env.reset(seed=0)
+    arm = env.task.diagram.GetSubsystemByName("station").GetSubsystemByName("station")
+    tool = arm.arm.tool[0]
+    mass = tool.get_mass(arm.plant.GetMyContextFromRoot(env.simulator.get_context()))
+    assert mass == pytest.approx(tool.default_mass() + 0.3)
+    assert tool.get_mass(arm.plant.CreateDefaultContext()) == pytest.approx(tool.default_mass())
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
