@@ -104,5 +104,5 @@ def _bounds(bounds: Bounds) -> dict[str, Any]:
 def _npz(arrays: Mapping[str, Any]) -> bytes:
     content = BytesIO()
     values: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
-    np.savez(content, **values)
+    np.savez_compressed(content, **values)  # most multipliers are zero
     return content.getvalue()
