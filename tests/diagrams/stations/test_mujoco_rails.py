@@ -90,7 +90,7 @@ def test_rotating_before_insertion_is_blocked_by_the_lugs():
     assert recording["pose"][-1, 2] == pytest.approx(LUG_TOP, abs=0.1 * MM)
 
 
-@pytest.mark.parametrize("axis", (0, 2, 3, 4))
+@pytest.mark.parametrize("axis", [0, 2, 3, 4])
 def test_what_is_commanded_beyond_a_stop_deflects_by_the_inverse_stiffness(axis):
     """Static displacement under a known load is within 2 % of K⁻¹ f: the load is what the sensor feels."""
     stiffness = np.array(Impedance().stiffness)
