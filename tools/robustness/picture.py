@@ -24,7 +24,7 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     axes = list(dict.fromkeys(table["axis"]))
     columns = min(COLUMNS, len(axes))
     bands = -(-len(axes) // columns)
-    figure, panels = new_figure(2 * bands, columns, (3.2 * columns, 3.6 * bands + 0.5))
+    figure, panels = new_figure(2 * bands, columns, (max(3.2 * columns, 6.4), 3.6 * bands + 0.5))
     colours = dict(zip(dict.fromkeys(table["who"]), COLOURS * 9, strict=False))
     for number, name in enumerate(axes):
         success, force = (panels[2 * (number // columns) + part, number % columns] for part in (0, 1))
