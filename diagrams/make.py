@@ -12,11 +12,13 @@ from pydantic import Field
 from pydrake.systems.framework import Diagram, System
 from threadpoolctl import threadpool_limits
 
+from guiderail.diagrams.disturbances import Disturbances
 from guiderail.diagrams.env import GuidedEnv, check_render_mode
 from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.registry import GUIDANCE, build_guidance, check_guidance, possible_guidance
 from guiderail.diagrams.options import Integer, Options, PrimitiveOptions, TemplateOptions, choose, validated
 from guiderail.diagrams.pool import Pool
+from guiderail.diagrams.stations.disturbed import disturbed
 from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import TaskDiagram
@@ -45,7 +47,8 @@ class Resolved:
     Attributes:
         task: the declaration.
         station: the kind of station.
-        models: the options by whom they concern: "common", "task", "station", "primitive", "template", "guidance".
+        models: the options by whom they concern: "common", "task", "station", "primitive", "template", "guidance",
+            "disturbances".
     """
 
     task: Task
@@ -68,6 +71,7 @@ def option_models(task: type[Task], guidance: str, station: str) -> dict[str, ty
         "primitive": PrimitiveOptions if "demonstrations" in task.knows() else Options,
         "template": TemplateOptions if "template" in task.knows() else Options,
         "guidance": kind.options or Options,
+        "disturbances": Disturbances if task.world_kind == "workcell" else Options,
     }
 
 
@@ -106,7 +110,11 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
 
 def make_station(resolved: Resolved) -> Station:
     """The station of an environment, its world in it."""
-    return resolved.station.build(resolved.task.world(), **_values(resolved.models["station"]))
+    kind, disturbances = resolved.station, resolved.models["disturbances"]
+    build = partial(kind.build, resolved.task.world(), **_values(resolved.models["station"]))
+    return (
+        disturbed(build, disturbances, kind.simulated, kind.name) if isinstance(disturbances, Disturbances) else build()
+    )
 
 
 def make_guidance(resolved: Resolved, station: Station) -> Diagram:

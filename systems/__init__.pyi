@@ -3,6 +3,7 @@ from .cartesian_impedance_controller import CartesianImpedanceController as Cart
 from .cartesian_impedance_controller import ImpedanceGains as ImpedanceGains
 from .cartesian_position_controller import CartesianPositionController as CartesianPositionController
 from .cartesian_position_controller import SpeedLimits as SpeedLimits
+from .command_disturbance import CommandDisturbance as CommandDisturbance
 from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_lever import ContactLever as ContactLever
@@ -21,6 +22,8 @@ from .lc_ns_kmp_system import LcNsKmpSystem as LcNsKmpSystem
 from .mean_force import MeanForce as MeanForce
 from .measured_pose import MeasuredPose as MeasuredPose
 from .meshcat_device import MeshcatDevice as MeshcatDevice
+from .mujoco_rails import MovedBodies as MovedBodies
+from .mujoco_rails import MujocoRails as MujocoRails
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
 from .pose_wrench import PoseWrench as PoseWrench
@@ -34,6 +37,7 @@ from .safety_filter import SafetyFilter as SafetyFilter
 from .safety_ledger import SafetyLedger as SafetyLedger
 from .sct_input_mapping import SctInputMapping as SctInputMapping
 from .sct_state_machine import SctStateMachine as SctStateMachine
+from .sensor_disturbance import SensorDisturbance as SensorDisturbance
 from .status_watchdog import StatusWatchdog as StatusWatchdog
 from .torque_guard import Phase as Phase
 from .torque_guard import SafetyLimits as SafetyLimits

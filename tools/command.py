@@ -44,6 +44,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
     "generated": _known("tools.recording.generate", "GENERATED"),
     "pictures": _known("tools.files", "PICTURES"),
+    "axes": lambda: [axis.name for axis in import_module("guiderail.tools.robustness.axes").AXES],
     "listed": lambda: [*LISTED, *CHOICES["tasks"]()],
 }
 
@@ -202,6 +203,71 @@ def evaluate(
         typer.echo("differs from the thesis in")
     for words in differs:
         typer.echo(f"  · {words}")
+
+
+@command("robustness runs/connector --env station=mujoco --episodes 50")
+def robustness(
+    run: Run,
+    episodes: Annotated[int, _opt("How many held-out episodes, for each who at each place.")] = 30,
+    seed: Seed = 1_000_000,
+    axes: Annotated[str | None, _opt("What is changed, comma-separated: {axes}.  [default: all]")] = None,
+    env: Env = None,
+    beside: Annotated[
+        str | None, _opt("Who else meets the same episodes, or none.  [default: white actions, and the rule]")
+    ] = None,
+    out: Annotated[Path | None, _opt("The folder to write.  [default: robustness/STATION in the run]")] = None,
+    as_json: Json = False,
+) -> None:
+    """Judge a run's policy where friction, stiffness, sensors, commands or the clock are other than it learned with.
+
+    One thing is changed at a time. What is done is kept: started again, it goes on where it was interrupted.
+    """
+    from guiderail.tools.robustness.robustness import breaks
+    from guiderail.tools.robustness.robustness import robustness as judge
+
+    environment = _environment(env)
+    others = _beside(run, environment, beside)
+    if beside is None:
+        others = {name: acts for name, acts in others.items() if name != "constant"}
+    found = judge(
+        run, episodes=episodes, seed=seed, environment=environment, axes=axes, beside=others, out=out, tell=_say
+    )
+    if as_json:
+        typer.echo(json.dumps({"table": str(found["table"]), "picture": str(found["picture"]), "rows": found["rows"]}))
+        return
+    for line in found["table"].with_suffix(".md").read_text(encoding="utf-8").splitlines():
+        typer.echo(line)
+    for name, values in breaks(found["rows"], "policy").items():
+        typer.echo(f"{name}: below 90 % at {', '.join(f'{value:.3g}' for value in values) or 'no place'}")
+    typer.echo(found["table"])
+    typer.echo(found["picture"])
+
+
+@command("certify runs/passage")
+def certify(
+    of: Annotated[str, _arg("The folder of a run; or a task, with --out: {tasks}.", "RUN or TASK")],
+    env: Env = None,
+    out: Annotated[Path | None, _opt("The folder to write.  [default: certificate in the run]")] = None,
+    start_within: Annotated[
+        float | None, _opt("How far beside its start the robot may begin, in the outputs' units.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Bound what a skill can command for all actions, and have the bounds checked by a program that knows no guiderail.
+
+    The certificate lists what it assumes. Check it anywhere: python checker.py FOLDER, with NumPy alone.
+    """
+    from guiderail.tools.certify import certify_skill
+
+    found = certify_skill(of, _environment(env), out=out, start_within=start_within)
+    if as_json:
+        typer.echo(json.dumps(found))
+    else:
+        for name, value in found.items():
+            words = ", ".join("–" if x is None else f"{x:.4g}" for x in value) if isinstance(value, list) else value
+            typer.echo(f"{name.replace('_', ' ')}: {words}")
+    if found["checker"] != "yes":
+        raise typer.Exit(1)
 
 
 @command("replay runs/passage --html replay.html")
@@ -383,12 +449,14 @@ def bench(
     what: Annotated[str, _arg("What is measured: {benchmarks}.", "WHAT", "benchmarks")],
     task: Annotated[str | None, _arg("Whose training is measured: {tasks}.", "TASK", "tasks")] = None,
     env: Env = None,
-    picture: Annotated[Path | None, _opt("Where a picture of the time steps' errors is written.")] = None,
+    picture: Annotated[
+        Path | None, _opt("Where a picture of the time steps' errors, or of the engines, is written.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure how fast the primitive, the simulation or a learner is here, or where a training run's time goes.
 
-    Of the simulation's time_step it measures the error, too.
+    Of the simulation's time_step it measures the error, too, and of two physics engines the forces.
 
     It takes a minute or two.
     """

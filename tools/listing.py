@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from guiderail.diagrams.disturbances import Disturbances
 from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
@@ -33,6 +34,7 @@ def everything() -> dict[str, Any]:
             "of every environment": described(CommonOptions),
             "of guidance made of demonstrations": described(PrimitiveOptions),
             "of guidance made of a template": described(TemplateOptions),
+            "of everything that an insertion may be disturbed by": described(Disturbances),
         },
     }
 

@@ -326,6 +326,11 @@ class ArmStation(Station):
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
         self._known.place(self.plant, self.arm.model, context, pose)
 
+    def set_payload(self, context: Context, mass: float) -> None:
+        """Adds a mass [kg] to the tool that neither controller nor sensor knows of; `context` is the root context."""
+        own, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
+        tool.SetMass(own, tool.default_mass() + mass)
+
 
 def _first_position(plant: MultibodyPlant, model: ModelInstanceIndex) -> int:
     """Where a model's positions begin in the plant's."""

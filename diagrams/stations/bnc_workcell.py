@@ -14,6 +14,8 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.bnc_connector import JACK_SDF, PLUG_SDF, BncDimensions
 from guiderail.models.objects.bnc_sdf import FRICTION
+from guiderail.models.objects.bnc_surfaces import jack_surfaces, plug_surfaces
+from guiderail.models.objects.surfaces import Surface
 from guiderail.models.objects.write_bnc import folder_of
 from guiderail.models.parsing import add_model
 
@@ -86,6 +88,14 @@ class BncWorkcell:
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Leaves the barrel to the bore, the lugs to the slots and the pad to the seat."""
         exclude_contacts(plant, scene_graph, "jack", "plug", FILTERED_PAIRS)
+
+    def fixture_surfaces(self) -> list[Surface]:
+        """What of the jack touches, in J."""
+        return jack_surfaces(self.dimensions, self.friction)
+
+    def workpiece_surfaces(self) -> list[Surface]:
+        """What of the plug touches, in its frame."""
+        return plug_surfaces(self.dimensions, self.friction)
 
     def set_jack_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
         """Moves the jack so that the plug locks at X_TTactual instead of at the target."""

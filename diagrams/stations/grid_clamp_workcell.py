@@ -14,6 +14,8 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.grid_clamp import CLAMP_SDF, TABLE_SDF, GridClampDimensions
 from guiderail.models.objects.grid_clamp_sdf import FRICTION
+from guiderail.models.objects.grid_clamp_surfaces import clamp_surfaces, table_surfaces
+from guiderail.models.objects.surfaces import Surface
 from guiderail.models.objects.write_grid_clamp import folder_of
 from guiderail.models.parsing import add_model
 
@@ -81,6 +83,14 @@ class GridClampWorkcell:
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Leaves each peg to its hole, the bead to the lip and the pad to the slab."""
         exclude_contacts(plant, scene_graph, "table", "clamp", FILTERED_PAIRS)
+
+    def fixture_surfaces(self) -> list[Surface]:
+        """What of the table touches, in G."""
+        return table_surfaces(self.dimensions, self.friction)
+
+    def workpiece_surfaces(self) -> list[Surface]:
+        """What of the clamp touches, in its frame."""
+        return clamp_surfaces(self.dimensions, self.friction)
 
     def set_table_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
         """Moves the table so that the clamp snaps in at X_TTactual instead of at the target."""

@@ -51,6 +51,12 @@ CARRIAGE_INERTIA = 2e-3  # [kg m²]
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 
 
+def damping(impedance: Impedance) -> np.ndarray:
+    """Of the rails with such an impedance, (6,) [N s/m, Nm s/rad]."""
+    masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
+    return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
+
+
 @register_station("rails", world="workcell", options=ContactOptions)
 class RailsStation(Station):
     """Joints x, y, z, Rz, Ry, Rx from the target frame to the tool centre, each with a spring, a damper and a limit.
@@ -115,15 +121,13 @@ def _add_rails(plant: MultibodyPlant, workcell: Workcell, impedance: Impedance) 
     """Adds the rails and behind them the tool with the workpiece, all weightless."""
     model = plant.AddModelInstance("rails")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
-    masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
-    dampings = 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
-    for (name, joint_type, axis), stiffness, damping, limit in zip(
-        RAILS, impedance.stiffness, dampings, impedance.limits, strict=True
+    for (name, joint_type, axis), stiffness, damps, limit in zip(
+        RAILS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
     ):
         link = plant.AddRigidBody(f"{name}_link", model, SpatialInertia.SolidSphereWithMass(LINK_MASS, LINK_RADIUS))
         joint = plant.AddJoint(joint_type(name, parent, link.body_frame(), axis))
         actuator: JointActuator = plant.AddJointActuator(f"{name}_motor", joint, limit)
-        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
+        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damps))
         parent = link.body_frame()
     inertia = UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS))
     tool = plant.AddRigidBody("tool_centre", model, SpatialInertia(CARRIAGE_MASS, np.zeros(3), inertia))

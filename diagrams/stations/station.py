@@ -30,14 +30,14 @@ task is done. T lies still in the world, where the *nominal* fixture wants it: a
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import Field, field_validator
-from pydrake.geometry import SceneGraph
-from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
+from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import Frame, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
@@ -148,6 +148,35 @@ class Station(Diagram):
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the robot at rest with its tool centre at `pose`, (6,); `context` is the root context."""
+
+    def set_contact(self, context: Context, friction: float, modulus: float) -> None:
+        """Multiplies all friction and all compliance of the contact by a factor, until the next reset.
+
+        `context` is the root context; it is Drake's contact here, and another engine's station overrides it.
+        """
+        change_contact(self.plant, self.scene_graph, context, friction, modulus)
+
+    def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
+        """Draws what a reset draws of the station itself, and says so; `context` is the root context."""
+        return {}
+
+
+def change_contact(
+    plant: MultibodyPlant, scene_graph: SceneGraph, context: Context, friction: float, modulus: float
+) -> None:
+    """Multiplies friction and hydroelastic modulus of all of a plant's surfaces, in the root context alone."""
+    own = scene_graph.GetMyMutableContextFromRoot(context)
+    inspector = scene_graph.model_inspector()
+    for geometry in inspector.GetAllGeometryIds(Role.kProximity):
+        properties = ProximityProperties(inspector.GetProximityProperties(geometry))
+        if properties.HasProperty("material", "coulomb_friction"):
+            nominal = properties.GetProperty("material", "coulomb_friction")
+            factored = CoulombFriction(friction * nominal.static_friction(), friction * nominal.dynamic_friction())
+            properties.UpdateProperty("material", "coulomb_friction", factored)
+        if properties.HasProperty("hydroelastic", "hydroelastic_modulus"):
+            nominal = properties.GetProperty("hydroelastic", "hydroelastic_modulus")
+            properties.UpdateProperty("hydroelastic", "hydroelastic_modulus", modulus * nominal)
+        scene_graph.AssignRole(own, plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
 
 
 def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:

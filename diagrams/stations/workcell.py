@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from pydrake.geometry import CollisionFilterDeclaration, GeometryId, GeometrySet, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
+
+from guiderail.models.objects.surfaces import Surface
 
 
 class Workcell(Protocol):
@@ -30,6 +32,17 @@ class Workcell(Protocol):
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Excludes pairs of geometry that can't or mustn't touch; called once the plant is finalized."""
+
+
+@runtime_checkable
+class ConvexWorkcell(Protocol):
+    """What a workcell also has whose contact another engine than Drake can calculate."""
+
+    def fixture_surfaces(self) -> list[Surface]:
+        """What of the fixture touches, in its body's frame."""
+
+    def workpiece_surfaces(self) -> list[Surface]:
+        """What of the workpiece touches, in its body's frame."""
 
 
 def movable_frame(plant: MultibodyPlant, name: str) -> FixedOffsetFrame:

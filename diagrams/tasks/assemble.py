@@ -329,7 +329,8 @@ def randomizes(task: Task, station: Station, guidance: Diagram) -> Any:
     """What draws an episode's conditions and writes them into the root context: `TaskDiagram.randomize`."""
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
-        return task.reset(station, guidance, context, rng, validated(task.Reset, options, f"a reset of {task.name}"))
+        drawn = task.reset(station, guidance, context, rng, validated(task.Reset, options, f"a reset of {task.name}"))
+        return {**drawn, **station.disturb(context, rng)}
 
     return randomize
 

@@ -26,6 +26,7 @@ MM = 1e-3
 FOLDER = Path(__file__).parent
 JACK_SDF = FOLDER / "bnc_jack.sdf"
 PLUG_SDF = FOLDER / "bnc_plug.sdf"
+BORE_SIDES = 24  # of the polygon that stands for the bore
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,7 @@ def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
     return TriangleMesh.from_quads(_both_halves(np.concatenate([walls, face])))
 
 
-def bore_mesh(dimensions: BncDimensions, num_sides: int = 24) -> TriangleMesh:
+def bore_mesh(dimensions: BncDimensions, num_sides: int = BORE_SIDES) -> TriangleMesh:
     """What the barrel touches: the mouth's face, its chamfer and the bore, a polygon around the true circle."""
     d = dimensions
     circumscribed = 1.0 / np.cos(np.pi / num_sides)

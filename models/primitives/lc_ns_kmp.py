@@ -59,6 +59,16 @@ class Prediction:
         return self._v is not None
 
     @property
+    def correction(self) -> np.ndarray | None:
+        """v (r,), the least that keeps the constraints, in units in which `output_sizes` is what it does at most."""
+        return self._v
+
+    @property
+    def signed_multipliers(self) -> np.ndarray | None:
+        """(m,) of the rows of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower bound."""
+        return self._signed
+
+    @property
     def multipliers(self) -> np.ndarray:
         """α (H+1, F) ≥ 0, zero where a constraint is slack; computed at each call."""
         if self._signed is None:
@@ -331,6 +341,15 @@ class LcNsKmp:
         factor = self._factor(step)
         split = self.history * self.num_outputs
         return factor.output_map[:, :split], factor.output_map[:, split:], factor.output_offset
+
+    def free_constraints(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which windows need no correction: map (m, PO+O) of [history, ξ̂], and what it must lie between, (m,) each."""
+        factor = self._factor(step)
+        return factor.constraint_map, factor.lower, factor.upper
+
+    def output_sizes(self, step: int) -> np.ndarray:
+        """How far a correction of size one can move each output of a step at most, (O,)."""
+        return self._factor(step).output_sizes()
 
     def factor_all(self) -> int:
         """Factors every step now rather than when first asked for; returns the bytes that takes."""

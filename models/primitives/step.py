@@ -135,6 +135,10 @@ class StepFactor:
         """
         return solve_least_norm(self.constraint_rows, self.lower - free, self.upper - free, solver)
 
+    def output_sizes(self) -> np.ndarray:
+        """How far a correction of size one can move each output of the executed point at most, (O,)."""
+        return np.linalg.norm(self._solve().L[: self._window.means.shape[1]], axis=1)
+
     def multipliers(self, signed: np.ndarray) -> np.ndarray:
         """α (H+1, F) ≥ 0 of the solver's (m,), which are positive at an upper and negative at a lower bound."""
         directions, first, second = self._directions

@@ -19,6 +19,7 @@ import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.mujoco_rails import MujocoStation
 from guiderail.models.joint_status import StatusLimits
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
@@ -63,6 +64,7 @@ def built():
         systems.ActiveConstraintProjector(skill, frames, PERIOD),
         systems.CartesianImpedanceController(plant, arm.target, arm.tool_centre, gains, period=PERIOD),
         systems.CartesianPositionController(plant, arm.target, arm.tool_centre, posture=np.zeros(7), period=PERIOD),
+        systems.CommandDisturbance(2, PERIOD, lost=0.5, late=1),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.ContactLever(0.5),
@@ -79,6 +81,7 @@ def built():
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),
         systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
+        MujocoStation(BncWorkcell()).rails,
         systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
         systems.PoseWrench(),
         systems.Recorder({"u": 2}, 4, PERIOD),
@@ -89,6 +92,7 @@ def built():
         systems.SafetyLedger(PERIOD),
         systems.SctInputMapping(skill, frames, PERIOD),
         systems.SctStateMachine(skill, frames, PERIOD),
+        systems.SensorDisturbance(PERIOD, np.ones(2), delay=1),
         systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
         systems.TorqueGuard(plant, safety, period=PERIOD),
         systems.TorquePublisher(DrakeLcm("memq://"), "torques", lambda time, torque: b"", 7, period=PERIOD),

@@ -10,9 +10,9 @@ from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 
 Item = TypeVar("Item")
-BENCHMARKS = ("primitive", "simulation", "time_step", "saving", "learner", "training")
+BENCHMARKS = ("primitive", "simulation", "time_step", "engines", "saving", "learner", "training")
 OF_A_TASK = ("training",)  # those that are told which task, and how it is set up
-DRAWN = ("time_step",)  # those that can be drawn
+DRAWN = ("time_step", "engines")  # those that can be drawn
 
 
 def run_benchmark(

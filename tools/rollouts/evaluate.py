@@ -135,13 +135,10 @@ def evaluate(
     others: dict[str, Any] = {}
     names = ["demonstration"] * bool(len(alone))
     for name, acts in (beside or {}).items():
-        told = json.dumps([where, how, config.seed, installed_versions()], sort_keys=True, default=str)
-        digest = hashlib.blake2b(told.encode(), digest_size=6).hexdigest()
-        judged = partial(evaluate_run, config, partial(_suited, acts), where, words=name, **how)
-        try:
-            others |= summary(cached(folder.path / "beside" / f"{name}-{digest}.csv", judged), COMPARED, f"{name}_")
-        except _NotSuitedError:
+        judged = judged_once(folder.path / "beside", name, config, acts, where, **how)
+        if judged is None:
             continue
+        others |= summary(judged, COMPARED, f"{name}_")
         names.append(name)
     return {
         **summary(rows, COMPARED),
@@ -154,6 +151,42 @@ def evaluate(
         "trained_episodes": len(trained),
         "differs_from_thesis": differences(replace(config, environment=where)),
     }
+
+
+def judged_once(
+    kept: Path,
+    name: str,
+    config: RunConfig,
+    acts: Callable[[gymnasium.Env], Act],
+    environment: Mapping[str, Any],
+    *,
+    about: Any = None,
+    **how: Any,
+) -> pd.DataFrame | None:
+    """Rows of held-out episodes of somebody who acts in a run's environment, kept in a folder and not run again.
+
+    Args:
+        kept: the folder.
+        name: of who acts, in the file's name and in what is said meanwhile.
+        config: the run's, for its task and what is hidden in it.
+        acts: who acts, for an environment.
+        environment: its arguments.
+        about: what else the rows depend on.
+        how: arguments of `evaluate_policy`.
+
+    Returns:
+        None if what they see or move is not this environment's.
+    """
+    deciding = {key: value for key, value in how.items() if key != "words"}
+    about = [] if about is None else [about]
+    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
+    digest = hashlib.blake2b(told.encode(), digest_size=6).hexdigest()
+    how.setdefault("words", name)
+    judged = partial(evaluate_run, config, partial(_suited, acts), environment, **how)
+    try:
+        return cached(kept / f"{name}-{digest}.csv", judged)
+    except _NotSuitedError:
+        return None
 
 
 class _NotSuitedError(Exception):

@@ -1,0 +1,211 @@
+"""A certificate: its bounds against what adversaries reach, and its checker against files that were tampered with."""
+
+import ast
+import hashlib
+import io
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from guiderail.models.certificate import checker
+from guiderail.models.certificate.bounds import Skill, certify
+from guiderail.models.certificate.files import CERTIFICATE, certificate_files, digest
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
+from guiderail.models.primitives.gains import authority_gains
+
+PERIOD, STEPS = 0.02, 60
+PHASE = np.linspace(0.0, 1.0, STEPS)
+
+
+def skill(history, bound=None, tied=0.0):
+    """Two outputs, the first explored: from 0 to 0.2 and from 0 to 1; the first may be constrained to ± bound."""
+    means = np.column_stack([0.2 * np.sin(np.pi * PHASE), PHASE])
+    width = 0.05 + 0.1 * np.sin(np.pi * PHASE)
+    covariances = np.zeros((STEPS, 2, 2))
+    covariances[:, 0, 0], covariances[:, 1, 1] = width**2, 0.04**2
+    covariances[:, 0, 1] = covariances[:, 1, 0] = tied * 0.04 * width
+    constraints = None if bound is None else LinearConstraints.box([-bound, -np.inf], [bound, np.inf])
+    primitive = LcNsKmp(
+        ReferenceTrajectory(PERIOD * np.arange(STEPS), means, covariances),
+        horizon=10, history=history, history_variance=1e-6, constraints=constraints,
+    )  # fmt: skip
+    gains = authority_gains(primitive, outputs=np.array([0]))
+    return Skill(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
+
+
+CASES = {
+    "KGRL, free": (0, None),
+    "sKGRL, free": (4, None),
+    "KGRL, constrained": (0, 0.25),
+    "sKGRL, constrained": (4, 0.25),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request):
+    made = skill(*CASES[request.param], tied=0.5)
+    return made, certify(made)
+
+
+def executed(made, actions, start):
+    """The commands (N, O) for actions (N,) of the first output."""
+    history = np.tile(start, (made.primitive.history, 1))
+    commands = []
+    for n, action in enumerate(actions):
+        past = history if made.primitive.history else None
+        commands.append(made.primitive.predict(n, action * made.gains, past).output)
+        if made.primitive.history:
+            history = np.vstack([history[1:], commands[-1]])
+    return np.array(commands)
+
+
+def adversaries(rng, number):
+    """White, constant, and corners that turn now and then."""
+    for i in range(number):
+        turns = np.cumsum(rng.uniform(size=STEPS) < (0.0, 0.05, 0.3, 1.0)[i % 4]) % 2
+        yield (2.0 * turns - 1.0) * rng.choice([-1.0, 1.0])
+
+
+def test_no_adversary_leaves_the_bounds_and_some_reach_them(case):
+    made, found = case
+    rng, always = np.random.default_rng(0), found.always
+    reached = {"position": 0.0, "speed": 0.0, "acceleration": 0.0}
+    middle = executed(made, np.zeros(STEPS), made.start)[:, 0]
+    for actions in adversaries(rng, 40):
+        y = executed(made, actions, made.start + rng.uniform(-1.0, 1.0, 2) * made.start_within)
+        speed, acceleration = (np.abs(np.diff(y, order, axis=0)) / PERIOD**order for order in (1, 2))
+        assert (y >= always.lower - 1e-7).all()
+        assert (y <= always.upper + 1e-7).all()
+        assert (speed <= always.speed[1:] + 1e-6).all()
+        assert (acceleration <= always.acceleration[2:] + 1e-4).all()
+        room = np.where(y[:, 0] > middle, always.upper[:, 0] - middle, middle - always.lower[:, 0])
+        reached["position"] = max(reached["position"], np.max(np.abs(y[:, 0] - middle) / room))
+        reached["speed"] = max(reached["speed"], speed[:, 0].max() / always.speed[:, 0].max())
+    assert reached["position"] > 0.9
+    if not found.touched.any():
+        assert reached["speed"] > 0.6
+
+
+def test_where_nothing_is_active_a_bound_is_reached_by_its_own_worst_actions():
+    """The zonotope's support is exact: the signs of the impulse responses reach it."""
+    made = skill(4)
+    found = certify(made)
+    n = STEPS - 1
+    still = executed(made, np.zeros(STEPS), made.start + made.start_within)
+    impulses = [executed(made, np.eye(STEPS)[m], made.start + made.start_within)[n, 0] for m in range(STEPS)]
+    worst = executed(made, np.sign(np.array(impulses) - still[n, 0]), made.start + made.start_within)
+    below = executed(made, np.sign(np.array(impulses) - still[n, 0]), made.start - made.start_within)
+    assert max(worst[n, 0], below[n, 0]) == pytest.approx(found.free.upper[n, 0], rel=1e-6)
+
+
+def test_what_corrections_can_reach_through_a_history_has_no_bound():
+    tied, alone = certify(skill(4, 0.25, tied=0.5)).always, certify(skill(4, 0.25)).always
+    assert np.isinf(tied.upper[-1, 1])
+    assert np.isfinite(alone.upper).all()
+    assert np.abs(tied.upper[:, 0]).max() <= 0.25 + 1e-9 or tied.upper[:, 0].max() < 0.3
+
+
+def files(made, found):
+    stiffness, limits = np.array([1500.0, 1500.0]), np.array([40.0, 40.0])
+    return certificate_files(made, found, stiffness, limits, {"task": "none"})
+
+
+def write(folder, contents):
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def test_what_was_computed_is_accepted(case, tmp_path):
+    checker.check(write(tmp_path, files(*case)))
+
+
+def signed(contents, **changed):
+    """The files with claims changed, and signed again as if they were honest."""
+    claims = json.loads(contents[CERTIFICATE])
+    for name, content in contents.items():
+        if name != CERTIFICATE:
+            claims["digests"][name] = hashlib.sha256(content).hexdigest()
+    for path, change in changed.items():
+        *parents, last = path.split("__")
+        inner = claims
+        for parent in parents:
+            inner = inner[parent]
+        inner[last] = change(inner[last])
+    claims["digest"] = digest(claims)
+    return {**contents, CERTIFICATE: json.dumps(claims).encode()}
+
+
+def altered(contents, name, **changed):
+    """One of the files with arrays changed."""
+    with np.load(io.BytesIO(contents[name])) as arrays:
+        values = {key: arrays[key].copy() for key in arrays.files}
+    for key, change in changed.items():
+        values[key] = change(values[key])
+    written = io.BytesIO()
+    np.savez(written, **values)
+    return {**contents, name: written.getvalue()}
+
+
+def at(index, factor=1.0, plus=0.0):
+    """A change of one number."""
+
+    def change(value):
+        array = np.array(value, dtype=float)
+        array[index] = factor * array[index] + plus
+        return array if isinstance(value, np.ndarray) else array.tolist()
+
+    return change
+
+
+TAMPERED = {
+    "an upper bound": lambda c: signed(c, always__upper=at((30, 0), plus=-0.01)),
+    "a lower bound": lambda c: signed(c, always__lower=at((30, 0), plus=0.01)),
+    "a bound that is too wide": lambda c: signed(c, always__upper=at((10, 1), plus=0.1)),
+    "a free bound": lambda c: signed(c, free__upper=at((40, 0), plus=-0.01)),
+    "a speed": lambda c: signed(c, always__speed=at((20, 0), factor=0.9)),
+    "an acceleration": lambda c: signed(c, free__acceleration=at((20, 0), factor=0.9)),
+    "the period": lambda c: signed(c, period=lambda period: 2.0 * period),
+    "a bound that is left out": lambda c: signed(c, always__upper=lambda rows: rows[:-1]),
+    "the limits of force": lambda c: signed(c, limits=lambda limits: [0.5 * x for x in limits]),
+    "the force": lambda c: signed(c, force=lambda force: 0.9 * force),
+    "the stiffness": lambda c: signed(c, stiffness=lambda stiffness: [0.01 * x for x in stiffness]),
+    "a mean": lambda c: signed(altered(c, "primitive.npz", means=at((30, 0), plus=0.02))),
+    "a covariance": lambda c: signed(altered(c, "primitive.npz", covariances=at((30, 0, 0), factor=3.0))),
+    "the gains": lambda c: signed(altered(c, "primitive.npz", gains=lambda gains: 1.1 * gains)),
+    "beta": lambda c: signed(altered(c, "primitive.npz", beta=lambda beta: 1.2 * beta)),
+    "the kernel": lambda c: signed(altered(c, "primitive.npz", inverse_length=lambda length: 1.5 * length)),
+    "the constraint's bound": lambda c: signed(altered(c, "constraints.npz", c=lambda c: 1.2 * c)),
+    "the constraint's matrix": lambda c: signed(altered(c, "constraints.npz", G=lambda G: G[:, ::-1].copy())),
+    "which steps are touched": lambda c: signed(altered(c, "witness.npz", touched=lambda t: np.zeros_like(t))),
+    "a multiplier": lambda c: signed(altered(c, "witness.npz", multipliers=lambda a: 0.5 * a)),
+    "a digest": lambda c: {**c, CERTIFICATE: c[CERTIFICATE].replace(b'"digest": "', b'"digest": "0')},
+    "a file, unsigned": lambda c: altered(c, "primitive.npz", gains=lambda gains: 1.0 * gains + 1e-9),
+}
+
+
+@pytest.fixture(scope="module")
+def honest():
+    made = skill(0, 0.25, tied=0.5)
+    return files(made, certify(made))
+
+
+@pytest.mark.parametrize("what", TAMPERED)
+def test_what_was_tampered_with_is_rejected(honest, tmp_path, what):
+    with pytest.raises((checker.Rejected, ValueError)):
+        checker.check(write(tmp_path, TAMPERED[what](honest)))
+
+
+def test_the_checker_is_short_and_knows_numpy_alone():
+    source = Path(checker.__file__).read_text()
+    assert len(source.splitlines()) <= 250
+    imported = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(str(node.module))
+    assert {name for name in imported if name.split(".")[0] not in sys.stdlib_module_names} == {"numpy"}

@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from guiderail.models.errors import InputError
+from guiderail.systems import SensorDisturbance
+
+PERIOD = 0.125
+
+
+def readings(seed=0, scale=1.0, bias=0.0, **options):
+    """What the sensor says, just before each instant, of a ramp that is its time."""
+    builder = DiagramBuilder()
+    ramp = builder.AddSystem(TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 10.0], [[0.0, 10.0]])))
+    sensor = builder.AddSystem(SensorDisturbance(PERIOD, **{"noise": np.zeros(1), **options}))
+    builder.Connect(ramp.get_output_port(), sensor.get_measured_input_port())
+    simulator = Simulator(builder.Build())
+    context = sensor.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    sensor.set_error(context, np.full(1, scale), np.full(1, bias), seed)
+    found = []
+    for step in range(1, 9):
+        simulator.AdvanceTo(step * PERIOD)
+        found.append(sensor.get_disturbed_output_port().Eval(context)[0])
+    return np.array(found)
+
+
+TIMES = PERIOD * np.arange(1, 9)
+
+
+def test_a_sensor_without_errors_says_what_is():
+    np.testing.assert_allclose(readings(), TIMES)
+
+
+def test_scale_and_bias():
+    np.testing.assert_allclose(readings(scale=2.0, bias=-0.5), 2.0 * TIMES - 0.5)
+
+
+def test_a_delay_is_of_whole_periods():
+    np.testing.assert_allclose(readings(delay=2), np.maximum(TIMES - 2.0 * PERIOD, 0.0), atol=1e-12)
+
+
+def test_noise_has_the_size_that_was_asked_for_and_repeats_with_its_seed():
+    first = readings(seed=3, noise=np.array([0.1])) - TIMES
+    assert 0.02 < first.std() < 0.3
+    np.testing.assert_array_equal(readings(seed=3, noise=np.array([0.1])) - TIMES, first)
+    assert not np.allclose(readings(seed=4, noise=np.array([0.1])) - TIMES, first)
+
+
+@pytest.mark.parametrize("wrong", [{"noise": np.array([-1.0])}, {"noise": np.zeros(1), "delay": -1}])
+def test_what_makes_no_sense_is_refused(wrong):
+    with pytest.raises(InputError):
+        SensorDisturbance(PERIOD, **wrong)

@@ -1,0 +1,31 @@
+import numpy as np
+import pytest
+
+from guiderail.models.objects.bnc_connector import BncDimensions
+from guiderail.models.units import MM
+from guiderail.tools.benchmarks import engines
+from guiderail.tools.benchmarks.engines import OFFSETS, draw, even_lever, rigid_lever
+
+D = BncDimensions()
+
+
+def test_two_points_are_nearer_to_the_axis_than_the_area_between_them():
+    for offset in np.array(OFFSETS) * MM:
+        assert 0.0 < rigid_lever(D, offset) < even_lever(D, offset) < D.ring_radius
+
+
+def test_the_rims_lever_is_that_of_an_even_pressure_on_what_is_soft_and_falls_as_it_hardens():
+    nominal, hard = (engines._lever("rails", 2.0 * MM, modulus) for modulus in (1.0, 100.0))
+    assert nominal == pytest.approx(even_lever(D, 2.0 * MM), rel=0.1)
+    assert rigid_lever(D, 2.0 * MM) < hard < 0.8 * nominal
+
+
+def test_the_picture_is_drawn(tmp_path):
+    names = ("time", "height_mm", "push_n", "torque_nm")
+    profiles = {
+        f"{task} {engine}": {name: [0.0, 1.0] for name in names} | {"real_time_factor": 1.0, "peak_force_n": 1.0}
+        for task in engines.TASKS
+        for engine in engines.ENGINES
+    }
+    results = {"profiles": profiles, "offsets_mm": [1.0, 2.0], "levers_mm": {"MuJoCo": [3.0, 2.0]}}
+    assert draw(results, tmp_path / "engines.png").stat().st_size > 10_000

@@ -1,0 +1,81 @@
+from functools import partial
+
+import pandas as pd
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.robustness import axes
+from guiderail.tools.robustness.axes import AXES, Axis, chosen_axes, points
+from guiderail.tools.robustness.robustness import breaks, robustness
+from guiderail.tools.rollouts.null_policies import NullPolicy, white
+from guiderail.tools.tasks import check_environment
+
+WALL = Axis("wall", "wall [m]", (-0.5, 1.0), 1.0, lambda environment, value: {"wall": value})
+
+
+@pytest.fixture
+def run(bead_config, tmp_path, monkeypatch):
+    monkeypatch.setattr(axes, "AXES", (WALL,))
+    train(RunFolder(tmp_path / "run"), bead_config)
+    return tmp_path / "run"
+
+
+def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):
+    told = []
+    how = {"episodes": 3, "beside": {"white": partial(NullPolicy, white)}, "tell": told.append}
+    first = robustness(run, **how)
+    assert {row["who"] for row in first["rows"]} == {"policy", "demonstration", "white"}
+    assert [row["value"] for row in first["rows"] if row["who"] == "policy"] == [-0.5, 1.0]
+    assert all(row["success_low"] <= row["success_rate"] <= row["success_high"] for row in first["rows"])
+    assert "2/2 wall 1 policy 3/3" in capsys.readouterr().err
+    assert robustness(run, **how)["rows"] == first["rows"]
+    assert "policy 3/3" not in capsys.readouterr().err
+    assert len(pd.read_csv(first["table"])) == 6
+    assert first["picture"].stat().st_size > 10_000
+    assert robustness(run, **{**how, "episodes": 2})["rows"] != first["rows"]
+
+
+def test_a_place_where_the_policy_fails_is_named(run):
+    found = robustness(run, episodes=2)
+    assert -0.5 in breaks(found["rows"], "policy")["wall"]
+
+
+def test_another_policy_in_the_folder_is_judged_anew(run, capsys):
+    robustness(run, episodes=2)
+    content = bytearray((run / "policy.safetensors").read_bytes())
+    content[-1] ^= 1
+    (run / "policy.safetensors").write_bytes(bytes(content))
+    capsys.readouterr()
+    robustness(run, episodes=2)
+    said = capsys.readouterr().err
+    assert "policy 2/2" in said
+    assert "demonstration 2/2" not in said
+
+
+@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"axes": "frictoin"}])
+def test_what_makes_no_sense_is_refused(run, wrong):
+    with pytest.raises(InputError):
+        robustness(run, **wrong)
+
+
+@pytest.mark.parametrize("task", ["BncConnector", "GridClamp"])
+def test_every_axis_can_be_made_or_says_why_not(task):
+    arguments = check_environment(task, {})
+    found, left_out = points(task, arguments, AXES)
+    assert len(found) + len(left_out) == sum(len(axis.values) for axis in AXES)
+    for axis in AXES:
+        at = {point.value: point.environment for point in found if point.axis is axis}
+        if axis.trained in at:
+            assert at[axis.trained] == arguments
+        assert all(at[value] != arguments for value in at if value != axis.trained)
+    names = {sentence.split()[0] for sentence in left_out}
+    assert names <= {"payload", "clearance", "offsets"}
+    assert all(": " in sentence for sentence in left_out)
+
+
+def test_offsets_go_up_to_twice_the_trained_ones():
+    (offsets,) = chosen_axes("offsets")
+    found, _ = points("BncConnector", {"uncertainty": "disc"}, [offsets])
+    assert found[-1].environment["offset_range"] == (0.0, 2.0 * 1.5e-3)

@@ -1,0 +1,130 @@
+"""`guiderail bench engines`: the same scripted motions in Drake and in MuJoCo, and what a plug on the rim feels."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.recording import DrivenStation, along
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.models.contact_lever import contact_lever
+from guiderail.models.objects.bnc_connector import BncDimensions
+from guiderail.models.objects.bnc_motion import poses
+from guiderail.models.units import MM
+from guiderail.tools.benchmarks import told
+from guiderail.tools.benchmarks.simulation import scripted_motion
+from guiderail.tools.viewing.style import legend, new_figure, save_figure
+
+ENGINES = {"Drake": "rails", "MuJoCo": "mujoco"}
+COLOURS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
+TASKS = ("BncConnector", "GridClamp")
+OFFSETS = (0.8, 1.25, 2.0, 3.0)  # [mm], of a plug on the rim
+MODULI = (0.1, 1.0, 10.0, 100.0)  # times the contact's own, in Drake
+PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
+LEAST_FORCE = 0.5  # [N] below which a lever says nothing
+
+
+def measure() -> dict[str, Any]:
+    """Force profiles and real-time factors of both engines, by one process's CPU time, and the rim's levers."""
+    jobs = [(task, engine) for task in TASKS for engine in ENGINES]
+    profiles = {f"{task} {engine}": _profile(task, ENGINES[engine]) for task, engine in told(jobs, "motion")}
+    pressed = [("Drake", modulus) for modulus in MODULI] + [("MuJoCo", 1.0)]
+    levers = {
+        f"{engine}, modulus × {modulus:g}" if engine == "Drake" else engine: [
+            _lever(ENGINES[engine], offset * MM, modulus) / MM for offset in OFFSETS
+        ]
+        for engine, modulus in told(pressed, "rim")
+    }
+    levers["two points, rigid"] = [rigid_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
+    levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
+    return {"profiles": profiles, "offsets_mm": list(OFFSETS), "levers_mm": levers}
+
+
+def rigid_lever(d: BncDimensions, offset: float) -> float:
+    """From the plug's axis to where two rigid bodies that tilt meet: the chord of their overlap [m]."""
+    mouth = d.bore_radius + d.mouth_chamfer
+    return float((mouth**2 + offset**2 - d.barrel_radius**2) / (2.0 * offset))
+
+
+def even_lever(d: BncDimensions, offset: float) -> float:
+    """From the plug's axis to the middle of the area where mouth and barrel overlap [m]."""
+    x, y = np.meshgrid(*(np.linspace(-d.ring_radius, d.ring_radius, 1401),) * 2)
+    inside = (np.hypot(x, y) > d.bore_radius + d.mouth_chamfer) & (np.hypot(x, y) < d.ring_radius)
+    inside &= np.hypot(x - offset, y) < d.barrel_radius
+    return float(x[inside].mean())
+
+
+def _profile(task: str, station: str) -> dict[str, Any]:
+    workcell, times, motion, _ = scripted_motion(task)
+    driven = DrivenStation(
+        STATIONS.get(station).build(workcell), along(times, motion), round(times[-1] / CONTROL_PERIOD)
+    )
+    driven.start(motion[0])
+    begin = time.process_time()
+    recording = driven.run()
+    spent = time.process_time() - begin
+    return {
+        "real_time_factor": float(times[-1] / spent),
+        "time": (CONTROL_PERIOD * np.arange(len(recording["pose"]))).tolist(),
+        "height_mm": (recording["pose"][:, 2] / MM).tolist(),
+        "push_n": recording["wrench"][:, 2].tolist(),
+        "torque_nm": recording["wrench"][:, 5].tolist(),
+        "peak_force_n": float(recording["contact_force"].max()),
+    }
+
+
+def _lever(name: str, offset: float, modulus: float) -> float:
+    """From the plug's axis to where the rim pushes, at rest on it beside the barrel [m]."""
+    workcell = BncWorkcell()
+    motion = poses(np.array([11.0 * MM, PRESSED, PRESSED]), np.pi / 2)
+    station = STATIONS.get(name).build(workcell)
+    times = np.array([0.0, 0.6, 1.4])
+    driven = DrivenStation(station, along(times, motion), round(times[-1] / CONTROL_PERIOD))
+    workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform([offset, 0.0, 0.0]))
+    if modulus != 1.0:
+        station.set_contact(driven.context, 1.0, modulus)
+    driven.start(motion[0])
+    wrench = driven.run()["wrench"][-10:].mean(axis=0)
+    return float(np.linalg.norm(contact_lever(wrench, LEAST_FORCE)))
+
+
+def show(results: dict[str, Any]) -> None:
+    """Prints a line for each motion and each lever."""
+    for name, profile in results["profiles"].items():
+        factor, peak = profile["real_time_factor"], profile["peak_force_n"]
+        print(f"{name}: {factor:.1f} times real time, {peak:.1f} N at most")
+    print(
+        "lever of a plug on the rim [mm], at", ", ".join(f"{offset:g}" for offset in results["offsets_mm"]), "mm beside"
+    )
+    for name, levers in results["levers_mm"].items():
+        print(f"  {name}: {', '.join(f'{lever:.2f}' for lever in levers)}")
+
+
+def draw(results: dict[str, Any], path: Path) -> Path:
+    """Writes the picture: height, push and torque of both engines, and the rim's lever."""
+    figure, axes = new_figure(2, 3, (11.0, 5.6))
+    for row, task in enumerate(TASKS):
+        for engine in ENGINES:
+            profile = results["profiles"][f"{task} {engine}"]
+            for axis, key in zip(axes[row], ("height_mm", "push_n", "torque_nm"), strict=True):
+                axis.plot(profile["time"], profile[key], color=COLOURS[engine], label=engine)
+        for axis, words in zip(axes[row], ("height [mm]", "push [N]", "torque about z [Nm]"), strict=True):
+            axis.set_ylabel(words)
+            axis.set_xlabel(f"{task}: time [s]")
+    legend(figure, axes[0, 0])
+    lever = axes[1, 2]
+    lever.clear()
+    for name, levers in results["levers_mm"].items():
+        nominal = name in ("MuJoCo", "Drake, modulus × 1")
+        colour = COLOURS.get(name.split(",")[0], "0.6")
+        lever.plot(results["offsets_mm"], levers, ".-", color=colour, alpha=1.0 if nominal else 0.5)
+        lever.annotate(name, (results["offsets_mm"][-1], levers[-1]), fontsize=6)
+    lever.set_xlabel("plug on the rim: offset [mm]")
+    lever.set_ylabel("lever of its force [mm]")
+    return save_figure(figure, path)

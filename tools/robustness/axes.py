@@ -1,0 +1,142 @@
+"""What is changed, one thing at a time, and in which steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
+from guiderail.models.errors import InputError
+from guiderail.models.registry import did_you_mean
+from guiderail.models.units import MM
+from guiderail.tools.tasks import check_environment
+
+Environment = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that is changed.
+
+    Attributes:
+        name: as the command takes it.
+        words: what it is, with its unit.
+        values: in steps, the trained one among them where it has a number.
+        trained: what it is where the policy learned.
+        changed: from an environment's arguments and a value to the arguments that differ.
+    """
+
+    name: str
+    words: str
+    values: tuple[float, ...]
+    trained: float
+    changed: Callable[[Environment, float], dict[str, Any]]
+
+
+def _factor(option: str) -> Callable[[Environment, float], dict[str, Any]]:
+    return lambda environment, value: {option: (value, value)}
+
+
+def _plain(option: str, unit: float = 1.0, kind: type = float) -> Callable[[Environment, float], dict[str, Any]]:
+    return lambda environment, value: {option: kind(value * unit)}
+
+
+def _force_and_torque(option: str, lever: float = 0.02) -> Callable[[Environment, float], dict[str, Any]]:
+    """A force [N] and the torque that it has at so long a lever [m]."""
+    return lambda environment, value: {option: (value, lever * value)}
+
+
+def _clearance(environment: Environment, value: float) -> dict[str, Any]:
+    for option in ("bore_clearance", "clearance"):
+        if option in environment:
+            return {option: value * environment[option]}
+    raise InputError("nothing here has a clearance")
+
+
+def _offsets(environment: Environment, value: float) -> dict[str, Any]:
+    from guiderail.diagrams.tasks.bnc_uncertainty import OFFSET_RANGES
+
+    if "offset_range" not in environment:
+        raise InputError("nothing here has an offset whose range could be another")
+    trained = environment["offset_range"] or OFFSET_RANGES[environment["uncertainty"]]
+    return {"offset_range": tuple(value * distance for distance in trained)}
+
+
+def _period(environment: Environment, value: float) -> dict[str, Any]:
+    return {"control_period": max(round(value * CONTROL_PERIOD / PLANT_PERIOD), 1) * PLANT_PERIOD}
+
+
+FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0)
+
+AXES = (
+    Axis("friction", "friction, times", FACTORS, 1.0, _factor("friction_factor")),
+    Axis("modulus", "contact's stiffness, times", (0.1, 0.3, 1.0, 3.0, 10.0), 1.0, _factor("modulus_factor")),
+    Axis("stiffness", "impedance's stiffness, times", (1 / 3, 0.6, 1.0, 1.7, 3.0), 1.0, _plain("stiffness_factor")),
+    Axis("clearance", "clearance, times", (0.5, 0.75, 1.0, 1.5, 2.0), 1.0, _clearance),
+    Axis("offsets", "offsets, times", (0.5, 1.0, 1.25, 1.5, 2.0), 1.0, _offsets),
+    Axis("wrench_scale", "measured wrench, times", FACTORS, 1.0, _factor("wrench_scale")),
+    Axis("wrench_bias", "wrench bias up to [N]", (0.0, 0.5, 1.0, 2.0, 4.0), 0.0, _force_and_torque("wrench_bias")),
+    Axis("wrench_noise", "wrench noise, σ [N]", (0.0, 0.25, 0.5, 1.0, 2.0), 0.0, _force_and_torque("wrench_noise")),
+    Axis("wrench_delay", "wrench late by [steps]", (0, 1, 2, 5, 10), 0, _plain("wrench_delay", kind=int)),
+    Axis("pose_bias", "pose error up to [mm]", (0.0, 0.1, 0.3, 0.6, 1.0), 0.0, _plain("pose_bias", MM)),
+    Axis("lost", "commands lost, part", (0.0, 0.1, 0.3, 0.5, 0.8), 0.0, _plain("lost_commands")),
+    Axis("late", "commands late by [steps]", (0, 1, 2, 5, 10), 0, _plain("late_commands", kind=int)),
+    Axis("period", "control period, times", (0.5, 1.0, 1.5, 2.0), 1.0, _period),
+    Axis("payload", "ignored payload [kg]", (0.0, 0.1, 0.3, 0.6, 1.0), 0.0, _plain("payload")),
+)
+
+
+def chosen_axes(names: str | None) -> list[Axis]:
+    """The axes of such names, comma-separated; all of them for None.
+
+    Raises:
+        InputError: for a name that is none.
+    """
+    if names is None:
+        return list(AXES)
+    known = {axis.name: axis for axis in AXES}
+    wanted = [name.strip() for name in names.split(",") if name.strip()]
+    for name in wanted:
+        if name not in known:
+            raise InputError(f"there is no axis {name!r}: {did_you_mean(name, known)}")
+    return [known[name] for name in wanted]
+
+
+@dataclass(frozen=True)
+class Point:
+    """One place of one axis.
+
+    Attributes:
+        axis, value: where.
+        environment: all arguments there.
+    """
+
+    axis: Axis
+    value: float
+    environment: Environment
+
+
+def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
+    """The places of some axes that an environment can be made at, and a sentence for each that it can't.
+
+    Raises:
+        InputError: if the environment itself can't be made.
+    """
+    resolved = check_environment(task, environment)
+    found, left_out = [], []
+    for axis in axes:
+        for value in axis.values:
+            try:
+                changed = {} if value == axis.trained else axis.changed(resolved, value)
+                if axis.name == "payload" and resolved.get("station") != "arm":
+                    raise InputError("a payload hangs from an arm's tool")
+                found.append(Point(axis, value, {**environment, **_checked(task, resolved, changed)}))
+            except InputError as error:
+                left_out.append(f"{axis.name} {value:g} is left out: {error}")
+    return found, left_out
+
+
+def _checked(task: str, resolved: Environment, changed: dict[str, Any]) -> dict[str, Any]:
+    check_environment(task, {**resolved, **changed})
+    return changed
