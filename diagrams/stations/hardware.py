@@ -24,7 +24,7 @@ from guiderail.diagrams.options import Number, Options
 from guiderail.diagrams.stations.arm import KnownArm, add_arm, add_controller
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
-    PLANT_PERIOD,
+    CONTROL_PERIOD,
     Impedance,
     Station,
     add_workcell_plant,
@@ -44,6 +44,8 @@ from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.status_watchdog import StatusWatchdog
 from guiderail.systems.torque_guard import SafetyLimits, TorqueGuard
 from guiderail.systems.torque_publisher import TorquePublisher
+
+TORQUE_PERIOD = CONTROL_PERIOD / 4  # [s] between torques that are sent, as often as the status arrives
 
 # Of what a driver stops at by itself: how much is sent, how much of the surroundings' is borne, and of a joint's speed.
 TORQUE_SHARE, EXTERNAL_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
@@ -212,7 +214,7 @@ class HardwareStation(Station):
         workcell: Workcell,
         lcm: DrakeLcmInterface | None = None,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
-        period: float = PLANT_PERIOD,
+        period: float = TORQUE_PERIOD,
         wrench_time_constant: float = 0.02,
         robot_timeout: float = 10.0,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
@@ -538,18 +540,18 @@ class StepByStep:
         self._say()
 
     def advance(self, simulator: Simulator, steps: int) -> None:
-        """Advances by so many periods of `PLANT_PERIOD`."""
+        """Advances by so many periods of `TORQUE_PERIOD`."""
         start = simulator.get_context().get_time()
         for step in range(steps):
             # A robot that has fallen silent is not waited for again and again.
-            patience = PLANT_PERIOD if self._is_silent else self._patience
+            patience = TORQUE_PERIOD if self._is_silent else self._patience
             for _ in range(10):
                 if self._statuses.count > self._taken:
                     break
                 self._lcm.HandleSubscriptions(max(1, int(1000 * patience / 10)))
             self._is_silent = self._statuses.count == self._taken
             self._taken = self._statuses.count
-            simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
+            simulator.AdvanceTo(start + (step + 1) * TORQUE_PERIOD)
             self._say()
 
     def _say(self) -> None:
@@ -561,4 +563,4 @@ def drive_in_step(simulator: Simulator, lcm: DrakeLcm, seconds: float, patience:
     """Advances a hardware station step by step: see `StepByStep`."""
     pace = StepByStep(lcm, patience)
     pace.begin()
-    pace.advance(simulator, round(seconds / PLANT_PERIOD))
+    pace.advance(simulator, round(seconds / TORQUE_PERIOD))

@@ -24,9 +24,8 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.make import make_skill, resolve
 from guiderail.diagrams.options import Options
-from guiderail.diagrams.stations.hardware import HardwareStation, StepByStep
+from guiderail.diagrams.stations.hardware import TORQUE_PERIOD, HardwareStation, StepByStep
 from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.diagrams.stations.station import PLANT_PERIOD
 from guiderail.diagrams.tasks.assemble import SkillDiagram
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.trace import Trace
@@ -72,7 +71,7 @@ class RealTime:
     def advance(self, simulator: Simulator, steps: int) -> None:
         """Advances by so many periods of the station."""
         simulator.set_target_realtime_rate(1.0)
-        simulator.AdvanceTo(simulator.get_context().get_time() + steps * PLANT_PERIOD)
+        simulator.AdvanceTo(simulator.get_context().get_time() + steps * TORQUE_PERIOD)
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ class Operation:
         self._skills_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
         # The guidance begins with its first control step. So another station on the same bus approaches the start.
         self._station = self._skills_station.alike(task.world())
-        self._steps = round(skill.control_period / PLANT_PERIOD)
+        self._steps = round(skill.control_period / TORQUE_PERIOD)
         self._start = task.start(np.random.default_rng(0))
         self._simulator = self._initialized()
         self.trace = Trace(skill.num_steps, 6, skill.control_period, SIGNALS)
@@ -195,7 +194,7 @@ class Operation:
     def _rest(self) -> None:
         station, context = self._acting()
         station.stop(context)
-        self._pace.advance(self._simulator, round((station.limits.damping_time + 0.1) / PLANT_PERIOD))
+        self._pace.advance(self._simulator, round((station.limits.damping_time + 0.1) / TORQUE_PERIOD))
 
     def _give_back(self) -> None:
         """Lets the station that approached go on instead of the skill, which can't be advanced any more."""

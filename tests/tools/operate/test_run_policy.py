@@ -10,8 +10,7 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.make import make_skill, resolve
-from guiderail.diagrams.stations.hardware import HardwareStation, SimulatedIiwa
-from guiderail.diagrams.stations.station import PLANT_PERIOD
+from guiderail.diagrams.stations.hardware import TORQUE_PERIOD, HardwareStation, SimulatedIiwa
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
 from guiderail.systems.policy_system import PolicyError
@@ -42,8 +41,8 @@ class Together:
             self.step += 1
             self.happens.get(self.step, lambda: None)()
             if not self.is_silent:
-                self.simulator.AdvanceTo(self.step * PLANT_PERIOD)
-            simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
+                self.simulator.AdvanceTo(self.step * TORQUE_PERIOD)
+            simulator.AdvanceTo(start + (step + 1) * TORQUE_PERIOD)
 
 
 @pytest.fixture
