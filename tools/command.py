@@ -153,6 +153,7 @@ def train(
     """
     from guiderail.tools.learning import configure
 
+    task, folders = (None, ()) if task is None else _named(task)
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     words |= {"uncertainty": uncertainty, "station": station}
     summary = configure.run(
@@ -165,7 +166,7 @@ def train(
         episodes=episodes,
         seed=seed,
         resume=resume,
-        imports=imports or (),
+        imports=(*folders, *(imports or ())),
         ledger=ledger,
     )
     _print(summary, as_json)
@@ -429,6 +430,49 @@ def stress(
     raise typer.Exit(1 if found["wrong"] else 0)
 
 
+@command("onboard plug.stl socket.stl --unit mm --out ./peg")
+def onboard(
+    plug: Annotated[Path, _arg("The part in the tool: .stl, .obj, .glb, .step.", "PLUG")],
+    socket: Annotated[Path, _arg("The part in the world.", "SOCKET")],
+    out: Annotated[Path, _opt("The task's folder; it must not exist.")],
+    unit: Annotated[str | None, _opt("Of the files' numbers: mm, cm, m or inch.")] = None,
+    place: Annotated[
+        str, _opt("x,y,z,rx,ry,rz in the files' unit and degrees: moves the plug's file to the target.")
+    ] = "0,0,0,0,0,0",
+    axis: Annotated[str, _opt("Which way the plug comes out: +x, -x, +y, -y, +z or -z.")] = "+z",
+    centre: Annotated[str | None, _opt("x,y,z of a point on the axis.  [default: the plug's middle]")] = None,
+    turn: Annotated[float, _opt("By how many degrees the plug turns at the bottom; it is drawn turned.")] = 0.0,
+    force_limit: Annotated[float, _opt("More than that ends an episode [N].")] = 35.0,
+    friction: Annotated[float, _opt("Of all surfaces.")] = 0.2,
+    scenario: Annotated[list[Path] | None, _opt("Drake model directives of what else stands there.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a task of two mesh files.
+
+    The parts are drawn assembled, or --place says where the plug goes. It checks them, finds contact geometry that is
+    fast and stiff enough, inserts the plug by a script, aligned and beside, records demonstrations, and leaves a folder
+    that is a task: guiderail train ./peg. Every number is in its task.yaml; preview.html shows it.
+    """
+    from guiderail.tools.onboard.onboard import ask_unit
+    from guiderail.tools.onboard.onboard import onboard as make
+
+    found = make(
+        plug,
+        socket,
+        out,
+        unit=ask_unit((plug, socket), unit),
+        place=_floats(place, 6, "--place"),
+        axis=axis,
+        centre=None if centre is None else _floats(centre, 3, "--centre"),
+        turn=turn,
+        force_limit=force_limit,
+        friction=friction,
+        scenario=scenario or (),
+        say=(lambda words: None) if as_json else _tell,
+    )
+    _print(found, as_json)
+
+
 @command("drive Pouring")
 def drive(
     task: Annotated[str, _arg("The task: {tasks}.", "TASK", "tasks")],
@@ -438,7 +482,7 @@ def drive(
     """Act in the policy's place, with a gamepad or the keyboard."""
     from guiderail.tools.operate.drive import drive_by_hand
 
-    drive_by_hand(task, ({} if guidance is None else {"guidance": guidance}) | _environment(env))
+    drive_by_hand(_named(task)[0], ({} if guidance is None else {"guidance": guidance}) | _environment(env))
 
 
 @command("run runs/connector --rehearse --yes")
@@ -520,6 +564,7 @@ def list_(
     from guiderail.tools.tasks import import_modules
 
     import_modules(imports or ())
+    what = None if what is None else _named(what)[0]
     if what is None:
         names = {name: names() for name, names in LISTED.items()}
         _print(names | _listing().everything() if as_json else names, as_json)
@@ -621,6 +666,17 @@ def _pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]
     return {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in given or [])}
 
 
+def _floats(text: str, count: int, option: str) -> list[float]:
+    """Numbers separated by commas."""
+    try:
+        numbers = [float(number) for number in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option} takes {count} numbers separated by commas, not {text!r}")
+    return numbers
+
+
 def _environment(given: list[str] | None) -> dict[str, Any]:
     """Options of an environment, each value as YAML would read it."""
     if not given:
@@ -628,6 +684,15 @@ def _environment(given: list[str] | None) -> dict[str, Any]:
     from guiderail.tools.tasks import as_value
 
     return {key: as_value(value) for key, value in _pairs(given, "--env", "station=arm").items()}
+
+
+def _named(task: str) -> tuple[str, tuple[str, ...]]:
+    """A task's name where the path of its folder was typed, and what a run has to import for it."""
+    if not (Path(task) / "task.yaml").is_file():
+        return task, ()
+    from guiderail.tools.tasks import task_named
+
+    return task_named(task)
 
 
 def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
@@ -651,6 +716,7 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
     """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
     from guiderail.tools.viewing import shown as showing
 
+    shown = _named(shown)[0]
     if Path(shown).is_dir() or shown not in CHOICES["tasks"]():
         return showing.Shown.of_run(Path(shown), environment, seed)
     from guiderail.tools.studies.scripted import untrained

@@ -14,6 +14,7 @@ from guiderail.models.units import DEGREE, MM
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]
 INSERTION_SPEED = 12.0 * MM
+TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # [m] above and below the rim, and how fast it passes that [m/s]
 TURN_SPEED = 45.0 * DEGREE  # [rad/s]
 SEARCH = 1.8  # [s] on the rim
 PAUSE = 0.3  # [s] after each part of the motion
@@ -27,15 +28,22 @@ _CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # [s]
 _CENTRING = 0.9  # of the mean of five random curves that is taken out: nobody knows a better path
 
 
-def straight(travel: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) and poses (N, 6): down, pushing, a turn where there is one, and to the target.
+def straight(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) and poses (N, 6): down, slowly past the rim, pushing, a turn where there is one, and to the target.
 
     Args:
-        travel: height of the start [m].
+        travel, rim: heights of the start, and of a plug that stands on the rim [m].
         turn: at the bottom [rad].
         push: commanded below the target [m].
     """
-    points = [(PAUSE, travel, -turn), ((travel + push) / INSERTION_SPEED, -push, -turn), (PAUSE, -push, -turn)]
+    low = rim - TOUCH
+    points = [
+        (PAUSE, travel, -turn),
+        ((travel - rim - TOUCH) / INSERTION_SPEED, rim + TOUCH, -turn),
+        (2.0 * TOUCH / TOUCH_SPEED, low, -turn),
+        ((low + push) / INSERTION_SPEED, -push, -turn),
+        (PAUSE, -push, -turn),
+    ]
     if turn:
         points += [(abs(turn) / TURN_SPEED + PAUSE, -push, 0.0)]
     points += [(PAUSE, -push, 0.0), (PAUSE, 0.0, 0.0), (PAUSE, 0.0, 0.0)]

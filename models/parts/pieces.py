@@ -18,7 +18,7 @@ _SLIVER = 1e-6  # of the whole volume: less is rounding
 _FLAT = 1e-2  # [rad] an edge that is less concave than this is none
 _TRIED = 6  # planes at each cut
 _SMALLEST_FACE = 2e-4  # [mm²] Drake makes a plane of each face, and fails at one of 5e-5
-_SIMPLER = (0.0, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2)  # [mm] that a surface may move for its faces to be large enough
+_DIGITS = 9  # of an OBJ file's metres: what is flat before it is rounded may not be so after
 _SCALE = 1e3  # manifold3d's tolerances are made for millimetres
 
 
@@ -57,14 +57,40 @@ def convex_pieces(solid: Any, most: int = MOST_PIECES) -> list[Any] | None:
 
 
 def _with_large_faces(convex: Any) -> Any:
-    """A convex solid without faces that are too small for Drake, moved as little as that takes."""
-    for tolerance in _SIMPLER:
-        simpler = convex.simplify(tolerance).hull() if tolerance else convex
-        vertices, triangles = as_arrays(simpler)
-        a, b, c = (vertices[triangles[:, i]] * _SCALE for i in range(3))
-        if 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).min() > _SMALLEST_FACE:
+    """A convex solid less the vertices that make faces too small for Drake: those on a line, or next to another."""
+    from pydrake.geometry import Convex  # half a second that whoever reads a folder need not wait for
+
+    manifold3d = need("manifold3d")
+    points = as_arrays(convex)[0]
+    while len(points) > 4:
+        points = np.round(points, _DIGITS)
+        hull = Convex(np.ascontiguousarray(points.T), "piece").GetConvexHull()
+        points = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
+        smallest, corner = _smallest_face(points, list(hull.face_data()))
+        if smallest > _SMALLEST_FACE:
             break
-    return simpler
+        points = np.delete(points, corner, axis=0)
+    return manifold3d.Manifold.hull_points(np.ascontiguousarray(points * _SCALE))
+
+
+def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
+    """The smallest triangle's area [mm²] where each polygon is a fan, as Drake makes it, and which corner is on a line.
+
+    `faces` has for each polygon how many corners, and which.
+    """
+    smallest, corner, start = np.inf, 0, 0
+    while start < len(faces):
+        fan = faces[start + 1 : start + 1 + faces[start]]
+        start += 1 + len(fan)
+        for second, third in zip(fan[1:-1], fan[2:], strict=True):
+            triangle = np.array([fan[0], second, third])
+            a, b, c = points[triangle] * _SCALE
+            area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a)))
+            if area < smallest:
+                # The corner opposite the longest side is nearest to the line of the other two.
+                opposite = np.argmax([np.linalg.norm(c - b), np.linalg.norm(c - a), np.linalg.norm(b - a)])
+                smallest, corner = area, int(triangle[opposite])
+    return smallest, corner
 
 
 def _hollow(solid: Any) -> float:

@@ -21,7 +21,10 @@ from guiderail.models.parts.motion import straight
 from guiderail.systems.recorder import Recording
 
 
-STEP: dict = {}
+
+
+
+_CORNERS = 8  # of a contact surface, those of the highest pressure, whose depth is measured
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,10 @@ class Depths:
         inspector = self._station.scene_graph.model_inspector()
         for number in range(results.num_hydroelastic_contacts()):
             surface = results.hydroelastic_contact_info(number).contact_surface()
-            mesh = surface.poly_mesh_W() if not surface.is_triangle() else surface.tri_mesh_W()
-            points = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+            mesh = surface.tri_mesh_W() if surface.is_triangle() else surface.poly_mesh_W()
+            field = surface.tri_e_MN() if surface.is_triangle() else surface.poly_e_MN()
+            pressures = np.array([field.EvaluateAtVertex(i) for i in range(mesh.num_vertices())])
+            points = np.array([mesh.vertex(int(i)) for i in np.argsort(pressures)[-_CORNERS:]])
             ids = (surface.id_M(), surface.id_N())
             for geometry in ids:
                 body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
@@ -113,9 +118,9 @@ def insert(
         measure_depth: whether depths are measured, which takes longer than the simulation.
     """
     numbers = file.motion
-    times, poses = straight(numbers.travel, file.turn, numbers.push) if motion is None else motion
+    times, poses = straight(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
     world = workcell(folder, file)
-    station = RailsStation(world, **STEP)
+    station = RailsStation(world)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     world.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
     compliant = {
@@ -129,7 +134,6 @@ def insert(
         watch = [0]
 
         def monitor(root_context) -> EventStatus:
-            # At the plant's every fourth step or so: a control step.
             watch[0] += 1
             return depths.monitor(root_context) if watch[0] % 4 == 0 else EventStatus.DidNothing()
 
