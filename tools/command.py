@@ -276,12 +276,54 @@ def check(
     draw: Annotated[
         Path | None, _opt("Draw the demonstrations, or a skill's state machine (.png, .svg, .pdf; a skill also .dot).")
     ] = None,
+    fit: Annotated[bool, _opt("Choose components, kernel and λ by what reproduces them, and say why.", "--fit")] = False,
     as_json: Json = False,
 ) -> None:
     """Check demonstrations or a skill before they are used."""
     from guiderail.tools.check import check as check_file
 
-    _print(check_file(file, draw), as_json)
+    _print(check_file(file, draw, fit=fit), as_json)
+
+
+TARGET_HELP = "x,y,z,rx,ry,rz: the task's target in the recording's frame, in metres and degrees."
+
+
+@command("import bag --out demonstrations.npz --target 0.5,0,0.2,0,0,0", "import")
+def import_(
+    source: Annotated[Path, _arg("A LeRobot v3 dataset, a ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")],
+    out: Annotated[Path, _opt("The demonstrations' file, .npz or .csv.")],
+    signal: Annotated[str | None, _opt("Which topic or feature.  [default: the one that can be meant]")] = None,
+    target: Annotated[str | None, _opt(TARGET_HELP)] = None,
+    rate: Annotated[float | None, _opt("Resample to so many samples a second.")] = None,
+    unit: Annotated[str | None, _opt("Of positions in a CSV file that does not say it: m, cm or mm.")] = None,
+    time_unit: Annotated[str | None, _opt("Of its time: s, ms, us or ns.")] = None,
+    quaternion: Annotated[str | None, _opt("The order of its numbered quaternion: xyzw or wxyz.")] = None,
+    angles: Annotated[str | None, _opt("Of its roll, pitch and yaw: deg or rad.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Bring demonstrations from another format.
+
+    It says what it took for granted, and asks for what a file doesn't say and only whoever recorded it knows.
+    """
+    from guiderail.tools.recording.exchange import import_recording
+
+    where = None if target is None else _floats(target, 6, "--target")
+    of_csv = {"unit": unit, "time_unit": time_unit, "quaternion": quaternion, "angles": angles}
+    _print(import_recording(source, out, signal=signal, target=where, rate=rate, **of_csv), as_json)
+
+
+@command("export demonstrations.npz --to lerobot --out dataset")
+def export(
+    file: Annotated[Path, _arg("Demonstrations (.npz, .csv or a folder of them).", "FILE")],
+    out: Annotated[Path, _opt("The folder to write; it must not exist.")],
+    to: Annotated[str, _opt("lerobot or mcap.")],
+    rate: Annotated[float | None, _opt("Resample to so many samples a second.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Take demonstrations to another format: a LeRobot v3 dataset, or ROS 2 bags in MCAP."""
+    from guiderail.tools.recording.exchange import export_demonstrations
+
+    _print(export_demonstrations(file, out, to, rate), as_json)
 
 
 @command("study connector --out studies --methods skgrl,kgrl --seeds 30,31")
