@@ -285,6 +285,29 @@ def check(
     _print(check_file(file, draw, fit=fit), as_json)
 
 
+@command("constraints demonstrations.npz --phases 4 --draw bounds.png --into ./peg")
+def constraints(
+    file: Annotated[Path, _arg("Demonstrations (.npz, .csv or a folder of them).", "FILE")],
+    phases: Annotated[int, _opt("Parts of the motion, each with bounds of its own.")] = 1,
+    margin: Annotated[float, _opt("Beyond what was shown, as a part of its range.")] = 0.1,
+    least: Annotated[float, _opt("Beyond what was shown at least, in the outputs' unit.")] = 0.0,
+    outputs: Annotated[str | None, _opt("Numbers of those that are bounded, such as 0,1.  [default: all]")] = None,
+    draw: Annotated[Path | None, _opt("Draw the demonstrations and their bounds (.png, .svg, .pdf).")] = None,
+    out: Annotated[Path | None, _opt("Write them as YAML, to be read and edited.")] = None,
+    into: Annotated[Path | None, _opt("A task's folder whose bounds become these.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Find bounds of every command from what was demonstrated, phase by phase."""
+    from guiderail.tools.recording.bounds import constraints as find
+
+    try:
+        chosen = None if outputs is None else [int(number) for number in outputs.split(",")]
+    except ValueError:
+        raise InputError(f"--outputs takes whole numbers separated by commas, not {outputs!r}") from None
+    how: dict[str, Any] = {"phases": phases, "margin": margin, "least": least, "outputs": chosen}
+    _print(find(file, **how, draw=draw, out=out, into=into), as_json)
+
+
 TARGET_HELP = "x,y,z,rx,ry,rz: the task's target in the recording's frame, in metres and degrees."
 
 
@@ -482,7 +505,7 @@ def onboard(
         str, _opt("x,y,z,rx,ry,rz in the files' unit and degrees: moves the plug's file to the target.")
     ] = "0,0,0,0,0,0",
     axis: Annotated[str, _opt("Which way the plug comes out: +x, -x, +y, -y, +z or -z.")] = "+z",
-    centre: Annotated[str | None, _opt("x,y,z of a point on the axis.  [default: the plug's middle]")] = None,
+    centre: Annotated[str | None, _opt("x,y,z of a point on the axis.  [default: the plug's centre of mass]")] = None,
     turn: Annotated[float, _opt("By how many degrees the plug turns at the bottom; it is drawn turned.")] = 0.0,
     force_limit: Annotated[float, _opt("More than that ends an episode [N].")] = 35.0,
     friction: Annotated[float, _opt("Of all surfaces.")] = 0.2,
@@ -525,6 +548,23 @@ def drive(
     from guiderail.tools.operate.drive import drive_by_hand
 
     drive_by_hand(_named(task)[0], ({} if guidance is None else {"guidance": guidance}) | _environment(env))
+
+
+@command("teach ./peg --out demonstrations.npz")
+def teach(
+    task: Annotated[str, _arg("A task's folder, or one of {tasks}.", "TASK", "tasks")],
+    out: Annotated[Path, _opt("The demonstrations' file, .npz or .csv.")],
+    env: Env = None,
+    as_json: Json = False,
+) -> None:
+    """Demonstrate a task in the browser, with sliders, keys or a gamepad.
+
+    You move where the tool shall be, the robot follows by its impedance, an arrow and a bar show the force. Each
+    demonstration is kept or discarded, and written as soon as it is kept. At the end it says what was learned.
+    """
+    from guiderail.tools.operate.teach import teach as record_taught
+
+    _print(record_taught(_named(task)[0], _environment(env), out, _tell), as_json)
 
 
 @command("run runs/connector --rehearse --yes")

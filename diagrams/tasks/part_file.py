@@ -66,8 +66,7 @@ class Bounds(Options):
 
     lower: tuple[Any, ...]
     upper: tuple[Any, ...]
-    phases: tuple[Number, ...] | None = Field(None, description="where in the motion each list holds, from 0 to 1")
-    speed: Numbers | None = Field(None, description="largest change of an output in a second, as it was demonstrated")
+    phases: tuple[Number, ...] | None = Field(None, description="where in the motion each list begins to hold, from 0 to 1")
 
     @field_validator("lower", "upper")
     @classmethod
@@ -83,17 +82,14 @@ class Bounds(Options):
         return _filled(self.lower, -np.inf), _filled(self.upper, np.inf)
 
     def constraints(self, num_steps: int) -> LinearConstraints:
-        """G y ≥ c: the same at each of N steps, or the nearest phase's; in between, whichever of two allows more."""
+        """G y ≥ c: the same at each of N steps, or those of the phase that a step is in."""
         lower, upper = self.arrays()
         if lower.ndim == 1:
             return LinearConstraints.box(lower, upper)
         if self.phases is None or len(self.phases) != len(lower) or lower.shape != upper.shape:
             raise InputError("bounds that change need phases, and a list of lower and of upper ones for each")
-        at = np.linspace(0.0, 1.0, num_steps)
-        low = np.searchsorted(self.phases, at, side="right") - 1
-        low = np.clip(low, 0, len(lower) - 1)
-        high = np.clip(low + 1, 0, len(lower) - 1)
-        lows, highs = np.minimum(lower[low], lower[high]), np.maximum(upper[low], upper[high])
+        phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, num_steps), side="right") - 1
+        lows, highs = (bound[np.clip(phase, 0, len(lower) - 1)] for bound in (lower, upper))
         bounded = [np.isfinite(lower).all(axis=0), np.isfinite(upper).all(axis=0)]
         eye = np.eye(POSE_SIZE)
         G = np.concatenate([eye[bounded[0]], -eye[bounded[1]]])

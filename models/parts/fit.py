@@ -79,6 +79,14 @@ def overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float, np.ndar
     return thickest, where
 
 
+def centre_of_mass(part: Part) -> np.ndarray:
+    """Of a part of one density, (3,) [m]; it lies on the axis of what is the same after a part of a turn."""
+    trimesh = need("trimesh")
+    meshes = [trimesh.Trimesh(vertices, triangles, process=False) for vertices, triangles in part.bodies]
+    volumes = np.array([mesh.volume for mesh in meshes])
+    return volumes @ np.array([mesh.center_mass for mesh in meshes]) / volumes.sum()
+
+
 def check_target(plug: Part, socket: Part) -> None:
     """Refuses parts that overlap where the plug should be.
 

@@ -95,7 +95,7 @@ def load_part(path: Path, unit: str) -> Part:
         remedy = f"is its unit {' or '.join(fitting)}?" if fitting else f"give parts of {SMALLEST} to {LARGEST} m"
         raise InputError(f"{path.name} would be {size:.3g} m long with --unit {unit}: {remedy}")
     bodies = []
-    for body in mesh.split(only_watertight=False):
+    for body in mesh.split(only_watertight=False, repair=False):
         _check_body(path, body)
         bodies.append((np.asarray(body.vertices) * UNITS[unit], np.asarray(body.faces)))
     return Part(path, tuple(bodies))

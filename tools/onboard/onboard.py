@@ -15,6 +15,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.parts.fit import (
     RESTING,
     Motion,
+    centre_of_mass,
     check_target,
     in_the_way,
     motion,
@@ -81,7 +82,7 @@ def read_parts(
         place: [x y z] in the files' unit and [rx ry rz] in degrees by which the plug's file is moved into the
             socket's; zeros where both are drawn assembled.
         axis: which way the plug comes out, in the socket's file.
-        centre: a point on the axis, in the socket's file; the plug's middle unless given.
+        centre: a point on the axis, in the socket's file; the plug's centre of mass unless given.
 
     Raises:
         InputError: if a file can't be used, or an argument makes no sense.
@@ -100,8 +101,7 @@ def read_parts(
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
     first, second = (part.moved(to_target, np.zeros(3)) for part in (first, second))
-    low, high = first.bounds
-    origin = np.array([*(0.5 * (low + high))[:2], low[2]])
+    origin = np.array([*centre_of_mass(first)[:2], first.bounds[0, 2]])
     if centre is not None:
         origin[:2] = (to_target @ (np.asarray(centre, dtype=float) * scale))[:2]
     return first.moved(np.eye(3), -origin), second.moved(np.eye(3), -origin)
@@ -174,7 +174,8 @@ def _snapping(plug: Part, socket: Part, path: Motion) -> frozenset[int]:
         depth, height = max(ways)
         raise InputError(
             f"the plug does not pass the socket: {1e3 * height:.1f} mm above the target they overlap by about "
-            f"{1e3 * depth:.2g} mm; say with --turn by how much it turns, or draw what gives way as a body of its own"
+            f"{1e3 * depth:.2g} mm; say with --turn and --centre by how much it turns about what, or draw what gives way "
+            "as a body of its own"
         )
     return blocked
 
