@@ -16,7 +16,7 @@ from guiderail.models.demonstrations.bnc_connector import NAMES
 from guiderail.models.parts.motion import NUM_DEMONSTRATIONS, demonstrator_motions, searching
 from guiderail.models.primitives import Demonstrations
 
-MOST_SESSIONS = 3  # hands that are tried until every demonstration of one seats
+MOST_SESSIONS = 3  # of five attempts, until five have seated the plug
 
 
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
@@ -24,16 +24,15 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
     numbers = file.motion
     script = searching(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
-    best, most = np.empty(0), -1
+    good: list[np.ndarray] = []
+    bad: list[np.ndarray] = []
     for seed in range(MOST_SESSIONS):
-        motions = demonstrator_motions(seed, script, numbers.rim - numbers.press - 1e-3, times)
-        seated = sum(_seats(folder, file, times, motion) for motion in motions)
-        if seated > most:
-            best, most = motions, seated
-        if seated == NUM_DEMONSTRATIONS:
-            break
-    Demonstrations([times] * len(best), list(best), NAMES).save(folder / file.demonstrations.file)
-    return most
+        for motion in demonstrator_motions(seed, script, numbers.rim - numbers.press - 1e-3, times):
+            if len(good) < NUM_DEMONSTRATIONS:
+                (good if _seats(folder, file, times, motion) else bad).append(motion)
+    shown = (good + bad)[:NUM_DEMONSTRATIONS]
+    Demonstrations([times] * len(shown), shown, NAMES).save(folder / file.demonstrations.file)
+    return len(good)
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:

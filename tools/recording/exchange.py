@@ -61,7 +61,7 @@ def import_recording(
         demonstrations = _at_rate(demonstrations, rate)
     out.parent.mkdir(parents=True, exist_ok=True)
     demonstrations.save(out)
-    return {"out": str(out), "from": kind} | _described(demonstrations) | {"assumed": "; ".join(found.assumed)}
+    return {"out": str(out), "from": kind} | _described(demonstrations) | {"assumed": "; ".join(found.assumed) or "nothing"}
 
 
 def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None = None) -> dict[str, Any]:
