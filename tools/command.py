@@ -156,6 +156,12 @@ def train(
     task, folders = (None, ()) if task is None else _named(task)
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     words |= {"uncertainty": uncertainty, "station": station}
+    if folders and task is not None and not resume:
+        from guiderail.tools.recording.followed import leaves_demonstrations
+
+        given = {k: v for k, v in words.items() if v is not None} | _environment(env)
+        if (sentence := leaves_demonstrations(task, given)) is not None:
+            _say(sentence)
     summary = configure.run(
         task,
         out,
@@ -276,7 +282,9 @@ def check(
     draw: Annotated[
         Path | None, _opt("Draw the demonstrations, or a skill's state machine (.png, .svg, .pdf; a skill also .dot).")
     ] = None,
-    fit: Annotated[bool, _opt("Choose components, kernel and λ by what reproduces them, and say why.", "--fit")] = False,
+    fit: Annotated[
+        bool, _opt("Choose components, kernel and λ by what reproduces them, and say why.", "--fit")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Check demonstrations or a skill before they are used."""
@@ -313,7 +321,9 @@ TARGET_HELP = "x,y,z,rx,ry,rz: the task's target in the recording's frame, in me
 
 @command("import bag --out demonstrations.npz --target 0.5,0,0.2,0,0,0", "import")
 def import_(
-    source: Annotated[Path, _arg("A LeRobot v3 dataset, a ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")],
+    source: Annotated[
+        Path, _arg("A LeRobot v3 dataset, a ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")
+    ],
     out: Annotated[Path, _opt("The demonstrations' file, .npz or .csv.")],
     signal: Annotated[str | None, _opt("Which topic or feature.  [default: the one that can be meant]")] = None,
     target: Annotated[str | None, _opt(TARGET_HELP)] = None,

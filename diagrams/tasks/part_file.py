@@ -68,7 +68,9 @@ class Bounds(Options):
 
     lower: tuple[Any, ...]
     upper: tuple[Any, ...]
-    phases: tuple[Number, ...] | None = Field(None, description="where in the motion each list begins to hold, from 0 to 1")
+    phases: tuple[Number, ...] | None = Field(
+        None, description="where in the motion each list begins to hold, from 0 to 1"
+    )
 
     @field_validator("lower", "upper")
     @classmethod

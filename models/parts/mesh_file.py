@@ -127,4 +127,6 @@ def _check_body(path: Path, body: Any) -> None:
             f"{path.name} has triangles that face different ways: recalculate its normals outwards, and export it again"
         )
     if body.volume <= 0.0:
-        raise InputError(f"{path.name} is inside out, its triangles face inwards: flip its normals, and export it again")
+        raise InputError(
+            f"{path.name} is inside out, its triangles face inwards: flip its normals, and export it again"
+        )

@@ -7,6 +7,7 @@ as a sculptor's saw would, and no surface moves.
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -82,7 +83,7 @@ def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
     while start < len(faces):
         fan = faces[start + 1 : start + 1 + faces[start]]
         start += 1 + len(fan)
-        for second, third in zip(fan[1:-1], fan[2:], strict=True):
+        for second, third in itertools.pairwise(fan[1:]):
             triangle = np.array([fan[0], second, third])
             a, b, c = points[triangle] * _SCALE
             area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a)))

@@ -146,6 +146,20 @@ def share_within_spread(primitive: LcNsKmp) -> float:
     return float(_within(primitive.reference, motion_without_actions(primitive), slice(None)).mean())
 
 
+def estimated_share(
+    reference: ReferenceTrajectory, inverse_length: float, lambda_: float, beta: float, horizon: int = 40
+) -> float:
+    """About what `share_within_spread` is of a primitive without a history, from forty of its steps.
+
+    Args:
+        reference: of the primitive.
+        inverse_length, lambda_, beta, horizon: as in `LcNsKmp`.
+    """
+    steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
+    motion = _motion(reference, SquaredExponential(inverse_length), lambda_ + beta, horizon, steps)
+    return float(_within(reference, motion, steps).mean())
+
+
 def motion_without_actions(primitive: LcNsKmp) -> np.ndarray:
     """(N, O): what a primitive commands step by step if nobody acts, from the first mean on."""
     reference = primitive.reference
@@ -210,9 +224,7 @@ def _tried(
     worse = np.full(len(grid), np.inf)
     behind = errors[asked] - errors[int(np.argmin(errors.mean(axis=1)))]
     standard_error = behind.std(axis=1, ddof=1) / np.sqrt(len(without))
-    worse[asked] = np.divide(
-        behind.mean(axis=1), standard_error, out=np.zeros(len(behind)), where=standard_error > 0
-    )
+    worse[asked] = np.divide(behind.mean(axis=1), standard_error, out=np.zeros(len(behind)), where=standard_error > 0)
     rms = np.sqrt(errors.mean(axis=1) / outputs.shape[-1])
     return tuple(
         Candidate(inverse_length, hbar / 2, float(rms[i]), float(worse[i]), float(shares[i]))

@@ -122,7 +122,9 @@ def bayonet(clearance: float = 0.2) -> Part:
     socket = _block(30.0, -14.0) - _hole(_disc(6.0), clearance, -12.2)
     half = np.rad2deg(np.arcsin((1.5 + clearance) / 6.0))
     arc = np.deg2rad(np.linspace(-40.0 - half, half, 13))
-    sector = CrossSection([[(0.0, 0.0), *((np.hypot(7.5, 1.5) + 2 * clearance) * np.stack([np.cos(arc), np.sin(arc)], axis=1))]])
+    sector = CrossSection(
+        [[(0.0, 0.0), *((np.hypot(7.5, 1.5) + 2 * clearance) * np.stack([np.cos(arc), np.sin(arc)], axis=1))]]
+    )
     for i, lug in enumerate(lugs):
         socket -= _hole(lug.rotate(-40.0), clearance, -11.0 - clearance)
         socket -= _prism(sector.rotate(120.0 * i), -11.0 - clearance, -8.5 + clearance)
@@ -133,7 +135,9 @@ def snap_fit(clearance: float = 0.2) -> Part:
     """A square peg with two noses that give way to the socket's lips, drawn as bodies of their own."""
     outline = _square(8.0, 8.0)
     noses = [
-        Manifold.hull_points([(s * x, y, z) for y in (-2.0, 2.0) for x, z in ((3.0, -8), (4.0, -8), (4.4, -7.0), (4.0, -6), (3.0, -6))])
+        Manifold.hull_points(
+            [(s * x, y, z) for y in (-2.0, 2.0) for x, z in ((3.0, -8), (4.0, -8), (4.4, -7.0), (4.0, -6), (3.0, -6))]
+        )
         for s in (-1.0, 1.0)
     ]
     socket = _block(26.0, -16.0) - _hole(outline, clearance, -12.0)
@@ -150,7 +154,9 @@ def dovetail(clearance: float = 0.15) -> Part:
     # The slot is open to the side of the plug's plate.
     block = _prism(_square(24.0, 12.0, 0.0, 6.0 + 0.1 + clearance), -19.0, 0.0)
     block -= _prism(slot, -15.0, 0.01)
-    block -= Manifold.batch_hull([_prism(_grown(tongue, clearance), -0.5, -0.49), _prism(_grown(tongue, 0.5), 0.0, 0.01)])
+    block -= Manifold.batch_hull(
+        [_prism(_grown(tongue, clearance), -0.5, -0.49), _prism(_grown(tongue, 0.5), 0.0, 0.01)]
+    )
     return Part([plug], [block], clearance)
 
 

@@ -15,7 +15,9 @@ OF_A_TASK = ("training",)  # those that are told which task, and how it is set u
 DRAWN = ("time_step",)  # those that can be drawn
 
 
-def run_benchmark(what: str, *, picture: Path | None = None, **told_of: Any) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
+def run_benchmark(
+    what: str, *, picture: Path | None = None, **told_of: Any
+) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
     """What one of `BENCHMARKS` measured, with its progress on standard error; and what shows it to a person.
 
     Args:

@@ -1,4 +1,4 @@
-"""From two mesh files to a task folder: contact geometry, motion, success and demonstrations, measured as they are made."""
+"""From two mesh files to a task folder: contact geometry, motion, success and demonstrations, measured."""
 
 from __future__ import annotations
 
@@ -174,8 +174,8 @@ def _snapping(plug: Part, socket: Part, path: Motion) -> frozenset[int]:
         depth, height = max(ways)
         raise InputError(
             f"the plug does not pass the socket: {1e3 * height:.1f} mm above the target they overlap by about "
-            f"{1e3 * depth:.2g} mm; say with --turn and --centre by how much it turns about what, or draw what gives way "
-            "as a body of its own"
+            f"{1e3 * depth:.2g} mm; say with --turn and --centre by how much it turns about what, or draw what "
+            "gives way as a body of its own"
         )
     return blocked
 

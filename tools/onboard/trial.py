@@ -20,10 +20,6 @@ from guiderail.models.parts.fit import nearest_on_surface
 from guiderail.models.parts.motion import straight
 from guiderail.systems.recorder import Recording
 
-
-
-
-
 _CORNERS = 8  # of a contact surface, those of the highest pressure, whose depth is measured
 
 

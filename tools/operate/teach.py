@@ -1,4 +1,4 @@
-"""`guiderail teach`: a person moves the compliant target of a running simulation from the browser, and keeps what is good.
+"""`guiderail teach`: a person moves the compliant target of a running simulation, and keeps what is good.
 
 The page's sliders are where the command shall be, and each has two keys; a gamepad pushes them. The command follows at
 a hand's speed, the robot by its impedance: pushing means to command beyond what stops it.
@@ -37,7 +37,13 @@ SLIDERS = {
     "pitch [degrees]": (10.0, 0.5, "KeyK", "KeyI", DEGREE),
     "roll [degrees]": (10.0, 0.5, "KeyJ", "KeyL", DEGREE),
 }
-KEEP, DISCARD, UNDO, SLOW, END = "keep (Enter)", "discard (Backspace)", "undo 1 s (U)", "slow motion (M)", "end (Escape)"
+KEEP, DISCARD, UNDO, SLOW, END = (
+    "keep (Enter)",
+    "discard (Backspace)",
+    "undo 1 s (U)",
+    "slow motion (M)",
+    "end (Escape)",
+)
 BUTTONS = {KEEP: "Enter", DISCARD: "Backspace", UNDO: "KeyU", SLOW: "KeyM", END: "Escape"}
 AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0))  # of a gamepad, for x, y, z and the turn
 GAMEPAD_SPEED = np.array([10.0, 10.0, 10.0, 30.0])  # slider units a second at full deflection
@@ -196,7 +202,7 @@ class Teaching:
         return bool(success.holds(np.concatenate([X.translation(), turn.angle() * turn.axis()])))
 
     def learned(self) -> dict[str, Any]:
-        """What the kept demonstrations say: their mean, drawn with its spread, their bounds, and whether it succeeds."""
+        """What was shown: its mean, drawn with its spread, its bounds, and whether the mean alone succeeds."""
         demonstrations = self.demonstrations()
         steps = round(float(np.mean([t[-1] for t, _ in self.kept])) / self._period) + 1
         common = demonstrations.resampled(steps)
@@ -277,7 +283,9 @@ class Teaching:
             self.meshcat.SetLine(f"/guiderail/learned/{number}", points, 3.0 if number == 0 else 1.0, colour)
 
     def _start_pose(self) -> np.ndarray:
-        return self.task.start(np.random.default_rng(0)) if isinstance(self.task, InsertionTask) else np.zeros(POSE_SIZE)
+        return (
+            self.task.start(np.random.default_rng(0)) if isinstance(self.task, InsertionTask) else np.zeros(POSE_SIZE)
+        )
 
     def _port(self) -> Any:
         return self.simulator.get_system().GetInputPort("desired_pose")

@@ -61,7 +61,11 @@ def import_recording(
         demonstrations = _at_rate(demonstrations, rate)
     out.parent.mkdir(parents=True, exist_ok=True)
     demonstrations.save(out)
-    return {"out": str(out), "from": kind} | _described(demonstrations) | {"assumed": "; ".join(found.assumed) or "nothing"}
+    return (
+        {"out": str(out), "from": kind}
+        | _described(demonstrations)
+        | {"assumed": "; ".join(found.assumed) or "nothing"}
+    )
 
 
 def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None = None) -> dict[str, Any]:
@@ -111,7 +115,9 @@ def _described(demonstrations: Demonstrations) -> dict[str, Any]:
         "demonstrations": demonstrations.num_demonstrations,
         "outputs": list(demonstrations.names),
         "samples": [len(t) for t in demonstrations.times],
-        "samples a second": f"{min(rates):.4g} to {max(rates):.4g}" if max(rates) - min(rates) > 0.01 else f"{rates[0]:.4g}",
+        "samples a second": f"{min(rates):.4g} to {max(rates):.4g}"
+        if max(rates) - min(rates) > 0.01
+        else f"{rates[0]:.4g}",
     }
 
 

@@ -11,7 +11,7 @@ from guiderail.models.parts.pieces import as_arrays, convex_pieces
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
-from oracles.parts import PARTS  # noqa: E402 (it needs both)
+from oracles.parts import PARTS
 
 
 def loaded(name, folder):
@@ -53,7 +53,7 @@ def test_what_overlaps_at_the_target_is_refused(tmp_path):
 def test_a_plug_above_its_socket_goes_into_nothing(tmp_path):
     plug, socket = loaded("square_peg", tmp_path)
     assert motion(plug, socket, 0.0).rim == pytest.approx(15e-3)
-    with pytest.raises(InputError, match="ends 5.0 mm above the socket"):
+    with pytest.raises(InputError, match=r"ends 5\.0 mm above the socket"):
         motion(plug.moved(np.eye(3), np.array([0, 0, 0.02])), socket, 0.0)
 
 

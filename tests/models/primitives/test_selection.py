@@ -6,7 +6,13 @@ import pytest
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.mixture import information_criteria
-from guiderail.models.primitives.selection import ENOUGH, fit, motion_without_actions, share_within_spread
+from guiderail.models.primitives.selection import (
+    ENOUGH,
+    estimated_share,
+    fit,
+    motion_without_actions,
+    share_within_spread,
+)
 from oracles.handwriting import correlated, write
 
 
@@ -108,6 +114,10 @@ def test_a_primitive_that_leaves_the_spread_says_so():
     assert share_within_spread(too_wide) < 0.7
     too_strong = LcNsKmp(hook(), SquaredExponential(50.0), 1e5, 1e5)
     assert share_within_spread(too_strong) < 0.2
+    for primitive in (good, too_wide, too_strong):
+        kernel, hbar = primitive.kernel.inverse_length, primitive.lambda_
+        estimate = estimated_share(primitive.reference, kernel, hbar, hbar)
+        assert estimate == pytest.approx(share_within_spread(primitive), abs=0.1)
 
 
 def test_the_share_counts_correlations():

@@ -12,7 +12,7 @@ from guiderail.tools.command import main
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
-from oracles.parts import PARTS  # noqa: E402 (it needs both)
+from oracles.parts import PARTS
 
 
 def call(*arguments, code=0):

@@ -71,7 +71,9 @@ def test_the_robot_follows_and_its_force_is_shown(session):
     lead(session, "x [mm]", 3.0, 15)  # beside the holes
     lead(session, "z [mm]", -12.0, 60)
     arrow = session.meshcat.lines["/guiderail/force"]
-    assert np.linalg.norm(arrow[:, 1] - arrow[:, 0]) > teaching.FORCE_LENGTH  # more than a newton: it stands on something
+    assert (
+        np.linalg.norm(arrow[:, 1] - arrow[:, 0]) > teaching.FORCE_LENGTH
+    )  # more than a newton: it stands on something
 
 
 def test_undo_takes_a_second_back(session):

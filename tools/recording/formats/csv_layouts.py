@@ -119,7 +119,9 @@ def _time(
         fitting = [name for name, scale in _TIME_UNITS.items() if _PERIODS[0] <= step * scale < _PERIODS[1]]
         if fitting[:1] != ["s"]:
             words = " or ".join(fitting) or "s, ms, us or ns"
-            raise InputError(f"{file} does not say the unit of {names[0]}, whose step is {step:g}: give --time-unit {words}")
+            raise InputError(
+                f"{file} does not say the unit of {names[0]}, whose step is {step:g}: give --time-unit {words}"
+            )
         unit = "s"
         assumed.append(f"{names[0]} is in seconds, {1.0 / step:.4g} samples in each")
     if unit not in _TIME_UNITS:

@@ -45,8 +45,9 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     if not version.startswith("v3"):
         raise InputError(f"{folder} is a LeRobot dataset of version {version}: convert it to v3.0 by LeRobot's script")
     vectors = [
-        name for name, one in features.items() if len(one.get("shape", ())) == 1 and name not in _CLOCKS and
-        str(one.get("dtype", "")).startswith("float")
+        name
+        for name, one in features.items()
+        if len(one.get("shape", ())) == 1 and name not in _CLOCKS and str(one.get("dtype", "")).startswith("float")
     ]
     chosen, assumed = choose_signal(sorted(vectors), signal, str(folder), "--signal")
     files = sorted((folder / "data").rglob("*.parquet"))
