@@ -150,8 +150,8 @@ def _rotations(
                 )
             values = table[[columns[name] for name in names]].to_numpy()
             return _from_quaternions(file, values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]])
-    for names in _EULER:
-        found = [_column(columns, name) for name in names]
+    for euler in _EULER:
+        found = [_column(columns, name) for name in euler]
         if None not in found:
             said = re.search(r"(deg|rad)", str(found[0]))
             unit = said.group(1) if said else angles
