@@ -103,9 +103,12 @@ def draw(results: dict[str, Any], path: Path) -> Path:
                 [row["seconds"] for row in rows], [row[column] for row in rows], "o-", mfc="white", label=motion
             )
             for row in rows:
-                axis.annotate(f"{1e3 * row['time_step']:g} ms", (row["seconds"], row[column]), fontsize=7)
+                place, beside = (row["seconds"], row[column]), {"xytext": (3, 5), "textcoords": "offset points"}
+                axis.annotate(f"{1e3 * row['time_step']:g} ms", place, fontsize=7, **beside)
                 if row["time_step"] == results["chosen"]:
                     axis.plot(row["seconds"], row[column], "o", color=line.get_color())
-        axis.set(xlabel="CPU time of the motion [s]", ylabel=label, xscale="log")
+        axis.set(xlabel="CPU time of the motion [s]", ylabel=label, xscale="log", xticks=[0.5, 1.0, 2.0, 5.0])
+        axis.minorticks_off()
+        axis.xaxis.set_major_formatter("{x:g}")
     axes.flat[0].legend(frameon=False)
     return save_figure(figure, path)

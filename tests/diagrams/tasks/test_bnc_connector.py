@@ -8,7 +8,7 @@ import guiderail.diagrams  # noqa: F401 (registers)
 from guiderail.diagrams.make import make_env
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, reference_trajectory
 from guiderail.diagrams.tasks.bnc_options import ALIGNMENT, COLLISION_FORCE
-from guiderail.diagrams.tasks.bnc_rewards import DEPTH_REWARD
+from guiderail.diagrams.tasks.bnc_rewards import ALIGNMENT_REWARD, DEPTH_REWARD
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
@@ -98,7 +98,7 @@ def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
 
 
 def test_half_a_turn_of_everything_is_the_same_task(kmp):
-    signs = np.array(kmp.task.symmetry.observation)
+    signs = np.diag(kmp.task.symmetry.observations[0])
     across = signs < 0
     felt = []
     for side in (1.0, -1.0):
@@ -150,6 +150,16 @@ def test_shaped_reward_adds_the_depth_gained():
     for _ in range(12):
         depth += env.step(np.zeros(2))[4]["depth"]
     assert depth == pytest.approx(DEPTH_REWARD * (start - env.trace.measured[-1, 2]) / MM, abs=0.5)
+
+
+def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
+    """From 2 mm beside the jack to where a constant action leads."""
+    env = make_env("BncConnector", guidance="kgrl", reward="aligned", uncertainty="known", hold=10)
+    env.reset(seed=0, options={"offset": (2.0 * MM, 0.0)})
+    gained = sum(env.step(np.array([1.0, 0.0]))[4]["alignment"] for _ in range(10))
+    nearer = np.hypot(2.0 * MM, 0.0) - np.linalg.norm(env.trace.measured[-1, :2] - [2.0 * MM, 0.0])
+    assert gained > 1.0
+    assert gained == pytest.approx(ALIGNMENT_REWARD * nearer / MM, abs=0.5)
 
 
 def test_the_same_policy_drives_rails_and_arm():
@@ -221,3 +231,24 @@ class TestUncertainty:
 def test_refuses_what_makes_no_sense(wrong):
     with pytest.raises(InputError):
         make_env("BncConnector", **wrong)
+
+
+def test_on_the_rim_a_quarter_turn_of_everything_feels_the_same(kmp):
+    """Not exactly so: the demonstrations search the rim one way round."""
+    near = kmp.task.near_symmetry
+    assert len(near.actions) == 7
+    quarter = near.observations[0]
+    felt = []
+    for offset in ((1.0 * MM, 0.5 * MM), (-0.5 * MM, 1.0 * MM)):
+        observations = play(kmp, still(kmp), options={"offset": offset})[3]
+        felt.append(observations[6:14].mean(axis=0))  # while the plug stands on the rim
+    seen, turned = felt
+    torques = slice(10, 12)
+    expected = (quarter @ seen)[torques]
+    assert np.linalg.norm(expected - turned[torques]) < 0.5 * np.linalg.norm(expected)
+
+
+def test_the_near_symmetry_contains_the_exact_one(kmp):
+    exact, near = kmp.task.symmetry, kmp.task.near_symmetry
+    sides = [k for k in range(7) if np.array_equal(near.actions[k], exact.actions[0])]
+    assert any(np.array_equal(near.observations[k], exact.observations[0]) for k in sides)
