@@ -2,10 +2,12 @@
 
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 import yaml
 
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
 
@@ -27,7 +29,11 @@ def folder(tmp_path_factory):
     where = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(where)
     call("onboard", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
-    return where / "peg"
+    yield where / "peg"
+    # What was registered here is nobody else's.
+    for name in [name for name in TASKS.names() if name.startswith("parts/")]:
+        del TASKS._entries[name]
+        gymnasium.registry.pop(environment_id(name), None)
 
 
 def test_what_was_measured_is_what_was_drawn(folder):

@@ -47,9 +47,7 @@ class Page:
 
 async def person(url, session, travel, picture):
     target = next(
-        tab
-        for tab in json.load(urllib.request.urlopen(f"http://localhost:{PORT}/json"))
-        if tab["type"] == "page"
+        tab for tab in json.load(urllib.request.urlopen(f"http://localhost:{PORT}/json")) if tab["type"] == "page"
     )
     async with websockets.connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
         page = Page(socket)
