@@ -102,8 +102,13 @@ class Bounds(Options):
 
 
 def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
-    filled = np.array(rows, dtype=object)
-    return np.where(np.equal(filled, None), missing, filled).astype(float)
+    return np.array(_replaced(rows, missing), dtype=float)
+
+
+def _replaced(rows: Any, missing: float) -> Any:
+    if isinstance(rows, list | tuple):
+        return [_replaced(one, missing) for one in rows]
+    return missing if rows is None else rows
 
 
 class Shown(Options):
@@ -129,14 +134,14 @@ class PartTaskFile(Options):
     place: Numbers = Field((0.55, 0.0, 0.15), min_length=3, max_length=3, description="of the target in the world [m]")
     scenario: tuple[str, ...] = Field((), description="Drake model directives (.yaml) of what else stands there")
     motion: MotionNumbers
-    tolerance: Tolerance = Tolerance()
-    bounds: Bounds = Bounds(lower=(-2e-3, -2e-3, *[None] * 4), upper=(2e-3, 2e-3, *[None] * 4))
+    tolerance: Tolerance = Tolerance.model_validate({})
+    bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
     offset_range: Numbers | None = Field(
         None, min_length=2, max_length=2, description="distance of the socket from its place [m], the task's own"
     )
     force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
-    demonstrations: Shown = Shown()
+    demonstrations: Shown = Shown.model_validate({})
     explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
     measured: dict[str, Any] = Field({}, description="what onboarding measured; nothing reads it")
 

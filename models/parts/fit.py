@@ -35,7 +35,7 @@ class Motion:
     def path(self, steps: int = 24) -> list[tuple[float, float]]:
         """Heights [m] and turns [rad] from the rim to the target."""
         down = [(float(z), -self.turn) for z in np.linspace(self.rim, 0.0, steps)]
-        turning = np.linspace(-self.turn, 0.0, steps)[1:] if self.turn else []
+        turning = np.linspace(-self.turn, 0.0, steps)[1:] if self.turn else np.empty(0)
         return down + [(0.0, float(angle)) for angle in turning]
 
 

@@ -31,7 +31,7 @@ class DemonstratedBounds:
     def holds(self, outputs: np.ndarray) -> np.ndarray:
         """Whether each of N samples (N, O) of a whole motion is inside, (N,)."""
         phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, len(outputs)), side="right") - 1
-        return ((outputs >= self.lower[phase]) & (outputs <= self.upper[phase])).all(axis=1)
+        return np.all((outputs >= self.lower[phase]) & (outputs <= self.upper[phase]), axis=1)
 
 
 def demonstrated_bounds(

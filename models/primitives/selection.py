@@ -217,7 +217,7 @@ def _tried(
     shares = np.array([_within(reference, motion, steps).mean() for motion in motions])
     asked = shares >= min(ENOUGH, shares.max())
     errors = np.full((len(grid), len(without)), np.inf)
-    for i in np.flatnonzero(asked):
+    for i in np.flatnonzero(asked).tolist():
         for m, part in enumerate(without):
             motion = _motion(part, kernels[i], grid[i][1], horizon, steps)
             errors[i, m] = _squared(reference.covariances[steps], outputs[m, steps] - motion).mean()

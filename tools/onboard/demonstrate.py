@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,5 +41,5 @@ def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarr
     plant = driven.station.plant
     X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
     turn = X.rotation().ToAngleAxis()
-    judge = type("Judge", (PartInsertion,), {"file": file})
+    judge: Any = type("Judge", (PartInsertion,), {"file": file})
     return judge.is_seated(np.concatenate([X.translation(), turn.angle() * turn.axis()]))

@@ -313,9 +313,12 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
     models = {}
     for part, name in zip(parts, ("plug", "socket"), strict=True):
         if contact.compliant == name:
-            pieces = [Piece(file=file, modulus=modulus, friction=friction) for file, modulus, _ in contact.pieces]
+            pieces = [
+                Piece.model_validate({"file": file, "modulus": modulus, "friction": friction})
+                for file, modulus, _ in contact.pieces
+            ]
         else:
-            pieces = [Piece(file=f"{name}.obj", friction=friction)]
+            pieces = [Piece.model_validate({"file": f"{name}.obj", "friction": friction})]
         vertices = _whole(part)[0]
         middle = part.bounds.mean(axis=0)
         models[name] = PartModel(
@@ -326,13 +329,16 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
             gyration=round(float(np.sqrt(((vertices - middle) ** 2).sum(axis=1).mean())), 6),
             pieces=tuple(pieces),
         )
-    return PartTaskFile(
+    values: dict[str, Any] = dict(
         name=f"{NAMESPACE}/{_plain_name(numbers['name'])}",
         **models,
         scenario=tuple(file.name for file in numbers["scenario"]),
-        motion=MotionNumbers(travel=path.travel, rim=path.rim, turn=float(path.turn / DEGREE), push=push),
+        motion=MotionNumbers.model_validate(
+            {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push}
+        ),
         force_limit=numbers["force_limit"],
     )
+    return PartTaskFile.model_validate(values)
 
 
 def _plain_name(name: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -141,7 +142,7 @@ def insert(
     X = plant.GetFrameByName(PLUG).CalcPose(context, plant.GetFrameByName(SOCKET))
     turn = X.rotation().ToAngleAxis()
     pose = np.concatenate([X.translation(), turn.angle() * turn.axis()])
-    judge = type("Judge", (PartInsertion,), {"file": file})
+    judge: Any = type("Judge", (PartInsertion,), {"file": file})
     return Trial(
         success=judge.is_seated(pose),
         pose=pose,

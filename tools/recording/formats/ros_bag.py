@@ -111,7 +111,7 @@ def _read_bag(
 
 def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
     """Seconds since the first message, by the stamps of whoever measured where there are some."""
-    headers = [getattr(message, "header", None) for _, message in rows]
+    headers: list[Any] = [getattr(message, "header", None) for _, message in rows]
     if all(header is not None for header in headers):
         stamps = np.array([header.stamp.sec * 10**9 + header.stamp.nanosec for header in headers], dtype=np.int64)
         if (np.diff(stamps) > 0).all():
