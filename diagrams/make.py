@@ -23,7 +23,7 @@ from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of, randomizes
-from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
@@ -81,6 +81,8 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
     Raises:
         InputError: for an unknown task, option or word, or a value out of range.
     """
+    if name not in TASKS.names() and is_task_folder(name):
+        name = register_task_folder(name)
     declared = TASKS.get(name)
     places = stations_for(declared.world_kind)
     difficulty = choose("difficulty", given.get("difficulty", STANDARD), list(declared.difficulties), name)
@@ -144,7 +146,7 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     cores too, threads that wait for each other take eighty times as long.
 
     Args:
-        task: its name.
+        task: its name, or the path of a task folder.
         render_mode: None, "human" (a browser view) or "rgb_array".
         options: those of `guiderail list`: of every environment, of the task, its guidance and its station.
 

@@ -13,8 +13,13 @@ from guiderail.tools.recording.reader import ENDINGS, load_demonstrations
 SKILLS = (".yaml", ".yml")
 
 
-def check(file: Path, draw: Path | None = None) -> dict[str, Any]:
-    """Reads a file as what its ending says it is; `draw` is where demonstrations or a state machine are drawn.
+def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
+    """Reads a file as what its ending says it is.
+
+    Args:
+        file: what is read.
+        draw: where demonstrations or a state machine are drawn.
+        fit: whether a primitive is fitted to demonstrations, which takes seconds.
 
     Raises:
         InputError: if it is neither, or what it holds makes no sense.
@@ -22,7 +27,7 @@ def check(file: Path, draw: Path | None = None) -> dict[str, Any]:
     if not file.exists():
         raise InputError(f"there is no file {file}: name demonstrations (.npz, .csv, a folder) or a skill (.yaml)")
     if file.suffix in ENDINGS or file.is_dir():
-        return check_demonstrations(file, draw)
+        return check_demonstrations(file, draw) | (fitted(file) if fit else {})
     if file.suffix in SKILLS:
         return check_skill(file, draw)
     raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv, a skill is .yaml")
@@ -59,6 +64,31 @@ def check_demonstrations(file: Path, draw: Path | None = None) -> dict[str, Any]
         "tightest": spread.min(axis=0).round(6).tolist(),
         "widest": spread.max(axis=0).round(6).tolist(),
     } | ({} if draw is None else {"picture": str(draw)})
+
+
+def fitted(file: Path) -> dict[str, Any]:
+    """What a primitive of these demonstrations should be made with, why, and how the defaults would do.
+
+    Raises:
+        InputError: if they are too few for that.
+    """
+    from guiderail.models.primitives import LcNsKmp
+    from guiderail.models.primitives.selection import ENOUGH, fit, share_within_spread
+
+    demonstrations = load_demonstrations(file)
+    # What agrees exactly would leave a covariance singular.
+    floor = 1e-3 * np.maximum(np.ptp(np.concatenate(demonstrations.outputs), axis=0), 1e-9)
+    chosen = fit(demonstrations, floor=floor)
+    share = share_within_spread(LcNsKmp(chosen.reference))
+    words = "stays with them" if share >= ENOUGH else "LEAVES them: give what is chosen here"
+    return {
+        "components": chosen.components,
+        "inverse_length": float(f"{chosen.kernel.inverse_length:.4g}"),
+        "lambda_": float(f"{chosen.lambda_:.4g}"),
+        "beta": float(f"{chosen.beta:.4g}"),
+        "why": chosen.why,
+        "with the defaults": f"λ = β = 6 and inverse_length = 2: {share:.1%} of the steps within; {words}",
+    }
 
 
 def draw_demonstrations(common: Demonstrations, picture: Path) -> None:

@@ -154,8 +154,15 @@ def train(
     """
     from guiderail.tools.learning import configure
 
+    task, folders = (None, ()) if task is None else _named(task)
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     words |= {"uncertainty": uncertainty, "station": station}
+    if folders and task is not None and not resume:
+        from guiderail.tools.recording.followed import leaves_demonstrations
+
+        given = {k: v for k, v in words.items() if v is not None} | _environment(env)
+        if (sentence := leaves_demonstrations(task, given)) is not None:
+            _say(sentence)
     summary = configure.run(
         task,
         out,
@@ -166,7 +173,7 @@ def train(
         episodes=episodes,
         seed=seed,
         resume=resume,
-        imports=imports or (),
+        imports=(*folders, *(imports or ())),
         ledger=ledger,
     )
     _print(summary, as_json)
@@ -341,12 +348,81 @@ def check(
     draw: Annotated[
         Path | None, _opt("Draw the demonstrations, or a skill's state machine (.png, .svg, .pdf; a skill also .dot).")
     ] = None,
+    fit: Annotated[
+        bool, _opt("Choose components, kernel and λ by what reproduces them, and say why.", "--fit")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Check demonstrations or a skill before they are used."""
     from guiderail.tools.check import check as check_file
 
-    _print(check_file(file, draw), as_json)
+    _print(check_file(file, draw, fit=fit), as_json)
+
+
+@command("constraints demonstrations.npz --phases 4 --draw bounds.png --into ./peg")
+def constraints(
+    file: Annotated[Path, _arg("Demonstrations (.npz, .csv or a folder of them).", "FILE")],
+    phases: Annotated[int, _opt("Parts of the motion, each with bounds of its own.")] = 1,
+    margin: Annotated[float, _opt("Beyond what was shown, as a part of its range.")] = 0.1,
+    least: Annotated[float, _opt("Beyond what was shown at least, in the outputs' unit.")] = 0.0,
+    outputs: Annotated[str | None, _opt("Numbers of those that are bounded, such as 0,1.  [default: all]")] = None,
+    draw: Annotated[Path | None, _opt("Draw the demonstrations and their bounds (.png, .svg, .pdf).")] = None,
+    out: Annotated[Path | None, _opt("Write them as YAML, to be read and edited.")] = None,
+    into: Annotated[Path | None, _opt("A task's folder whose bounds become these.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Find bounds of every command from what was demonstrated, phase by phase."""
+    from guiderail.tools.recording.bounds import constraints as find
+
+    try:
+        chosen = None if outputs is None else [int(number) for number in outputs.split(",")]
+    except ValueError:
+        raise InputError(f"--outputs takes whole numbers separated by commas, not {outputs!r}") from None
+    how: dict[str, Any] = {"phases": phases, "margin": margin, "least": least, "outputs": chosen}
+    _print(find(file, **how, draw=draw, out=out, into=into), as_json)
+
+
+TARGET_HELP = "x,y,z,rx,ry,rz: the task's target in the recording's frame, in metres and degrees."
+
+
+@command("import bag --out demonstrations.npz --target 0.5,0,0.2,0,0,0", "import")
+def import_(
+    source: Annotated[
+        Path, _arg("A LeRobot v3 dataset, a ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")
+    ],
+    out: Annotated[Path, _opt("The demonstrations' file, .npz or .csv.")],
+    signal: Annotated[str | None, _opt("Which topic or feature.  [default: the one that can be meant]")] = None,
+    target: Annotated[str | None, _opt(TARGET_HELP)] = None,
+    rate: Annotated[float | None, _opt("Resample to so many samples a second.")] = None,
+    unit: Annotated[str | None, _opt("Of positions in a CSV file that does not say it: m, cm or mm.")] = None,
+    time_unit: Annotated[str | None, _opt("Of its time: s, ms, us or ns.")] = None,
+    quaternion: Annotated[str | None, _opt("The order of its numbered quaternion: xyzw or wxyz.")] = None,
+    angles: Annotated[str | None, _opt("Of its roll, pitch and yaw: deg or rad.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Bring demonstrations from another format.
+
+    It says what it took for granted, and asks for what a file doesn't say and only whoever recorded it knows.
+    """
+    from guiderail.tools.recording.exchange import import_recording
+
+    where = None if target is None else _floats(target, 6, "--target")
+    of_csv = {"unit": unit, "time_unit": time_unit, "quaternion": quaternion, "angles": angles}
+    _print(import_recording(source, out, signal=signal, target=where, rate=rate, **of_csv), as_json)
+
+
+@command("export demonstrations.npz --to lerobot --out dataset")
+def export(
+    file: Annotated[Path, _arg("Demonstrations (.npz, .csv or a folder of them).", "FILE")],
+    out: Annotated[Path, _opt("The folder to write; it must not exist.")],
+    to: Annotated[str, _opt("lerobot or mcap.")],
+    rate: Annotated[float | None, _opt("Resample to so many samples a second.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Take demonstrations to another format: a LeRobot v3 dataset, or ROS 2 bags in MCAP."""
+    from guiderail.tools.recording.exchange import export_demonstrations
+
+    _print(export_demonstrations(file, out, to, rate), as_json)
 
 
 @command("study connector --out studies --methods skgrl,kgrl --seeds 30,31")
@@ -498,6 +574,49 @@ def stress(
     raise typer.Exit(1 if found["wrong"] else 0)
 
 
+@command("onboard plug.stl socket.stl --unit mm --out ./peg")
+def onboard(
+    plug: Annotated[Path, _arg("The part in the tool: .stl, .obj, .glb, .step.", "PLUG")],
+    socket: Annotated[Path, _arg("The part in the world.", "SOCKET")],
+    out: Annotated[Path, _opt("The task's folder; it must not exist.")],
+    unit: Annotated[str | None, _opt("Of the files' numbers: mm, cm, m or inch.")] = None,
+    place: Annotated[
+        str, _opt("x,y,z,rx,ry,rz in the files' unit and degrees: moves the plug's file to the target.")
+    ] = "0,0,0,0,0,0",
+    axis: Annotated[str, _opt("Which way the plug comes out: +x, -x, +y, -y, +z or -z.")] = "+z",
+    centre: Annotated[str | None, _opt("x,y,z of a point on the axis.  [default: the plug's centre of mass]")] = None,
+    turn: Annotated[float, _opt("By how many degrees the plug turns at the bottom; it is drawn turned.")] = 0.0,
+    force_limit: Annotated[float, _opt("More than that ends an episode [N].")] = 35.0,
+    friction: Annotated[float, _opt("Of all surfaces.")] = 0.2,
+    scenario: Annotated[list[Path] | None, _opt("Drake model directives of what else stands there.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Make a task of two mesh files.
+
+    The parts are drawn assembled, or --place says where the plug goes. It checks them, finds contact geometry that is
+    fast and stiff enough, inserts the plug by a script, aligned and beside, records demonstrations, and leaves a folder
+    that is a task: guiderail train ./peg. Every number is in its task.yaml; preview.html shows it.
+    """
+    from guiderail.tools.onboard.onboard import ask_unit
+    from guiderail.tools.onboard.onboard import onboard as make
+
+    found = make(
+        plug,
+        socket,
+        out,
+        unit=ask_unit((plug, socket), unit),
+        place=_floats(place, 6, "--place"),
+        axis=axis,
+        centre=None if centre is None else _floats(centre, 3, "--centre"),
+        turn=turn,
+        force_limit=force_limit,
+        friction=friction,
+        scenario=scenario or (),
+        say=(lambda words: None) if as_json else _tell,
+    )
+    _print(found, as_json)
+
+
 @command("drive Pouring")
 def drive(
     task: Annotated[str, _arg("The task: {tasks}.", "TASK", "tasks")],
@@ -507,7 +626,24 @@ def drive(
     """Act in the policy's place, with a gamepad or the keyboard."""
     from guiderail.tools.operate.drive import drive_by_hand
 
-    drive_by_hand(task, ({} if guidance is None else {"guidance": guidance}) | _environment(env))
+    drive_by_hand(_named(task)[0], ({} if guidance is None else {"guidance": guidance}) | _environment(env))
+
+
+@command("teach ./peg --out demonstrations.npz")
+def teach(
+    task: Annotated[str, _arg("A task's folder, or one of {tasks}.", "TASK", "tasks")],
+    out: Annotated[Path, _opt("The demonstrations' file, .npz or .csv.")],
+    env: Env = None,
+    as_json: Json = False,
+) -> None:
+    """Demonstrate a task in the browser, with sliders, keys or a gamepad.
+
+    You move where the tool shall be, the robot follows by its impedance, an arrow and a bar show the force. Each
+    demonstration is kept or discarded, and written as soon as it is kept. At the end it says what was learned.
+    """
+    from guiderail.tools.operate.teach import teach as record_taught
+
+    _print(record_taught(_named(task)[0], _environment(env), out, _tell), as_json)
 
 
 @command("run runs/connector --rehearse --yes")
@@ -589,6 +725,7 @@ def list_(
     from guiderail.tools.tasks import import_modules
 
     import_modules(imports or ())
+    what = None if what is None else _named(what)[0]
     if what is None:
         names = {name: names() for name, names in LISTED.items()}
         _print(names | _listing().everything() if as_json else names, as_json)
@@ -690,6 +827,17 @@ def _pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]
     return {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in given or [])}
 
 
+def _floats(text: str, count: int, option: str) -> list[float]:
+    """Numbers separated by commas."""
+    try:
+        numbers = [float(number) for number in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option} takes {count} numbers separated by commas, not {text!r}")
+    return numbers
+
+
 def _environment(given: list[str] | None) -> dict[str, Any]:
     """Options of an environment, each value as YAML would read it."""
     if not given:
@@ -697,6 +845,15 @@ def _environment(given: list[str] | None) -> dict[str, Any]:
     from guiderail.tools.tasks import as_value
 
     return {key: as_value(value) for key, value in _pairs(given, "--env", "station=arm").items()}
+
+
+def _named(task: str) -> tuple[str, tuple[str, ...]]:
+    """A task's name where the path of its folder was typed, and what a run has to import for it."""
+    if not (Path(task) / "task.yaml").is_file():
+        return task, ()
+    from guiderail.tools.tasks import task_named
+
+    return task_named(task)
 
 
 def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
@@ -720,6 +877,7 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
     """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
     from guiderail.tools.viewing import shown as showing
 
+    shown = _named(shown)[0]
     if Path(shown).is_dir() or shown not in CHOICES["tasks"]():
         return showing.Shown.of_run(Path(shown), environment, seed)
     from guiderail.tools.studies.scripted import untrained

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
 from guiderail.diagrams.register import register_envs
-from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_task_folder
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 from guiderail.models.yaml_files import parse_yaml
@@ -29,7 +29,8 @@ def known_tasks() -> list[str]:
 def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
     """Imports modules or files (.py) that register tasks, guidance, stations or learners; returns how to name them.
 
-    A file is named by its absolute path, so that whoever goes on with a run elsewhere on the machine finds it.
+    A task folder, which `guiderail onboard` makes, counts as one. A file or a folder is named by its absolute path, so
+    that whoever goes on with a run elsewhere on the machine finds it.
 
     Raises:
         InputError: if there is no such module or file.
@@ -38,6 +39,10 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
     for module in modules:
         try:
             path = Path(module)
+            if is_task_folder(path):
+                register_task_folder(path)
+                names.append(str(path.resolve()))
+                continue
             names.append(_import_file(path) if path.suffix == ".py" else import_module(module).__name__)
         except (ModuleNotFoundError, FileNotFoundError, ValueError, TypeError) as error:
             if isinstance(error, InputError):
@@ -47,6 +52,19 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
             ) from None
     register_envs()
     return tuple(names)
+
+
+def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
+    """A task's name for what a person typed, its own name or a task folder's path, and what a run has to import for it.
+
+    Raises:
+        InputError: if something in the folder makes no sense.
+    """
+    if typed in TASKS.names() or not is_task_folder(typed):
+        return typed, ()
+    name = register_task_folder(typed)
+    register_envs()
+    return name, (str(Path(typed).resolve()),)
 
 
 def _import_file(path: Path) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from guiderail.models.registry import Registry
@@ -33,6 +34,24 @@ def register_task(name: str) -> Callable[[AnyTask], AnyTask]:
         return task
 
     return add
+
+
+def is_task_folder(name: str | Path) -> bool:
+    """Whether that is a folder that `guiderail onboard` made, by its path."""
+    return (Path(name) / "task.yaml").is_file()
+
+
+def register_task_folder(folder: str | Path) -> str:
+    """Adds the task of a folder, and returns what it is called. Doing it again reads the folder anew.
+
+    Raises:
+        InputError: if something in it makes no sense, or another task has its name.
+    """
+    from guiderail.diagrams.tasks.part_insertion import load_task_folder  # Drake takes a second
+
+    task = load_task_folder(Path(folder))
+    register_task(task.file.name)(task)
+    return task.name
 
 
 def environment_id(name: str) -> str:

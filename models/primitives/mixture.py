@@ -6,6 +6,7 @@ scikit-learn fits the mixture; what stands here is what it doesn't know: that th
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -56,18 +57,34 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     Raises:
         InputError: if there are fewer points than components need.
     """
-    data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
-    center, deviation = data.mean(axis=0), data.std(axis=0)
-    scale = np.where(deviation > 0, deviation, 1.0)
-    data = (data - center) / scale
+    data, center, scale = _scaled(times, outputs)
     most = min(_MOST_COMPONENTS, len(times) // 2)
     if components is not None and not 1 <= components <= len(times) // 2:
         raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {components}")
     candidates = [components] if components is not None else range(1, most + 1)
-    slices = np.tile(np.arange(len(times)), len(outputs)) / len(times)
+    slices = _slices(times, outputs)
     fits = [_fit(data, slices, count, seed) for count in candidates]
     best = min(fits, key=lambda fit: fit.bic(data)) if len(fits) > 1 else fits[0]
     return Mixture(best.weights_, best.means_, best.covariances_, center, scale)
+
+
+def information_criteria(
+    times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
+) -> dict[int, float]:
+    """The Bayesian information criterion of a mixture of each number of components; less is better.
+
+    Args:
+        times, outputs, seed: as in `fit_mixture`.
+        candidates: increasing numbers; it stops where two more have not been better than the best before.
+    """
+    data, _, _ = _scaled(times, outputs)
+    slices = _slices(times, outputs)
+    found: dict[int, float] = {}
+    for count in candidates:
+        found[count] = float(_fit(data, slices, count, seed).bic(data))
+        if len(found) > 2 and min(list(found.values())[-2:]) > min(list(found.values())[:-2]):
+            break
+    return found
 
 
 def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,6 +107,19 @@ def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray
     covariances = (covariances + covariances.transpose(0, 2, 1)) / 2
     scale = mixture.scale[1:]
     return means * scale + mixture.center[1:], covariances * scale[:, None] * scale
+
+
+def _scaled(times: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Samples (M·N, 1 + O) of time and outputs in units of their own standard deviations, with centre and scale."""
+    data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
+    center, deviation = data.mean(axis=0), data.std(axis=0)
+    scale = np.where(deviation > 0, deviation, 1.0)
+    return (data - center) / scale, center, scale
+
+
+def _slices(times: np.ndarray, outputs: np.ndarray) -> np.ndarray:
+    """Where in the motion each sample is, from 0 to below 1."""
+    return np.tile(np.arange(len(times)), len(outputs)) / len(times)
 
 
 def _fit(data: np.ndarray, slices: np.ndarray, components: int, seed: int) -> GaussianMixture:

@@ -1,0 +1,188 @@
+"""A task folder's `task.yaml`: every number of a task made of two meshes, in one file that a person reads and edits."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from pydantic import Field, field_validator
+
+from guiderail.diagrams.options import Number, Numbers, Options, validated
+from guiderail.models.errors import InputError
+from guiderail.models.pose_coordinates import POSE_SIZE
+from guiderail.models.primitives import LinearConstraints
+from guiderail.models.units import DEGREE, MM
+from guiderail.models.yaml_files import load_yaml
+
+FILE_NAME = "task.yaml"
+FILE_FORMAT = "guiderail task 1"
+NAMESPACE = "parts"
+
+
+class Piece(Options):
+    """A mesh that touches."""
+
+    file: str = Field(description="OBJ beside this file, in the target frame [m]")
+    modulus: Number | None = Field(None, gt=0, description="[Pa] of a compliant convex mesh; none is rigid")
+    friction: Number = Field(0.2, ge=0, le=2, description="of the surface, static and dynamic")
+    # What is pressed in a millionth of a metre too deep within a step would otherwise be thrown out by it: with 100 s/m
+    # nothing leaves a contact faster than 10 mm/s.
+    dissipation: Number = Field(100.0, ge=0, description="Hunt and Crossley's [s/m]")
+
+
+class PartModel(Options):
+    """Of the plug or the socket."""
+
+    source: str = Field("", description="the file that it was made of")
+    visual: str = Field(description="OBJ that is seen, in the target frame [m]")
+    mass: Number = Field(gt=0, description="[kg]")
+    centre: Numbers = Field(min_length=3, max_length=3, description="of mass, in the target frame [m]")
+    gyration: Number = Field(gt=0, description="radius of gyration [m]")
+    pieces: tuple[Piece, ...] = Field(min_length=1, description="what touches")
+
+
+class MotionNumbers(Options):
+    """How the plug goes in along z of the target frame."""
+
+    travel: Number = Field(gt=0, le=0.5, description="height of the start above the target [m]")
+    rim: Number = Field(gt=0, le=0.5, description="height at which the plug stands on the rim [m]")
+    turn: Number = Field(0.0, ge=-180, le=180, description="about z, at the bottom [degrees]")
+    push: Number = Field(4.0 * MM, ge=0, le=30 * MM, description="commanded below the target while it goes in [m]")
+    press: Number = Field(2.5 * MM, ge=0, le=10 * MM, description="commanded below the rim while it searches [m]")
+
+
+class Tolerance(Options):
+    """Success by pose: how far from the target the plug may be, in the socket."""
+
+    height: Number = Field(0.5 * MM, gt=0, description="along z [m]")
+    beside: Number = Field(1.0 * MM, gt=0, description="across it [m]")
+    turn: Number = Field(4.0, gt=0, description="about z [degrees]")
+    steps: int = Field(3, ge=1, description="control steps for which it must hold")
+
+
+class Bounds(Options):
+    """Bounds of every command, [x y z Rz Ry Rx]; one list for all steps, or one for each."""
+
+    lower: tuple[Any, ...]
+    upper: tuple[Any, ...]
+    phases: tuple[Number, ...] | None = Field(
+        None, description="where in the motion each list begins to hold, from 0 to 1"
+    )
+
+    @field_validator("lower", "upper")
+    @classmethod
+    def _are_numbers(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
+        rows = value if value and isinstance(value[0], list | tuple) else (value,)
+        for row in rows:
+            if len(row) != POSE_SIZE or not all(one is None or isinstance(one, int | float) for one in row):
+                raise ValueError("bounds are six numbers each, [x y z Rz Ry Rx], null where there is none")
+        return value
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper, each (6,) or one row a phase (K, 6), infinite where there is none."""
+        return _filled(self.lower, -np.inf), _filled(self.upper, np.inf)
+
+    def constraints(self, num_steps: int) -> LinearConstraints:
+        """G y ≥ c: the same at each of N steps, or those of the phase that a step is in."""
+        lower, upper = self.arrays()
+        if lower.ndim == 1:
+            return LinearConstraints.box(lower, upper)
+        if self.phases is None or len(self.phases) != len(lower) or lower.shape != upper.shape:
+            raise InputError("bounds that change need phases, and a list of lower and of upper ones for each")
+        phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, num_steps), side="right") - 1
+        lows, highs = (bound[np.clip(phase, 0, len(lower) - 1)] for bound in (lower, upper))
+        bounded = [np.isfinite(lower).all(axis=0), np.isfinite(upper).all(axis=0)]
+        eye = np.eye(POSE_SIZE)
+        G = np.concatenate([eye[bounded[0]], -eye[bounded[1]]])
+        c = np.concatenate([lows[:, bounded[0]], -highs[:, bounded[1]]], axis=1)
+        return LinearConstraints(np.tile(G, (num_steps, 1, 1)), c)
+
+
+def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
+    return np.array(_replaced(rows, missing), dtype=float)
+
+
+def _replaced(rows: Any, missing: float) -> Any:
+    if isinstance(rows, list | tuple):
+        return [_replaced(one, missing) for one in rows]
+    return missing if rows is None else rows
+
+
+class Shown(Options):
+    """Demonstrations in the folder."""
+
+    file: str = Field("demonstrations.npz", description=".npz or .csv, poses in the target frame")
+    components: int | None = Field(None, ge=1, description="of their mixture; by information criterion unless given")
+    floor: Numbers = Field(
+        (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE),
+        min_length=6,
+        max_length=6,
+        description="standard deviation that a hand has anyway [m], [rad]",
+    )
+
+
+class PartTaskFile(Options):
+    """What a task folder says."""
+
+    format: str = FILE_FORMAT
+    name: str = Field(pattern=r"^[\w:-]+/[\w:.-]+$", description="what the task is called")
+    plug: PartModel
+    socket: PartModel
+    place: Numbers = Field((0.55, 0.0, 0.15), min_length=3, max_length=3, description="of the target in the world [m]")
+    scenario: tuple[str, ...] = Field((), description="Drake model directives (.yaml) of what else stands there")
+    motion: MotionNumbers
+    tolerance: Tolerance = Tolerance.model_validate({})
+    bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
+    offset_range: Numbers | None = Field(
+        None, min_length=2, max_length=2, description="distance of the socket from its place [m], the task's own"
+    )
+    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+    stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
+    demonstrations: Shown = Shown.model_validate({})
+    explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
+    measured: dict[str, Any] = Field({}, description="what onboarding measured; nothing reads it")
+
+    @cached_property
+    def turn(self) -> float:
+        """The turn at the bottom [rad]."""
+        return self.motion.turn * DEGREE
+
+
+def read_task_file(folder: Path) -> PartTaskFile:
+    """The task of a folder.
+
+    Raises:
+        InputError: if it is none, something in it makes no sense, or a file that it names is missing.
+    """
+    path = folder / FILE_NAME
+    if not path.is_file():
+        raise InputError(f"{folder} is no task: it has no {FILE_NAME}; guiderail onboard makes one")
+    data = load_yaml(path, "task")
+    if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
+        raise InputError(f"{path} is no task: its first line must be 'format: {FILE_FORMAT}'")
+    file = validated(PartTaskFile, data, str(path))
+    named = [model.visual for model in (file.plug, file.socket)]
+    named += [piece.file for model in (file.plug, file.socket) for piece in model.pieces]
+    for name in (*named, file.demonstrations.file, *file.scenario):
+        if not (folder / name).is_file():
+            raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or onboard the parts again")
+    return file
+
+
+def write_task_file(folder: Path, file: PartTaskFile) -> Path:
+    """Writes `task.yaml`; what it holds reads back as the same."""
+    path = folder / FILE_NAME
+    values = _plain(file.model_dump())
+    path.write_text(yaml.safe_dump(values, sort_keys=False, width=110, default_flow_style=None), encoding="utf-8")
+    return path
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return float(f"{value:.9g}") if isinstance(value, float) else value

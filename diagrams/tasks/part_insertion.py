@@ -1,0 +1,248 @@
+"""A task of two meshes: its folder says every number, and makes it a task as those that come along are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar, Literal, cast
+
+import numpy as np
+from pydantic import Field, field_validator
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+
+from guiderail.diagrams.cameras import Camera, look_from_front
+from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import Number, Numbers, Options
+from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.stations.part_workcell import PLUG, SOCKET, PartWorkcell
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.diagrams.tasks.bnc_rewards import reward_terms
+from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.offsets import in_ring
+from guiderail.diagrams.tasks.part_file import FILE_NAME, PartTaskFile, read_task_file
+from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.models.errors import InputError
+from guiderail.models.keep_out import KeepOut
+from guiderail.models.parts.model_files import part_sdf
+from guiderail.models.pose_coordinates import POSE_SIZE
+from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
+from guiderail.models.units import DEGREE, MM
+from guiderail.systems.contact_lever import ContactLever
+from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.reward_system import RewardTerm
+
+COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
+RHO = 1e-11  # ρ [m², rad²], as the connector's
+LARGEST_OFFSET = 4.0 * MM
+LEAST_FORCE = 0.5  # [N] with which the plug stands on something
+WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
+LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
+
+
+class PartOptions(Options):
+    """Of a task of two meshes."""
+
+    uncertainty: Literal["calibration", "disc", "known"] = Field("calibration", description="where the socket may be")
+    offset_range: Numbers | None = Field(
+        None,
+        min_length=2,
+        max_length=2,
+        description="least and greatest distance of the socket from where it should be [m]",
+    )
+    start_beside: Number = Field(0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]")
+    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+
+    @field_validator("offset_range")
+    @classmethod
+    def _is_a_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and not 0.0 <= value[0] <= value[1] <= LARGEST_OFFSET:
+            raise ValueError(f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first")
+        return value
+
+
+class PartInsertion(InsertionTask):
+    """Insert a plug into a socket: "sparse" costs action and force and rewards the end, "shaped" adds the depth gained.
+
+    Attributes:
+        folder: of the task.
+        file: what `task.yaml` says.
+    """
+
+    Options = PartOptions
+    options: PartOptions
+    workpiece, fixture = PLUG, SOCKET
+    rewards = ("sparse", "shaped")
+    observations = ("state", "lever")
+    isotropic_groups = ((0, 1, 2), (3, 4, 5))
+    folder: ClassVar[Path]
+    file: ClassVar[PartTaskFile]
+
+    def __init__(self, options: PartOptions, choice: Choice):
+        super().__init__(options, choice)
+        self.offsets = BncUncertainty(options.uncertainty, offset_range=options.offset_range)
+        self.collision = Threshold("contact_force", options.force_limit)
+        self.num_steps = self.reference().num_steps
+
+    def world(self) -> PartWorkcell:
+        """The socket in the world, the plug in the tool."""
+        return workcell(self.folder, self.file)
+
+    def reference(self) -> ReferenceTrajectory:
+        """Of the folder's demonstrations."""
+        path = self.folder / self.file.demonstrations.file
+        return _reference(path, path.stat().st_mtime_ns, self.file.demonstrations)
+
+    def constraints(self) -> LinearConstraints:
+        """The folder's bounds."""
+        return self.file.bounds.constraints(self.reference().num_steps)
+
+    def keep_out(self) -> KeepOut:
+        """No walls are known: what safe residual learning is projected to are the bounds alone."""
+        return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
+
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Beside where the plug is, the lever of what it stands on."""
+        lever = builder.AddNamedSystem("contact_lever", ContactLever(LEAST_FORCE))
+        builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
+        return {**super().signals(builder, station), "lever": lever.get_lever_output_port()}
+
+    def observed(self) -> Sequence[Observed]:
+        """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
+        half = 0.5 * self.num_steps * CONTROL_PERIOD
+        height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
+        centre = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
+        scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
+        state = (Observed("time", half, half), Observed("pose", centre, scale), Observed("wrench", 0.0, WRENCH_SCALE))
+        if self.choice.observation == "state":
+            return state
+        return (*state, Observed("lever", 0.0, LEVER_SCALE), Observed("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
+
+    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+        """Of actions, forces and the end; of depth where the reward is shaped."""
+        return reward_terms(self.choice.reward, num_actions)
+
+    def conditions(self) -> list[Condition]:
+        """At the target for a while, or pushed too hard."""
+        seated = Condition("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
+        return [seated, self.force_limit()]
+
+    @classmethod
+    def is_seated(cls, plug: np.ndarray) -> bool:
+        """Whether a plug at `plug`, position and rotation vector in the socket (6,), is at the target."""
+        tolerance = cls.file.tolerance
+        return bool(
+            abs(plug[2]) < tolerance.height
+            and np.hypot(plug[0], plug[1]) < tolerance.beside
+            and abs(plug[5]) < tolerance.turn * DEGREE
+        )
+
+    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+        """Moves the socket, and the plug in the tool, by (x, y)."""
+        plant_context = station.plant.GetMyMutableContextFromRoot(context)
+        world = self.world()
+        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
+        world.set_socket_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
+        world.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        """Where the demonstrations start, or somewhere beside it."""
+        start = self.reference().means[0].copy()
+        if self.options.start_beside > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.options.start_beside)
+        return start
+
+    def camera(self) -> Camera:
+        """Looks slightly down at the socket."""
+        size = self.file.motion.travel
+        target = np.array(self.file.place) + [0.0, 0.0, 0.5 * size]
+        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=6 * size, height=3 * size))
+
+    def scene(self) -> Scene:
+        """The demonstrations, and the box that commands stay in."""
+        to_world, size = in_frame(self.world().X_WT), self.file.motion.travel
+        near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
+        _, upper = self.file.bounds.arrays()
+        bound = float(np.atleast_2d(upper)[:, :2].min())
+        edges = box_edges(bound, 0.0, size) if np.isfinite(bound) else []
+        return Scene(
+            to_world=to_world,
+            demonstrations=tuple(Demonstrations.load(self.folder / self.file.demonstrations.file).outputs),
+            constraint=tuple(to_world(edge) for edge in edges),
+            viewpoint=near,
+            arm_views={"the parts": near, "the arm": ARM_VIEW},
+            line_radius=0.0001,
+        )
+
+
+def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
+    """What a task folder is about, its SDF files written beside its meshes."""
+    for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
+        text = part_sdf(
+            name,
+            part.visual,
+            part.pieces,
+            mass=part.mass,
+            centre=part.centre,
+            gyration=part.gyration,
+            colour=COLOURS[name],
+        )
+        path = folder / f"{name}.sdf"
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+    return PartWorkcell(
+        str(folder / f"{PLUG}.sdf"),
+        str(folder / f"{SOCKET}.sdf"),
+        cast(tuple[float, float, float], file.place),
+        file.stiction_tolerance,
+        tuple(str(folder / name) for name in file.scenario),
+    )
+
+
+@cache
+def _reference(path: Path, changed: int, shown: Any) -> ReferenceTrajectory:
+    """What the demonstrations have in common, on the control period's clock; fitted once a process and version."""
+    demonstrations = Demonstrations.load(path)
+    if demonstrations.num_outputs != POSE_SIZE:
+        raise InputError(
+            f"{path} has {demonstrations.num_outputs} outputs: a task of parts needs the six of a pose, "
+            "[x y z Rz Ry Rx] in the target frame"
+        )
+    duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
+    num_steps = round(duration / CONTROL_PERIOD) + 1
+    fitted = ReferenceTrajectory.from_demonstrations(
+        demonstrations, components=shown.components, num_steps=num_steps, floor=np.array(shown.floor)
+    )
+    return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
+
+
+def load_task_folder(folder: Path) -> type[PartInsertion]:
+    """The task of a folder, as a class that a registry takes.
+
+    Raises:
+        InputError: if it is no task folder, or something in it makes no sense.
+    """
+    folder = folder.resolve()
+    text = (folder / FILE_NAME).read_text(encoding="utf-8") if (folder / FILE_NAME).is_file() else ""
+    return _task_class(folder, text)
+
+
+@cache
+def _task_class(folder: Path, text: str) -> type[PartInsertion]:
+    """One class for each folder and what its file says, so that environments of it can share diagrams."""
+    file = read_task_file(folder)
+    defaults = {
+        "guidance": "skgrl",
+        "station": "rails",
+        "hold": 10,
+        "explored": file.explored,
+        "history_variance": RHO,
+        "force_limit": file.force_limit,
+        "offset_range": file.offset_range,
+    }
+    members = {"folder": folder, "file": file, "defaults": defaults, "__module__": __name__}
+    task = type(f"PartInsertion({folder})", (PartInsertion,), members)
+    task.__doc__ = f"Insert {file.plug.source or 'a plug'} into {file.socket.source or 'a socket'}."
+    return cast(type[PartInsertion], task)

@@ -1,0 +1,82 @@
+"""Letters as several people write them: sharp corners, straight strokes, loops, and a pen that slows at corners."""
+
+import numpy as np
+
+from guiderail.models.primitives import Demonstrations
+
+# Strokes on a unit square: ("line", x, y) goes straight to a point, ("arc", x, y, degrees) turns about one.
+LETTERS = {
+    "N": [(0, 0), ("line", 0, 1), ("line", 0.7, 0), ("line", 0.7, 1)],
+    "Z": [(0, 1), ("line", 0.8, 1), ("line", 0, 0), ("line", 0.8, 0)],
+    "M": [(0, 0), ("line", 0.1, 1), ("line", 0.45, 0.3), ("line", 0.8, 1), ("line", 0.9, 0)],
+    "e": [(0.1, 0.5), ("line", 0.8, 0.5), ("arc", 0.45, 0.5, 310)],
+    "l": [(0, 0.1), ("line", 0.35, 0.6), ("arc", 0.25, 0.75, 250), ("line", 0.2, 0.1), ("arc", 0.3, 0.1, 150)],
+    "B": [(0, 0), ("line", 0, 1), ("line", 0.3, 1), ("arc", 0.3, 0.75, -180), ("line", 0, 0.5)]
+    + [("line", 0.35, 0.5), ("arc", 0.35, 0.25, -180), ("line", 0, 0)],
+}
+
+
+def path(letter: str, points: int = 2000) -> np.ndarray:
+    """(points, 2), evenly spaced along the strokes."""
+    strokes = LETTERS[letter]
+    corners = [np.array(strokes[0], dtype=float)]
+    for kind, x, y, *turn in strokes[1:]:
+        if kind == "line":
+            corners.append(np.array([x, y], dtype=float))
+        else:
+            centre, start = np.array([x, y]), corners[-1]
+            angles = np.radians(np.linspace(0, turn[0], 60)[1:])
+            arm = start - centre
+            corners += [centre + arm @ np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) for a in angles]
+    corners = np.array(corners)
+    lengths = np.r_[0, np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))]
+    at = np.linspace(0, lengths[-1], points)
+    return np.column_stack([np.interp(at, lengths, column) for column in corners.T])
+
+
+def write(
+    letter: str, seed: int = 0, count: int = 6, steps: int = 200, spread: float = 0.03, size: float = 1.0, offset=(0, 0)
+):
+    """Demonstrations of a letter: each leans, stretches, wanders and hurries in its own way.
+
+    Args:
+        letter: one of `LETTERS`.
+        seed: of who writes.
+        count, steps: how many, and points in each.
+        spread: how far they differ, in sizes of the letter.
+        size, offset: of the page, in any unit.
+    """
+    rng = np.random.default_rng(seed)
+    straight = path(letter)
+    phase = np.linspace(0, 1, len(straight))
+    # Slower where it turns.
+    heading = np.unwrap(np.arctan2(*np.gradient(straight, axis=0).T[::-1]))
+    bend = np.convolve(np.abs(np.gradient(heading)), np.ones(60), mode="same")
+    clock = np.cumsum(1 + 2 * np.minimum(bend, 1.5))
+    clock = (clock - clock[0]) / (clock[-1] - clock[0])
+    outputs = []
+    for _ in range(count):
+        waves = [
+            np.sin(np.pi * k * phase + rng.uniform(0, 6.28))[:, None] * rng.standard_normal(2) / k for k in (1, 2, 3)
+        ]
+        shape = straight @ (np.eye(2) + spread * rng.standard_normal((2, 2))) + spread * rng.standard_normal(2)
+        shape = shape + 0.4 * spread * np.sum(waves, axis=0)
+        own = clock + 0.3 * spread * np.sin(np.pi * clock) * rng.standard_normal()
+        own = (own - own[0]) / (own[-1] - own[0])
+        t = np.linspace(0, 1, steps)
+        outputs.append(np.column_stack([np.interp(t, own, column) for column in shape.T]) * size + np.asarray(offset))
+    return Demonstrations(np.linspace(0, 4, steps), outputs, ("x", "y"))
+
+
+def correlated(seed: int = 0, count: int = 6, steps: int = 200, correlation: float = 0.98) -> Demonstrations:
+    """Three outputs that differ together: whoever is too far in one is as much too far in the others."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(0, 2, steps)
+    mean = np.column_stack([np.sin(2 * t), np.abs(t - 1), np.cos(3 * t)])
+    mix = np.linalg.cholesky(correlation * np.ones((3, 3)) + (1 - correlation) * np.eye(3))
+    outputs = []
+    for _ in range(count):
+        waves = np.stack([np.sin(k * t + p) / k for k, p in zip((1, 2, 3), rng.uniform(0, 6.28, 3), strict=True)])
+        deviation = (rng.standard_normal((3, 3)) @ waves + rng.standard_normal((3, 1))).T @ mix.T
+        outputs.append(mean + 0.03 * deviation)
+    return Demonstrations(t, outputs)

@@ -1,0 +1,171 @@
+"""Parts that nobody tuned anything for, from drawings: six plugs and sockets as STL files in millimetres.
+
+Each pair is drawn as it is assembled, the plug coming from above along z. A plug that turns is drawn locked.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from manifold3d import CrossSection, Manifold
+
+SIDES = 32
+CHAMFER = 0.5  # [mm] of a plug's tip and a socket's mouth
+
+
+@dataclass(frozen=True)
+class Part:
+    """A plug and its socket.
+
+    Attributes:
+        plug, socket: solids of one piece each, or several.
+        clearance: between their walls, on each side [mm].
+        options: further words of the command.
+    """
+
+    plug: list[Manifold]
+    socket: list[Manifold]
+    clearance: float
+    options: list[str] = field(default_factory=list)
+
+    def write(self, folder: Path) -> tuple[Path, Path]:
+        """The two STL files."""
+        paths = folder / "plug.stl", folder / "socket.stl"
+        for path, solids in zip(paths, (self.plug, self.socket), strict=True):
+            trimesh.util.concatenate([_mesh(solid) for solid in solids]).export(path)
+        return paths
+
+
+def _mesh(solid: Manifold) -> trimesh.Trimesh:
+    mesh = solid.to_mesh()
+    return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts))
+
+
+def _disc(radius: float) -> CrossSection:
+    return CrossSection.circle(radius, SIDES)
+
+
+def _square(width: float, depth: float, x: float = 0.0, y: float = 0.0) -> CrossSection:
+    return CrossSection.square((width, depth), True).translate((x, y))
+
+
+def _prism(outline: CrossSection, low: float, high: float) -> Manifold:
+    return Manifold.extrude(outline, high - low).translate((0, 0, low))
+
+
+def _grown(outline: CrossSection, by: float) -> CrossSection:
+    from manifold3d import JoinType
+
+    return outline.offset(by, JoinType.Miter)
+
+
+def _shaft(outline: CrossSection, low: float, high: float) -> Manifold:
+    """A convex prism whose lower end is chamfered."""
+    tip = _prism(_grown(outline, -CHAMFER), low, low + 0.01)
+    return Manifold.batch_hull([tip, _prism(outline, low + CHAMFER, high)])
+
+
+def _hole(outline: CrossSection, clearance: float, low: float) -> Manifold:
+    """What a convex outline's hole takes away below z = 0, its mouth chamfered."""
+    wall = _grown(outline, clearance)
+    mouth = [_prism(wall, -CHAMFER, -CHAMFER + 0.01), _prism(_grown(wall, CHAMFER), 0.0, 0.01)]
+    return _prism(wall, low, 0.01) + Manifold.batch_hull(mouth)
+
+
+def _block(width: float, low: float) -> Manifold:
+    return _prism(_square(width, width), low, 0.0)
+
+
+def keyed_peg(clearance: float = 0.2) -> Part:
+    """A round peg with a key and a head that seats on the socket's face."""
+    outlines = [_disc(6.0), _square(3.0, 3.0, 6.0)]
+    shaft = Manifold.batch_hull([_prism(_grown(_disc(6.0), -CHAMFER), -15, -14.99), _prism(_disc(6.0), -14.5, 0)])
+    key = _shaft(outlines[1], -15.0, 0.0)
+    plug = shaft + key + _prism(_disc(10.0), 0.0, 8.0)
+    socket = _block(30.0, -20.0)
+    for outline in outlines:
+        socket -= _hole(outline, clearance, -16.0)
+    return Part([plug], [socket], clearance)
+
+
+def square_peg(clearance: float = 0.1) -> Part:
+    """A square peg that seats on the hole's bottom."""
+    outline = _square(10.0, 10.0)
+    return Part([_shaft(outline, -15.0, 10.0)], [_block(30.0, -20.0) - _hole(outline, clearance, -15.0)], clearance)
+
+
+def d_connector(clearance: float = 0.15) -> Part:
+    """A D-shaped shell around a D-shaped tongue."""
+    outline = _disc(7.0) ^ _square(20.0, 20.0, -6.0)
+    core, wall = _grown(outline, -1.5), 1.5
+    cavity = _prism(core, -8.0, -1.5) + Manifold.batch_hull(
+        [_prism(core, -7.5, -7.49), _prism(_grown(core, CHAMFER), -8.01, -8.0)]
+    )
+    plug = _shaft(outline, -8.0, 6.0) - cavity
+    tongue_outline = _grown(core, -clearance)
+    tongue = Manifold.batch_hull(
+        [_prism(tongue_outline, -9.0, -2.0 - CHAMFER), _prism(_grown(tongue_outline, -CHAMFER), -2.01, -2.0)]
+    )
+    socket = _block(26.0, -12.0) - _hole(outline, clearance, -8.0) + tongue
+    assert wall > 2 * clearance
+    return Part([plug], [socket], clearance)
+
+
+def bayonet(clearance: float = 0.2) -> Part:
+    """Three lugs that come down in slots and turn by 40 degrees under a ring."""
+    lugs = [_square(3.0, 3.0, 6.0).rotate(120.0 * i) for i in range(3)]
+    plug = _shaft(_disc(6.0), -12.0, 8.0)
+    for lug in lugs:
+        plug += _prism(lug, -11.0, -8.5)
+    socket = _block(30.0, -14.0) - _hole(_disc(6.0), clearance, -12.2)
+    half = np.rad2deg(np.arcsin((1.5 + clearance) / 6.0))
+    arc = np.deg2rad(np.linspace(-40.0 - half, half, 13))
+    sector = CrossSection(
+        [[(0.0, 0.0), *((np.hypot(7.5, 1.5) + 2 * clearance) * np.stack([np.cos(arc), np.sin(arc)], axis=1))]]
+    )
+    for i, lug in enumerate(lugs):
+        socket -= _hole(lug.rotate(-40.0), clearance, -11.0 - clearance)
+        socket -= _prism(sector.rotate(120.0 * i), -11.0 - clearance, -8.5 + clearance)
+    return Part([plug], [socket], clearance, ["--turn", "40"])
+
+
+def snap_fit(clearance: float = 0.2) -> Part:
+    """A square peg with two noses that give way to the socket's lips, drawn as bodies of their own."""
+    outline = _square(8.0, 8.0)
+    noses = [
+        Manifold.hull_points(
+            [(s * x, y, z) for y in (-2.0, 2.0) for x, z in ((3.0, -8), (4.0, -8), (4.4, -7.0), (4.0, -6), (3.0, -6))]
+        )
+        for s in (-1.0, 1.0)
+    ]
+    socket = _block(26.0, -16.0) - _hole(outline, clearance, -12.0)
+    for s in (-1.0, 1.0):
+        socket -= _prism(_square(2.0, 6.0, s * 4.5), -12.0, -5.0)
+    return Part([_shaft(outline, -12.0, 8.0), *noses], [socket], clearance)
+
+
+def dovetail(clearance: float = 0.15) -> Part:
+    """A tongue that slides into a slot wider inside than at its mouth."""
+    tongue = CrossSection([[(-3.0, 0.0), (3.0, 0.0), (5.0, 5.0), (-5.0, 5.0)]])
+    slot = _grown(tongue, clearance)
+    plug = _shaft(tongue, -15.0, 8.0) + _prism(_square(14.0, 5.0, 0.0, -2.4), -15.0, 8.0)
+    # The slot is open to the side of the plug's plate.
+    block = _prism(_square(24.0, 12.0, 0.0, 6.0 + 0.1 + clearance), -19.0, 0.0)
+    block -= _prism(slot, -15.0, 0.01)
+    block -= Manifold.batch_hull(
+        [_prism(_grown(tongue, clearance), -0.5, -0.49), _prism(_grown(tongue, 0.5), 0.0, 0.01)]
+    )
+    return Part([plug], [block], clearance)
+
+
+PARTS: dict[str, Callable[[], Part]] = {
+    "keyed_peg": keyed_peg,
+    "square_peg": square_peg,
+    "d_connector": d_connector,
+    "bayonet": bayonet,
+    "snap_fit": snap_fit,
+    "dovetail": dovetail,
+}
+"""The six by name."""

@@ -1,0 +1,129 @@
+"""Two meshes become a task by the command alone: it is checked, inserted, trained, evaluated and replayed."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.models.errors import InputError
+from guiderail.tools.command import main
+
+pytest.importorskip("trimesh")
+pytest.importorskip("manifold3d")
+
+from oracles.parts import PARTS
+
+
+def call(*arguments, code=0):
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    assert end.value.code == code
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The simplest of the six; `tests/tools/onboard/parts.py` onboards all of them."""
+    where = tmp_path_factory.mktemp("parts")
+    plug, socket = PARTS["square_peg"]().write(where)
+    call("onboard", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
+    yield where / "peg"
+    # What was registered here is nobody else's.
+    for name in [name for name in TASKS.names() if name.startswith("parts/")]:
+        del TASKS._entries[name]
+        gymnasium.registry.pop(environment_id(name), None)
+
+
+def test_what_was_measured_is_what_was_drawn(folder):
+    measured = yaml.safe_load((folder / "task.yaml").read_text())["measured"]
+    assert measured["clearance_mm"] == pytest.approx(0.1, abs=1e-3)
+    assert measured["inserted"] is True
+    assert measured["inserted_1.5_mm_off"] == [False, False]
+    assert max(measured["penetration_mm"], measured["penetration_pushed_on_the_rim_mm"]) <= 0.05
+    assert measured["demonstrations_seated"] == "5 of 5"
+    page = (folder / "preview.html").read_text()
+    assert "plug" in page
+    assert len(page) > 100_000
+
+
+def test_it_is_a_task(folder, tmp_path, capsys):
+    call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
+    capsys.readouterr()
+    call("evaluate", tmp_path / "run", "--episodes", 1, "--beside", "none", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["worst_violation"] <= 1e-9
+    assert (tmp_path / "run/replay.html").is_file()
+
+
+def test_its_options_are_listed(folder, capsys):
+    call("list", folder)
+    assert "offset_range" in capsys.readouterr().out
+
+
+def test_bounds_from_demonstrations_become_its_own(folder, capsys):
+    from guiderail.diagrams.make import resolve
+
+    before = (folder / "task.yaml").read_text()
+    try:
+        call("constraints", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--into", folder)
+        constraints = resolve(str(folder), {}).task.constraints()
+        assert constraints.G.shape[0] > 1
+        np.testing.assert_array_equal(constraints.G[0, :2, :2], np.eye(2))
+    finally:
+        (folder / "task.yaml").write_text(before)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda text: text.replace("force_limit: 35.0", "force_limit: -3"), "force_limit must be at least 1"),
+        (lambda text: text.replace("file: plug_0.obj", "file: gone.obj"), "names gone.obj"),
+        (lambda text: text.replace("place:", "plaze:"), "did you mean place?"),
+        (lambda text: "format: other\n", "is no task"),
+    ],
+)
+def test_an_edited_number_is_checked(change, says, folder, capsys):
+    before = (folder / "task.yaml").read_text()
+    try:
+        (folder / "task.yaml").write_text(change(before))
+        call("list", folder, code=2)
+        assert says in capsys.readouterr().err
+    finally:
+        (folder / "task.yaml").write_text(before)
+
+
+def test_what_makes_no_sense_is_refused_and_leaves_nothing(folder, tmp_path, capsys):
+    plug, socket = PARTS["bayonet"]().write(tmp_path)
+    for arguments, says in (
+        ((), "does not say its unit"),
+        (("--unit", "ell"), "there is no unit"),
+        (("--unit", "mm"), "does not pass the socket"),
+        (("--unit", "mm", "--axis", "z"), "--axis is one of"),
+        (("--unit", "mm", "--place", "1,2"), "--place takes 6 numbers"),
+        (("--unit", "mm", "--out", folder), "already exists"),
+    ):
+        out = () if "--out" in arguments else ("--out", tmp_path / "task")
+        call("onboard", plug, socket, *out, *arguments, code=2)
+        assert says in capsys.readouterr().err
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["plug.stl", "socket.stl"]
+
+
+def test_a_part_from_another_direction_is_the_same_task(tmp_path):
+    """Drawn lying along x, and the plug apart from its socket: --axis and --place bring both to the target frame."""
+    from guiderail.tools.onboard.onboard import read_parts
+
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    upright = read_parts(plug, socket, "mm", (0,) * 6, "+z", None)
+    import trimesh
+
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
+    for path in (plug, socket):
+        trimesh.load(path).apply_transform(turn).export(path)
+    trimesh.load(plug).apply_translation([-30.0, 0, 0]).export(plug)
+    lying = read_parts(plug, socket, "mm", (30.0, 0, 0, 0, 0, 0), "+x", None)
+    for one, other in zip(lying, upright, strict=True):
+        np.testing.assert_allclose(one.bounds, other.bounds, atol=1e-8)
+    with pytest.raises(InputError, match="--axis"):
+        read_parts(plug, socket, "mm", (0,) * 6, "up", None)

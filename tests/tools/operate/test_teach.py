@@ -1,0 +1,136 @@
+"""A person's keys become demonstrations: by a page that answers as Meshcat's does."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.operate import teach as teaching
+from guiderail.tools.operate.teach import BUTTONS, DISCARD, END, KEEP, SLIDERS, UNDO, Teaching
+
+
+class Page:
+    """What a session asks of a Meshcat: sliders that stay where they are, buttons that count their clicks."""
+
+    def __init__(self):
+        self.sliders, self.clicks, self.lines = {}, dict.fromkeys(BUTTONS, 0), {}
+        self.gamepad = SimpleNamespace(index=None, axes=[])
+
+    def AddSlider(self, name, low, high, step, value, lower, higher):
+        self.sliders[name] = value
+
+    def AddButton(self, name, key):
+        pass
+
+    def SetSliderValue(self, name, value):
+        self.sliders[name] = value
+
+    def GetSliderValue(self, name):
+        return self.sliders[name]
+
+    def GetButtonClicks(self, name):
+        return self.clicks[name]
+
+    def GetGamepad(self):
+        return self.gamepad
+
+    def SetLine(self, path, vertices, width, colour):
+        self.lines[path] = vertices
+
+
+@pytest.fixture
+def session(tmp_path):
+    return Teaching("GridClamp", {}, tmp_path / "shown.npz", meshcat=Page())
+
+
+def lead(session, name, to, steps):
+    session.meshcat.SetSliderValue(name, to)
+    for _ in range(steps):
+        session.step()
+
+
+def test_what_is_led_is_kept_at_once(session):
+    session.begin()
+    lead(session, "x [mm]", 2.0, 20)
+    assert "kept demonstration 1" in session.keep()
+    shown = Demonstrations.load(session.out)
+    moved = shown.outputs[0] - session.start
+    assert moved[-1] == pytest.approx([2e-3, 0, 0, 0, 0, 0])
+    # At a hand's speed, however far the slider jumped.
+    assert np.abs(np.diff(moved[:, 0])).max() <= teaching.SPEED[0] * 0.02 + 1e-12
+    session.begin()
+    lead(session, "y [mm]", 1.0, 20)
+    session.keep()
+    assert Demonstrations.load(session.out).num_demonstrations == 2
+
+
+def test_the_robot_follows_and_its_force_is_shown(session):
+    session.begin()
+    lead(session, "x [mm]", 3.0, 15)  # beside the holes
+    lead(session, "z [mm]", -12.0, 60)
+    arrow = session.meshcat.lines["/guiderail/force"]
+    assert (
+        np.linalg.norm(arrow[:, 1] - arrow[:, 0]) > teaching.FORCE_LENGTH
+    )  # more than a newton: it stands on something
+
+
+def test_undo_takes_a_second_back(session):
+    session.begin()
+    lead(session, "x [mm]", 1.0, 60)
+    before = [command.copy() for command in session.taken.commands]
+    lead(session, "x [mm]", -3.0, 50)
+    session.undo()  # to the last whole second that is at least half a second ago
+    assert session.steps == 50
+    np.testing.assert_allclose(session.taken.commands, before[:50])
+    assert session.meshcat.sliders["x [mm]"] == pytest.approx(1.0)
+    lead(session, "x [mm]", 1.0, 10)
+    assert session.simulator.get_context().get_time() == pytest.approx(60 * 0.02)
+
+
+def test_buttons_do_what_they_say(session):
+    said = []
+    page, step = session.meshcat, session.step
+    script = {15: ("y [mm]", 1.0), 30: KEEP, 60: DISCARD, 61: KEEP, 80: END}
+    count = [0]
+
+    def scripted():
+        act = script.get(count[0])
+        count[0] += 1
+        if isinstance(act, tuple):
+            page.SetSliderValue(*act)
+        elif act is not None:
+            page.clicks[act] += 1
+        step()
+
+    session.step = scripted
+    session.run(said.append, real_time=False, most_steps=200)
+    assert count[0] == 81
+    assert [words.split()[0] for words in said] == ["kept", "discarded", "nothing"]
+    assert len(session.kept) == 1
+    found = session.learned()
+    assert found["demonstrations"] == 1
+    assert found["the mean alone succeeds"] is False  # it never went down
+
+
+def test_a_gamepad_pushes_the_sliders(session):
+    session.begin()
+    session.meshcat.gamepad = SimpleNamespace(index=0, axes=[1.0, 0.05])
+    for _ in range(50):
+        session.step()
+    assert session.meshcat.sliders["x [mm]"] == pytest.approx(10.0)
+    assert session.meshcat.sliders["y [mm]"] == 0.0
+
+
+def test_every_key_is_one_things(session):
+    keys = [key for _, _, *pair, _ in SLIDERS.values() for key in pair] + list(BUTTONS.values())
+    assert len(set(keys)) == len(keys)
+    assert UNDO in BUTTONS
+
+
+def test_what_makes_no_sense_is_refused(tmp_path):
+    (tmp_path / "there.npz").touch()
+    for task, file in (("GridClamp", "there.npz"), ("GridClamp", "new.txt"), ("NarrowPassage", "new.npz")):
+        with pytest.raises(InputError):
+            Teaching(task, {}, tmp_path / file, meshcat=Page())

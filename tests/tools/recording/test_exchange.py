@@ -1,0 +1,174 @@
+"""What others recorded comes in and goes out with its numbers; what a file doesn't say is asked for."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.recording.exchange import export_demonstrations, import_recording
+
+NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
+
+
+def shown(count=3, steps=40, period=0.02):
+    rng = np.random.default_rng(0)
+    times = [period * np.arange(steps + m) for m in range(count)]
+    outputs = [0.2 * np.cumsum(rng.standard_normal((len(t), 6)), axis=0) / len(t) for t in times]
+    return Demonstrations(times, outputs, NAMES)
+
+
+@pytest.fixture
+def file(tmp_path):
+    shown().save(tmp_path / "shown.npz")
+    return tmp_path / "shown.npz"
+
+
+@pytest.mark.parametrize(("kind", "tolerance", "library"), [("lerobot", 1e-6, "pyarrow"), ("mcap", 1e-15, "rosbags")])
+def test_a_round_trip_is_equal_to_rounding(kind, tolerance, library, file, tmp_path):
+    pytest.importorskip(library)
+    export_demonstrations(file, tmp_path / kind, kind)
+    signal = "action" if kind == "lerobot" else None
+    found = import_recording(tmp_path / kind, tmp_path / "back.npz", signal=signal)
+    back, there = Demonstrations.load(tmp_path / "back.npz"), shown()
+    assert found["demonstrations"] == 3
+    assert back.names == there.names
+    for one, other in zip((*back.outputs, *back.times), (*there.outputs, *there.times), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=max(tolerance, 1e-9 if one.ndim == 1 else 0))
+
+
+def test_a_dataset_is_laid_out_as_version_3_says(file, tmp_path):
+    import pyarrow.parquet as parquet
+
+    export_demonstrations(file, tmp_path / "set", "lerobot")
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["total_episodes"], info["total_frames"]) == ("v3.0", 50, 3, 123)
+    table = parquet.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    assert set(table.column_names) == set(info["features"])
+    episodes = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert episodes["dataset_from_index"] == [0, 40, 81]
+    assert episodes["dataset_to_index"] == [40, 81, 123]
+    tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet").to_pandas()
+    assert list(tasks["task_index"]) == [0]
+
+
+def test_a_dataset_that_has_a_command_and_a_measurement_gives_the_command(file, tmp_path):
+    export_demonstrations(file, tmp_path / "set", "lerobot")
+    found = import_recording(tmp_path / "set", tmp_path / "back.csv")
+    assert "action is what was commanded" in found["assumed"]
+
+
+def test_several_rates_need_one(tmp_path):
+    t = np.array([0.0, 0.1, 0.3])
+    Demonstrations(t, [np.ones((3, 1))]).save(tmp_path / "uneven.npz")
+    with pytest.raises(InputError, match="--rate"):
+        export_demonstrations(tmp_path / "uneven.npz", tmp_path / "set", "lerobot")
+    export_demonstrations(tmp_path / "uneven.npz", tmp_path / "set", "lerobot", rate=10)
+
+
+LAYOUTS = {
+    "/franka_robot_state_broadcaster/current_pose": "fr3_link0",  # franka_ros2
+    "/iiwa/command/CartesianPose": "iiwa_link_0",  # iiwa_stack
+}
+
+
+def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True):
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = {name.split("/")[-1]: one for name, one in store.types.items()}
+    with Writer(path, version=8) as writer:
+        for topic, frame in topics.items():
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for n in range(5):
+                stamp = types["Time"](sec=10 if stamped else 0, nanosec=10_000_000 * n if stamped else 0)
+                x, y, z, w = Rotation.from_euler("z", 10.0 * n, degrees=True).as_quat()
+                pose = types["Pose"](
+                    position=types["Point"](x=0.5 + 0.01 * n, y=0.1, z=0.3),
+                    orientation=types["Quaternion"](x=x, y=y, z=z, w=w),
+                )
+                message = types["PoseStamped"](header=types["Header"](stamp=stamp, frame_id=frame), pose=pose)
+                writer.write(connection, 20_000_000_000 + 11_000_000 * n, store.serialize_cdr(message, kind))
+
+
+@pytest.mark.parametrize(("topic", "frame"), LAYOUTS.items())
+def test_a_bag_of_an_arm(topic, frame, tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {topic: frame})
+    found = import_recording(tmp_path / "bag", tmp_path / "kept.npz")
+    assert frame in found["assumed"]
+    kept = Demonstrations.load(tmp_path / "kept.npz")
+    np.testing.assert_allclose(kept.times[0], 0.01 * np.arange(5), atol=1e-9)
+    np.testing.assert_allclose(kept.outputs[0][3], [0.53, 0.1, 0.3, np.deg2rad(30), 0, 0], atol=1e-12)
+
+    import_recording(tmp_path / "bag", tmp_path / "in_target.npz", target=(0.5, 0.1, 0.2, 0, 0, 90))
+    moved = Demonstrations.load(tmp_path / "in_target.npz").outputs[0]
+    np.testing.assert_allclose(moved[2], [0, -0.02, 0.1, np.deg2rad(-70), 0, 0], atol=1e-12)
+
+
+def test_a_bag_with_two_measured_poses_is_asked_about(tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {"/a/pose": "base", "/b/pose": "base"})
+    with pytest.raises(InputError, match=r"/a/pose, /b/pose, and does not say which.*--signal"):
+        import_recording(tmp_path / "bag", tmp_path / "x.npz")
+    assert import_recording(tmp_path / "bag", tmp_path / "x.npz", signal="/b/pose")["samples"] == [5]
+
+
+def test_without_stamps_time_is_the_recorders(tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {"/a/pose": "base"}, stamped=False)
+    assert "when the recorder got" in import_recording(tmp_path / "bag", tmp_path / "x.npz")["assumed"]
+    np.testing.assert_allclose(Demonstrations.load(tmp_path / "x.npz").times[0], 0.011 * np.arange(5), atol=1e-9)
+
+
+def write_table(path, header, rows):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+
+
+def test_named_columns_say_all_that_matters(tmp_path):
+    rows = [(n * 10, 1 + n, 2, 3, 0, 0, np.sin(0.1 * n), np.cos(0.1 * n)) for n in range(4)]
+    write_table(tmp_path / "a.csv", "time_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw", rows)
+    import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+    back = Demonstrations.load(tmp_path / "a.npz")
+    np.testing.assert_allclose(back.times[0], 0.01 * np.arange(4))
+    np.testing.assert_allclose(back.outputs[0][3], [0.004, 0.002, 0.003, 0.6, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "asks", "remedy"),
+    [
+        ("t,x,y,z", (0.01, 1, 2, 3), "unit of x, y and z", {"unit": "mm"}),
+        ("timestamp,x_m,y_m,z_m", (8, 1, 2, 3), "unit of timestamp", {"time_unit": "ms"}),
+        ("t,x_m,y_m,z_m,q1,q2,q3,q4", (0.01, 1, 2, 3, 1, 0, 0, 0), "which is its scalar", {"quaternion": "wxyz"}),
+        ("t,x_m,y_m,z_m,roll,pitch,yaw", (0.01, 1, 2, 3, 0, 0, 1), "is in degrees", {"angles": "deg"}),
+    ],
+)
+def test_what_a_table_does_not_say_is_asked_for(header, row, asks, remedy, tmp_path):
+    rows = [(n * row[0], row[1] + n, *row[2:]) for n in range(4)]
+    write_table(tmp_path / "a.csv", header, rows)
+    with pytest.raises(InputError, match=asks):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+    import_recording(tmp_path / "a.csv", tmp_path / "a.npz", **remedy)
+    angle = {"angles": np.deg2rad(1)}.get(next(iter(remedy)), 0.0)
+    outputs = Demonstrations.load(tmp_path / "a.npz").outputs[0]
+    if outputs.shape[1] == 6:
+        assert outputs[0, 3] == pytest.approx(angle)
+
+
+def test_a_quaternion_that_is_none_is_refused(tmp_path):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m,qx,qy,qz,qw", [(0.01 * n, 0, 0, 0, 0, 0, 0, 3) for n in range(3)])
+    with pytest.raises(InputError, match="length 3"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+
+
+def test_what_is_no_recording_is_refused(tmp_path):
+    for source, words in ((tmp_path / "none", "there is no"), (tmp_path, "is no LeRobot dataset, bag")):
+        with pytest.raises(InputError, match=words):
+            import_recording(source, tmp_path / "a.npz")
+    (tmp_path / "bad.mcap").write_bytes(b"nothing")
+    pytest.importorskip("rosbags")
+    with pytest.raises(InputError, match="can't be read as a bag"):
+        import_recording(tmp_path / "bad.mcap", tmp_path / "a.npz")

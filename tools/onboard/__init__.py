@@ -1,0 +1,1 @@
+"""`guiderail onboard`: from two mesh files to a task."""

@@ -1,0 +1,362 @@
+"""From two mesh files to a task folder: contact geometry, motion, success and demonstrations, measured."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+from guiderail.models.parts.fit import (
+    RESTING,
+    Motion,
+    centre_of_mass,
+    check_target,
+    in_the_way,
+    motion,
+    side_clearance,
+    solids,
+)
+from guiderail.models.parts.mesh_file import UNITS, Part, load_part, unit_of
+from guiderail.models.parts.model_files import obj_text
+from guiderail.models.parts.pieces import as_arrays, convex_pieces
+from guiderail.models.units import DEGREE, MM
+
+AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
+MODULI = (2e9, 1e10)  # [Pa] of what is compliant, tried in this order until it is stiff enough
+SNAP_MODULI = (2e7, 5e7, 5e6)  # [Pa] of a body that has to give way
+PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded below the target, as little as seats the plug
+OFF = 1.5 * MM  # beside its place a socket must stop the plug
+FAST_ENOUGH = 4.0  # times real time, from which the other side is not tried
+DENSITY = 2700.0  # [kg/m³] of a part, aluminium's; rails carry no weight
+CLEAR = 3.0 * MM
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Which part is compliant, and in how many pieces.
+
+    Attributes:
+        compliant: "plug" or "socket".
+        bodies: its convex pieces, for each of its bodies.
+        modulus: of those that don't snap [Pa].
+        snap_modulus: of those that do [Pa].
+        snapping: numbers of the bodies that do.
+    """
+
+    compliant: str
+    bodies: tuple[tuple[Any, ...], ...]
+    modulus: float
+    snap_modulus: float
+    snapping: frozenset[int]
+
+    @property
+    def pieces(self) -> list[tuple[str, float, Any]]:
+        """Each piece's file, modulus [Pa] and solid."""
+        found = []
+        for number, body in enumerate(self.bodies):
+            modulus = self.snap_modulus if number in self.snapping else self.modulus
+            found += [(modulus, solid) for solid in body]
+        return [(f"{self.compliant}_{i}.obj", modulus, solid) for i, (modulus, solid) in enumerate(found)]
+
+    @property
+    def snapping_pieces(self) -> frozenset[str]:
+        """Names of the geometries that give way."""
+        numbers = [number for number, body in enumerate(self.bodies) for _ in body]
+        return frozenset(f"piece_{i}" for i, number in enumerate(numbers) if number in self.snapping)
+
+
+def read_parts(
+    plug: Path, socket: Path, unit: str | None, place: Sequence[float], axis: str, centre: Sequence[float] | None
+) -> tuple[Part, Part]:
+    """Both parts in the target frame: z out of the socket, its origin on the axis at the plug's lower end.
+
+    Args:
+        plug, socket: the files.
+        unit: of both files' numbers; None where their formats say it.
+        place: [x y z] in the files' unit and [rx ry rz] in degrees by which the plug's file is moved into the
+            socket's; zeros where both are drawn assembled.
+        axis: which way the plug comes out, in the socket's file.
+        centre: a point on the axis, in the socket's file; the plug's centre of mass unless given.
+
+    Raises:
+        InputError: if a file can't be used, or an argument makes no sense.
+    """
+    if axis not in AXES:
+        raise InputError(f"--axis is one of {', '.join(AXES)}, not {axis!r}: the way the plug comes out")
+    units = [unit_of(path, unit) for path in (plug, socket)]
+    if None in units:
+        raise InputError(
+            f"{(plug, socket)[units.index(None)].name} does not say its unit: give --unit {', '.join(UNITS)}"
+        )
+    first, second = (load_part(path, str(one)) for path, one in zip((plug, socket), units, strict=True))
+    scale = UNITS[str(units[1])]
+    first = first.moved(_rotation(np.asarray(place[3:]) * DEGREE), np.asarray(place[:3]) * scale)
+    z = np.array(AXES[axis], dtype=float)
+    x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
+    to_target = np.stack([x, np.cross(z, x), z])
+    first, second = (part.moved(to_target, np.zeros(3)) for part in (first, second))
+    origin = np.array([*centre_of_mass(first)[:2], first.bounds[0, 2]])
+    if centre is not None:
+        origin[:2] = (to_target @ (np.asarray(centre, dtype=float) * scale))[:2]
+    return first.moved(np.eye(3), -origin), second.moved(np.eye(3), -origin)
+
+
+def _rotation(angles: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("xyz", angles).as_matrix()
+
+
+def onboard(
+    plug: Path,
+    socket: Path,
+    out: Path,
+    *,
+    unit: str | None = None,
+    place: Sequence[float] = (0.0,) * 6,
+    axis: str = "+z",
+    centre: Sequence[float] | None = None,
+    turn: float = 0.0,
+    force_limit: float = 35.0,
+    friction: float = 0.2,
+    scenario: Sequence[Path] = (),
+    say: Callable[[str], None] = lambda words: None,
+) -> dict[str, Any]:
+    """Makes a task folder, and returns what was measured.
+
+    Args:
+        plug, socket, unit, place, axis, centre: see `read_parts`.
+        out: the folder; it must not exist.
+        turn: of the plug at the bottom [degrees], counter-clockwise as seen from outside; it is drawn turned.
+        force_limit: more than that ends an episode [N].
+        friction: of all surfaces.
+        scenario: files of Drake model directives of what else stands there.
+        say: is told what was found while it goes on.
+
+    Raises:
+        InputError: if the parts can't be used, in a sentence with the remedy; nothing is left then.
+    """
+    if out.exists():
+        raise InputError(f"{out} already exists: name another folder with --out, or remove it")
+    parts = read_parts(plug, socket, unit, place, axis, centre)
+    check_target(*parts)
+    path = motion(*parts, turn * DEGREE, CLEAR)
+    clearance = side_clearance(*parts)
+    snapping = _snapping(*parts, path)
+    say(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
+    say(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
+    made = out.with_name(f".{out.name}.part")
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir(parents=True)
+    try:
+        measured = _make(made, out.name, parts, path, clearance, snapping, force_limit, friction, scenario, say)
+        made.rename(out)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+    return {"task": str(out), **measured, "page": str(out / "preview.html")}
+
+
+def _snapping(plug: Part, socket: Part, path: Motion) -> frozenset[int]:
+    """Numbers of the plug's bodies that overlap the socket on the way.
+
+    Raises:
+        InputError: if that is all there is of the plug: a rigid part that doesn't fit.
+    """
+    ways = in_the_way(plug, socket, path)
+    blocked = frozenset(i for i, (depth, _) in enumerate(ways) if depth > RESTING)
+    if blocked and len(blocked) == len(ways):
+        depth, height = max(ways)
+        raise InputError(
+            f"the plug does not pass the socket: {1e3 * height:.1f} mm above the target they overlap by about "
+            f"{1e3 * depth:.2g} mm; say with --turn and --centre by how much it turns about what, or draw what "
+            "gives way as a body of its own"
+        )
+    return blocked
+
+
+def _make(
+    folder: Path,
+    name: str,
+    parts: tuple[Part, Part],
+    path: Motion,
+    clearance: float,
+    snapping: frozenset[int],
+    force_limit: float,
+    friction: float,
+    scenario: Sequence[Path],
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    from guiderail.diagrams.tasks.part_file import write_task_file
+    from guiderail.tools.onboard.demonstrate import demonstrate
+    from guiderail.tools.onboard.preview import write_preview
+    from guiderail.tools.onboard.trial import insert
+
+    for part, of in zip(parts, ("plug", "socket"), strict=True):
+        (folder / f"{of}.obj").write_text(obj_text(*_whole(part)), encoding="utf-8")
+    for file in scenario:
+        shutil.copy(file, folder / file.name)
+    numbers = {"name": name, "force_limit": force_limit, "friction": friction, "scenario": scenario, "path": path}
+    contact, push, aligned = _choose_contact(folder, parts, numbers, clearance, snapping, say)
+    file = _task_file(parts, contact, push, numbers)
+    off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in ((OFF, 0.0), (0.0, OFF))]
+    penetration = max(trial.penetration for trial in (aligned, *off))
+    succeeded, page = demonstrate(folder, file), folder / "preview.html"
+    measured = {
+        "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,
+        "compliant": contact.compliant,
+        "pieces": len(contact.pieces),
+        "modulus": contact.modulus,
+        "inserted": aligned.success,
+        "inserted_1.5_mm_off": [trial.success for trial in off],
+        "force": round(aligned.peak_force, 2),
+        "penetration_mm": round(1e3 * aligned.penetration, 4),
+        "penetration_pushed_on_the_rim_mm": round(1e3 * penetration, 4),
+        "snap_mm": round(1e3 * aligned.snap, 4),
+        "real_time_factor": round(min(trial.real_time_factor for trial in (aligned, *off)), 2),
+        "demonstrations_seated": f"{succeeded} of 5",
+    }
+    file = file.model_copy(update={"measured": measured})
+    write_task_file(folder, file)
+    write_preview(page, folder, file, aligned)
+    return measured
+
+
+def _choose_contact(
+    folder: Path,
+    parts: tuple[Part, Part],
+    numbers: dict[str, Any],
+    clearance: float,
+    snapping: frozenset[int],
+    say: Callable[[str], None],
+) -> tuple[Contact, float, Any]:
+    """The contact geometry that inserts, deep enough in nothing, and fastest; with its push and its trial."""
+    from guiderail.tools.onboard.trial import insert
+
+    allowed = 0.5 * clearance if np.isfinite(clearance) else 5e-5
+    found: list[tuple[tuple[bool, bool, float], Contact, float, Any]] = []
+    for side, part in zip(("plug", "socket"), parts, strict=True):
+        if snapping and side == "socket":
+            continue  # what gives way is in the plug
+        cut = [convex_pieces(solid) for solid in solids(part)]
+        if any(body is None for body in cut):
+            say(f"{side}: too intricate to be cut into convex pieces")
+            continue
+        for modulus in MODULI:
+            bodies = tuple(tuple(body or ()) for body in cut)
+            trial, contact, push = _first_that_seats(folder, parts, side, bodies, modulus, snapping, numbers)
+            good = trial.success and trial.penetration <= allowed
+            if good:
+                # Pressed on the rim it is deepest: there an edge meets an edge.
+                file = _task_file(parts, contact, push, numbers)
+                good = insert(folder, file, offset=(OFF, 0.0)).penetration <= allowed
+            say(
+                f"{side} compliant, {len(contact.pieces)} convex pieces, {modulus:.0e} Pa: "
+                f"{'seats' if trial.success else 'does not seat'}, {trial.peak_force:.1f} N, "
+                f"{1e3 * trial.penetration:.3f} mm deep, {trial.real_time_factor:.1f} × real time"
+            )
+            rank = (trial.success, good, trial.real_time_factor)
+            found.append((rank, contact, push, trial))
+            if good:
+                break
+        if found and found[-1][0][1] and found[-1][0][2] >= FAST_ENOUGH:
+            break
+    if not found:
+        raise InputError(
+            "both parts are too intricate to be cut into convex pieces: leave out what never touches, such as threads, "
+            "fillets and lettering, and export them again"
+        )
+    _, contact, push, trial = max(found, key=lambda one: one[0])
+    _write_pieces(folder, parts, contact)
+    return contact, push, trial
+
+
+def _first_that_seats(
+    folder: Path,
+    parts: tuple[Part, Part],
+    side: str,
+    bodies: tuple[tuple[Any, ...], ...],
+    modulus: float,
+    snapping: frozenset[int],
+    numbers: dict[str, Any],
+) -> tuple[Any, Contact, float]:
+    """The first trial that seats, over how far is pushed and how soft a snap is; the last one if none does."""
+    from guiderail.tools.onboard.trial import insert
+
+    for soft in SNAP_MODULI if snapping else (modulus,):
+        contact = Contact(side, bodies, modulus, soft, snapping)
+        _write_pieces(folder, parts, contact)
+        for push in PUSHES if snapping else PUSHES[:1]:
+            file = _task_file(parts, contact, push, numbers)
+            trial = insert(folder, file, snapping=contact.snapping_pieces)
+            if trial.success:
+                return trial, contact, push
+    return trial, contact, push
+
+
+def _write_pieces(folder: Path, parts: tuple[Part, Part], contact: Contact) -> None:
+    for old in [*folder.glob("plug_*.obj"), *folder.glob("socket_*.obj")]:
+        old.unlink()
+    for file, _, solid in contact.pieces:
+        (folder / file).write_text(obj_text(*as_arrays(solid)), encoding="utf-8")
+
+
+def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers: dict[str, Any]) -> Any:
+    from guiderail.diagrams.tasks.part_file import NAMESPACE, MotionNumbers, PartModel, PartTaskFile, Piece
+
+    path, friction = numbers["path"], numbers["friction"]
+    models = {}
+    for part, name in zip(parts, ("plug", "socket"), strict=True):
+        if contact.compliant == name:
+            pieces = [
+                Piece.model_validate({"file": file, "modulus": modulus, "friction": friction})
+                for file, modulus, _ in contact.pieces
+            ]
+        else:
+            pieces = [Piece.model_validate({"file": f"{name}.obj", "friction": friction})]
+        vertices = _whole(part)[0]
+        middle = part.bounds.mean(axis=0)
+        models[name] = PartModel(
+            source=part.path.name,
+            visual=f"{name}.obj",
+            mass=round(max(1e-3, DENSITY * sum(solid.volume() for solid in solids(part)) * 1e-9), 6),
+            centre=tuple(np.round(middle, 6).tolist()),
+            gyration=round(float(np.sqrt(((vertices - middle) ** 2).sum(axis=1).mean())), 6),
+            pieces=tuple(pieces),
+        )
+    values: dict[str, Any] = dict(
+        name=f"{NAMESPACE}/{_plain_name(numbers['name'])}",
+        **models,
+        scenario=tuple(file.name for file in numbers["scenario"]),
+        motion=MotionNumbers.model_validate(
+            {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push}
+        ),
+        force_limit=numbers["force_limit"],
+    )
+    return PartTaskFile.model_validate(values)
+
+
+def _plain_name(name: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "_.-" else "_" for letter in name)
+
+
+def _whole(part: Part) -> tuple[np.ndarray, np.ndarray]:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in part.bodies)])
+    triangles = [t + start for (_, t), start in zip(part.bodies, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in part.bodies]), np.concatenate(triangles)
+
+
+def _size(part: Part) -> str:
+    return " × ".join(f"{1e3 * side:.1f}" for side in np.ptp(part.bounds, axis=0)) + " mm"
+
+
+def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
+    """The unit, asked for at a terminal where neither an argument nor the format says it."""
+    if given is not None or all(unit_of(path, None) for path in paths) or not sys.stdin.isatty():
+        return given
+    return input(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ").strip() or "mm"

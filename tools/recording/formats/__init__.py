@@ -1,0 +1,1 @@
+"""Recordings of others: CSV as people have it, ROS 2 bags and MCAP, LeRobot datasets."""

@@ -1,0 +1,171 @@
+"""LeRobot datasets of version 3, read and written with pyarrow: the library itself asks for other versions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.recording.formats.recorded import Recorded, choose_signal
+
+VERSION = "v3.0"
+INFO = Path("meta") / "info.json"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+TASK = "guiderail demonstration"
+_CLOCKS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+
+
+def read_lerobot(folder: Path, signal: str | None) -> Recorded:
+    """One demonstration an episode.
+
+    Args:
+        folder: of the dataset.
+        signal: a feature of one dimension, such as action; found out unless given.
+
+    Raises:
+        InputError: if it is no such dataset, or does not say what is meant.
+    """
+    import pyarrow.parquet as parquet
+
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        version, features, fps = str(info["codebase_version"]), dict(info["features"]), float(info["fps"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder} is no LeRobot dataset: its {INFO} is missing or damaged") from error
+    if not version.startswith("v3"):
+        raise InputError(f"{folder} is a LeRobot dataset of version {version}: convert it to v3.0 by LeRobot's script")
+    vectors = [
+        name
+        for name, one in features.items()
+        if len(one.get("shape", ())) == 1 and name not in _CLOCKS and str(one.get("dtype", "")).startswith("float")
+    ]
+    chosen, assumed = choose_signal(sorted(vectors), signal, str(folder), "--signal")
+    files = sorted((folder / "data").rglob("*.parquet"))
+    if not files:
+        raise InputError(f"{folder} has no data/*.parquet: copy the whole dataset")
+    columns = [chosen, "frame_index", "episode_index"]
+    try:
+        tables = [parquet.read_table(file, columns=columns) for file in files]
+        values = np.concatenate([np.array(table[chosen].to_pylist(), dtype=float) for table in tables])
+        frames, episodes = (
+            np.concatenate([table[name].to_numpy() for table in tables]) for name in ("frame_index", "episode_index")
+        )
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{folder} holds data that its {INFO} does not describe: {error}") from error
+    names = _names(features[chosen], values.shape[1])
+    assumed += [
+        f"time is the frame's number by {fps:g} frames a second",
+        "numbers are kept as they are: a LeRobot dataset does not say their unit or frame",
+    ]
+    found = Recorded([], [], names, assumed)
+    for episode in np.unique(episodes):
+        rows = np.flatnonzero(episodes == episode)
+        rows = rows[np.argsort(frames[rows], kind="stable")]
+        found.times.append(frames[rows] / fps)
+        found.outputs.append(values[rows])
+    return found
+
+
+def _names(feature: dict[str, Any], size: int) -> tuple[str, ...]:
+    names = feature.get("names")
+    if isinstance(names, dict):  # some datasets have {"motors": [...]}
+        names = next(iter(names.values()), None)
+    if isinstance(names, list) and len(names) == size:
+        return tuple(str(name) for name in names)
+    return tuple(f"y{i + 1}" for i in range(size))
+
+
+def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
+    """Writes a dataset whose action is what was commanded.
+
+    Raises:
+        InputError: if the demonstrations have no common rate, which a dataset must have.
+    """
+    import pyarrow as arrow
+    import pyarrow.parquet as parquet
+
+    steps = np.concatenate([np.diff(t) for t in demonstrations.times])
+    period = float(np.median(steps))
+    if np.abs(steps - period).max() > 1e-3 * period:
+        raise InputError(
+            "a LeRobot dataset has one rate, and these demonstrations have several: give --rate to resample them"
+        )
+    fps = round(1.0 / period, 6)
+    fps = int(fps) if float(fps).is_integer() else fps
+    size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
+    values = np.concatenate(demonstrations.outputs).astype(np.float32)
+    frames = np.concatenate([np.arange(n) for n in lengths])
+    episodes = np.repeat(np.arange(len(lengths)), lengths)
+    flat = arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), size)
+    columns = {
+        "action": flat,
+        "observation.state": flat,
+        "timestamp": arrow.array((frames / fps).astype(np.float32)),
+        "frame_index": arrow.array(frames.astype(np.int64)),
+        "episode_index": arrow.array(episodes.astype(np.int64)),
+        "index": arrow.array(np.arange(len(frames), dtype=np.int64)),
+        "task_index": arrow.array(np.zeros(len(frames), dtype=np.int64)),
+    }
+    names = list(demonstrations.names)
+    features: dict[str, Any] = {
+        name: {"dtype": "float32", "shape": [size], "names": names} for name in ("action", "observation.state")
+    }
+    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _CLOCKS.items()}
+    data = folder / DATA_PATH.format(chunk_index=0, file_index=0)
+    data.parent.mkdir(parents=True)
+    parquet.write_table(arrow.table(columns), data)
+    ends = np.cumsum(lengths)
+    described = {
+        "episode_index": list(range(len(lengths))),
+        "tasks": [[TASK]] * len(lengths),
+        "length": lengths,
+        "data/chunk_index": [0] * len(lengths),
+        "data/file_index": [0] * len(lengths),
+        "dataset_from_index": [int(end - n) for end, n in zip(ends, lengths, strict=True)],
+        "dataset_to_index": [int(end) for end in ends],
+        "meta/episodes/chunk_index": [0] * len(lengths),
+        "meta/episodes/file_index": [0] * len(lengths),
+    }
+    about = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    about.parent.mkdir(parents=True)
+    parquet.write_table(arrow.table(described), about)
+    import pandas as pd
+
+    pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task")).to_parquet(folder / "meta" / "tasks.parquet")
+    info = {
+        "codebase_version": VERSION,
+        "robot_type": None,
+        "total_episodes": len(lengths),
+        "total_frames": len(frames),
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 500,
+        "fps": fps,
+        "splits": {"train": f"0:{len(lengths)}"},
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "features": features,
+    }
+    (folder / INFO).write_text(json.dumps(info, indent=4), encoding="utf-8")
+    (folder / "meta" / "stats.json").write_text(json.dumps(_statistics(columns, values), indent=4), encoding="utf-8")
+    return ["action and observation.state are both what was demonstrated, as 32-bit numbers"]
+
+
+def _statistics(columns: dict[str, Any], values: np.ndarray) -> dict[str, Any]:
+    found = {}
+    for name, column in columns.items():
+        numbers = values.astype(float) if name in ("action", "observation.state") else column.to_numpy()[:, None]
+        reduced = {"min": numbers.min(0), "max": numbers.max(0), "mean": numbers.mean(0), "std": numbers.std(0)}
+        found[name] = {key: value.tolist() for key, value in reduced.items()} | {"count": [len(numbers)]}
+    return found

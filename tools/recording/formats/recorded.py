@@ -1,0 +1,76 @@
+"""What an importer found, and what it took for granted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.errors import InputError
+
+POSE_NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+COMMANDED = ("command", "desired", "target", "equilibrium", "cmd", "action", "goal", "setpoint", "reference")
+"""Words in a signal's name that mean what was asked for, and not what was measured."""
+
+
+@dataclass
+class Recorded:
+    """Motions from somebody's file.
+
+    Attributes:
+        times: (N_m,) of each [s].
+        outputs: (N_m, O) of each.
+        names: of the outputs.
+        assumed: what the file does not say, a sentence each.
+    """
+
+    times: list[np.ndarray]
+    outputs: list[np.ndarray]
+    names: tuple[str, ...]
+    assumed: list[str] = field(default_factory=list)
+
+
+def poses_in_target(positions: np.ndarray, rotations: Rotation, target: Sequence[float] | None) -> np.ndarray:
+    """Poses (N, 6), [x y z Rz Ry Rx], of positions (N, 3) [m] and rotations, in the target frame.
+
+    Args:
+        positions, rotations: in the recording's frame.
+        target: [x y z] in metres and [rx ry rz] in degrees of the target in that frame; None keeps the recording's.
+    """
+    if target is not None:
+        turn = Rotation.from_euler("xyz", np.asarray(target[3:], dtype=float), degrees=True)
+        positions = turn.inv().apply(positions - np.asarray(target[:3], dtype=float))
+        rotations = turn.inv() * rotations
+    # Rz(a) Ry(b) Rx(c); a turn past half a circle goes on.
+    angles = np.unwrap(rotations.as_euler("ZYX"), axis=0)
+    return np.column_stack([positions, angles])
+
+
+def is_commanded(name: str) -> bool:
+    """Whether a signal's name says that it was asked for."""
+    return any(word in name.lower() for word in COMMANDED)
+
+
+def choose_signal(candidates: Sequence[str], given: str | None, where: str, option: str) -> tuple[str, list[str]]:
+    """The signal that is imported and what was assumed of it.
+
+    One that was named; else the only one; else the only one that was commanded, which a primitive should learn.
+
+    Raises:
+        InputError: if none of that says which.
+    """
+    if not candidates:
+        raise InputError(f"{where} holds no poses, transforms or joint positions: nothing of it can be imported")
+    if given is not None:
+        if given not in candidates:
+            raise InputError(f"{where} has no {given}: {option} is one of {', '.join(candidates)}")
+        return given, []
+    commanded = [name for name in candidates if is_commanded(name)]
+    chosen = commanded if len(commanded) == 1 else list(candidates)
+    if len(chosen) > 1:
+        raise InputError(f"{where} has {', '.join(chosen)}, and does not say which is meant: name one with {option}")
+    kind = "commanded, by its name" if is_commanded(chosen[0]) else "measured, as nothing in it says commanded"
+    return chosen[0], [f"{chosen[0]} is what was {kind}"]
