@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
 from guiderail.models.errors import InputError
+
+MISSED = 6  # messages in a row without which nobody goes on
 
 
 class Fault(IntEnum):
@@ -29,6 +32,8 @@ class Fault(IntEnum):
     EXTERNAL_TORQUE = 13
     TORQUE = 14
     ASKED = 15
+    LATE = 16
+    DEPUTY = 17
 
 
 FAULTS = {
@@ -48,6 +53,8 @@ FAULTS = {
     Fault.EXTERNAL_TORQUE: "the surroundings load a joint too much",
     Fault.TORQUE: "the wanted torques are no numbers",
     Fault.ASKED: "somebody asked for it",
+    Fault.LATE: "this program was held up, and sent nothing for too long",
+    Fault.DEPUTY: "the deputy at the robot has stopped it, or is gone",
 }
 """Each fault in words."""
 
@@ -80,6 +87,23 @@ class JointStatus:
         return np.concatenate([self.positions, self.velocities, self.external_torque])
 
 
+@dataclass(frozen=True)
+class DeputyWord:
+    """What a robot's deputy says with every status.
+
+    Attributes:
+        number: another one each time.
+        is_acting: whether it is stopping the arm.
+    """
+
+    number: int
+    is_acting: bool
+
+    def __deepcopy__(self, memo: object) -> DeputyWord:
+        """Itself: nobody writes into this one."""
+        return self
+
+
 UNREADABLE = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
 """What stands for a message that could not be read."""
 
@@ -97,6 +121,8 @@ class StatusLimits:
         settling: for how long statuses must have been sound before they are believed [s], not negative: the time for
             which a driver that has just been started wants no commands.
         clock_drift: of the two clocks against each other [s/s], not negative: slower changes are no fault.
+        max_gap: between two checks, by the clock on the wall, beyond which this program itself was held up for too
+            long [s], positive.
     """
 
     velocity: tuple[float, ...]
@@ -106,13 +132,21 @@ class StatusLimits:
     velocity_jump: float = 1.5
     settling: float = 0.25
     clock_drift: float = 1e-3
+    max_gap: float = 0.03
 
     def __post_init__(self) -> None:
         positive = (*self.velocity, self.max_age, self.max_lead, self.position_jump, self.velocity_jump)
+        positive += (self.max_gap,)
         if not self.velocity or not all(0.0 < value < np.inf for value in positive):
             raise InputError("the limits of a robot's status must be positive")
         if not min(self.settling, self.clock_drift) >= 0.0:
             raise InputError("a robot's settling time and its clock's drift must not be negative")
+
+    @classmethod
+    def at_rate(cls, velocity: Sequence[float], period: float) -> StatusLimits:
+        """The limits for a driver that speaks once in `period` [s]: some messages in a row may be lost or late."""
+        silence = MISSED * period
+        return cls(tuple(velocity), max_age=silence, max_lead=silence, max_gap=silence)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.errors import InputError
+from guiderail.models.joint_damping import damping_torque
 from guiderail.models.joint_status import FAULTS, Fault
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
 from guiderail.systems.support.sampling import check_period
@@ -23,7 +24,7 @@ from guiderail.systems.support.sampling import check_period
 # Entries of the state.
 _PHASE, _FAULT, _PHASE_TIME, _AUTHORITY = range(4)
 # For how long no torque is said once more before a silent robot is sent nothing [s].
-_FAREWELL = 0.05
+FAREWELL = 0.05
 
 
 class Phase(IntEnum):
@@ -337,10 +338,9 @@ class TorqueGuard(LeafSystem):
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
 
     def _damping_torque(self, context: Context) -> np.ndarray:
-        age, decay_time = float(self._status_age_port.Eval(context)[0]), self._limits.decay_time
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = self._state_port.Eval(context)[self._num_joints :]
-        return -(M @ v) * (np.exp(-age / decay_time) / decay_time)
+        return damping_torque(M, v, self._limits.decay_time, float(self._status_age_port.Eval(context)[0]))
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         phase, fault, _, _ = self._memory_of(context)
@@ -357,7 +357,7 @@ class TorqueGuard(LeafSystem):
         phase, _, phase_time, _ = self._memory_of(context)
         is_sending = phase in (Phase.RAMPING, Phase.RUNNING, Phase.DAMPING)
         if phase == Phase.OFF:
-            is_sending = phase_time <= _FAREWELL or self._status_fault_port.Eval(context)[0] == Fault.NONE
+            is_sending = phase_time <= FAREWELL or self._status_fault_port.Eval(context)[0] == Fault.NONE
         output.SetAtIndex(0, float(is_sending))
 
     def _calc_not_following(self, context: Context, output: BasicVector) -> None:

@@ -445,6 +445,10 @@ def run(
     lcm_url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
     robot: Annotated[str, _opt("Which arm.", of="robots")] = "iiwa14",
     rehearse: Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")] = False,
+    lockstep: Annotated[
+        bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--lockstep")
+    ] = False,
+    rate: Annotated[float, _opt("Of a rehearsal: the simulated robot's clock to the wall's.")] = 0.2,
     yes: Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")] = False,
     out: Annotated[Path | None, _opt("The folder of what is recorded.  [default: hardware in the run]")] = None,
 ) -> None:
@@ -457,7 +461,16 @@ def run(
     from guiderail.tools.operate.run_policy import run_policy
 
     code = run_policy(
-        run, station=station, lcm_url=lcm_url, robot=robot, rehearse=rehearse, yes=yes, out=out, say=_tell
+        run,
+        station=station,
+        lcm_url=lcm_url,
+        robot=robot,
+        rehearse=rehearse,
+        lockstep=lockstep,
+        rate=rate,
+        yes=yes,
+        out=out,
+        say=_tell,
     )
     raise typer.Exit(code)
 
@@ -468,7 +481,9 @@ def serve_iiwa(
     seconds: Annotated[float, _opt("How long, in simulated time.")] = 3600.0,
     patience: Annotated[float, _opt("How many seconds to wait for a command.")] = 5.0,
     task: Annotated[str, _opt("What stands in front of it: {tasks}.", of="tasks")] = "BncConnector",
-    real_time: Annotated[bool, _opt("Go by the wall's clock, and wait for nobody.", "--real-time")] = False,
+    rate: Annotated[
+        float | None, _opt("Go by the wall's clock, or so much slower, and wait for nobody; 1 is real time.")
+    ] = None,
 ) -> None:
     """Simulate an iiwa at the other end of LCM.
 
@@ -476,7 +491,7 @@ def serve_iiwa(
     """
     from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
 
-    raise typer.Exit(0 if serve(url, seconds, patience, task, real_time=real_time) else 1)
+    raise typer.Exit(0 if serve(url, seconds, patience, task, rate=rate) else 1)
 
 
 @command("generate connector-demonstrations --out .")

@@ -170,3 +170,52 @@ def test_refuses_limits_that_make_no_sense(wrong):
 def test_refuses_a_period_that_is_none():
     with pytest.raises(InputError):
         StatusWatchdog(LIMITS, period=0.0)
+
+
+class WithClock(Watched):
+    """The same by the clock on the wall, which goes by itself."""
+
+    def __init__(self):
+        super().__init__()
+        self.wall = 5000.0
+
+    def check(self, status, gap=PERIOD):
+        self.wall += gap
+        self.system.get_clock_input_port().FixValue(self.context, [self.wall])
+        return super().check(status)
+
+    def sound(self, gap=PERIOD):
+        return replace(super().sound(), time=CLOCK + self.wall + gap)
+
+
+def test_by_the_clock_on_the_wall_a_delay_of_ones_own_is_no_fault_of_the_status():
+    """A program that was held up for a few periods finds a status that is as much newer, and goes on."""
+    watched = WithClock().settle()
+    for gap in (3.0, 1.0, 4.0, 0.5):
+        assert watched.check(watched.sound(gap * PERIOD), gap * PERIOD) == Fault.NONE
+        assert watched.age <= PERIOD
+
+
+def test_a_program_that_was_held_up_for_too_long_says_so_and_believes_the_newest_status():
+    watched = WithClock().settle()
+    status = watched.sound(0.2)
+    assert watched.check(status, 0.2) == Fault.LATE
+    np.testing.assert_array_equal(watched.state, status.values()[:4])
+    assert watched.check(watched.sound()) == Fault.LATE  # until it has settled again
+    watched.settle()
+
+
+def test_by_the_clock_on_the_wall_a_status_that_stops_is_stale_however_few_checks_there_were():
+    watched = WithClock().settle()
+    last = watched.sound()
+    watched.check(last)
+    gap = 0.7 * LIMITS.max_gap
+    assert [watched.check(last, gap) for _ in range(2)] == [Fault.NONE, Fault.STALE]
+    assert watched.age == pytest.approx(2.0 * gap)
+
+
+def test_the_limits_follow_from_the_rate():
+    limits = StatusLimits.at_rate((1.0, 2.0), 0.005)
+    assert (limits.max_age, limits.max_lead, limits.max_gap) == (0.03, 0.03, 0.03)
+    with pytest.raises(InputError):
+        StatusLimits((1.0,), max_gap=0.0)

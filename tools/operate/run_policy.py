@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -24,9 +24,9 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.make import make_skill, resolve
 from guiderail.diagrams.options import Options
-from guiderail.diagrams.stations.hardware import HardwareStation, StepByStep
+from guiderail.diagrams.stations.hardware import HardwareStation
+from guiderail.diagrams.stations.pace import Pace, RealTime, StepByStep, hurry
 from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.diagrams.stations.station import PLANT_PERIOD
 from guiderail.diagrams.tasks.assemble import SkillDiagram
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.trace import Trace
@@ -48,31 +48,12 @@ STANDSTILL = 0.05  # [rad/s] of a joint
 UNLOADED = 5.0  # [N]: what a robot feels at rest whose payload is known to it
 SIGNALS = {"wrench": 6, "saturation": 1, "holding": 1, "fallback": 1, "commanded_violation": 1, "fault": 1, "phase": 1}
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
+# Contact takes a simulated robot with 1 kHz longer than the wall's clock would allow, on the machines that we know.
+REHEARSAL_RATE = 0.2
+WARM_UP = 0.1  # [s], less than a driver's hold-off
 PATIENCE = 3.0  # [s] of wall clock that a rehearsal waits for a status
 
 Say = Callable[[str], None]
-
-
-class Pace(Protocol):
-    """How time passes."""
-
-    def begin(self) -> None:
-        """Called when a simulator was initialized."""
-
-    def advance(self, simulator: Simulator, steps: int) -> None:
-        """Advances by so many periods of the station."""
-
-
-class RealTime:
-    """The wall's clock: a real robot waits for nobody."""
-
-    def begin(self) -> None:
-        """Nothing: an initialization starts the clock."""
-
-    def advance(self, simulator: Simulator, steps: int) -> None:
-        """Advances by so many periods of the station."""
-        simulator.set_target_realtime_rate(1.0)
-        simulator.AdvanceTo(simulator.get_context().get_time() + steps * PLANT_PERIOD)
 
 
 @dataclass(frozen=True)
@@ -118,7 +99,7 @@ class Operation:
         self._skills_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
         # The guidance begins with its first control step. So another station on the same bus approaches the start.
         self._station = self._skills_station.alike(task.world())
-        self._steps = round(skill.control_period / PLANT_PERIOD)
+        self._steps = round(skill.control_period / self._skills_station.period)
         self._start = task.start(np.random.default_rng(0))
         self._simulator = self._initialized()
         self.trace = Trace(skill.num_steps, 6, skill.control_period, SIGNALS)
@@ -177,6 +158,7 @@ class Operation:
 
         The arm is brought to rest whatever is raised, such as by a policy that returns no action.
         """
+        self._warm_up()
         self._simulator = self._initialized()
         here = self._station.get_pose_output_port().Eval(self._simulator.get_context()).copy()
         say(f"taking over, and approaching the start at {CRAWL / MM:.0f} mm/s")
@@ -192,10 +174,20 @@ class Operation:
         self._rest()
         return stopped
 
+    def _warm_up(self) -> None:
+        """Whatever is called for the first time takes longer than the arm could wait between approach and skill.
+
+        The skill's station hears statuses here, and is not yet settled enough to send anything.
+        """
+        simulator = Simulator(self._diagram)
+        self._skills_station.start(simulator)
+        self._pace.begin()
+        self._pace.advance(simulator, self._skills_station, round(WARM_UP / self._skills_station.period))
+
     def _rest(self) -> None:
         station, context = self._acting()
         station.stop(context)
-        self._pace.advance(self._simulator, round((station.limits.damping_time + 0.1) / PLANT_PERIOD))
+        self._pace.advance(self._simulator, station, round((station.limits.damping_time + 0.1) / station.period))
 
     def _give_back(self) -> None:
         """Lets the station that approached go on instead of the skill, which can't be advanced any more."""
@@ -212,8 +204,8 @@ class Operation:
 
     def _step(self) -> Outcome | None:
         """Advances by a control step; how it ended, if it did."""
-        self._pace.advance(self._simulator, self._steps)
         station, root = self._acting()
+        self._pace.advance(self._simulator, station, self._steps)
         context = station.GetMyContextFromRoot(root)
         phase, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("phase", "fault"))
         force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
@@ -292,8 +284,9 @@ class Operation:
         folder.mkdir(parents=True, exist_ok=True)
         number = len(list(folder.glob("episode-*.json")))
         ledger = table(self.trace, number)
+        joints = self._station.known.plant.num_positions()
         for name, values in self._joints.items():
-            for joint, column in enumerate(np.reshape(values, (len(self.trace), -1)).T):
+            for joint, column in enumerate(np.reshape(values, (len(self.trace), joints)).T):
                 ledger = ledger.append_column(f"{name}_{joint}", pa.array(column))
         file = io.BytesIO()
         pq.write_table(ledger, file, compression="NONE", use_dictionary=False)
@@ -310,6 +303,8 @@ def run_policy(
     lcm_url: str = "",
     robot: str = DEFAULT_ROBOT,
     rehearse: bool = False,
+    lockstep: bool = False,
+    rate: float = REHEARSAL_RATE,
     yes: bool = False,
     out: Path | None = None,
     say: Say = print,
@@ -322,6 +317,8 @@ def run_policy(
         lcm_url: of the bus; LCM's own default where it is empty, and in a rehearsal one of this process alone.
         robot: which arm.
         rehearse: a simulated robot stands in, in a process of its own.
+        lockstep: of a rehearsal: each side waits for the other instead of going by the wall's clock.
+        rate: of a simulated robot's clock to the wall's.
         yes: what is read out is confirmed.
         out: the folder of what is recorded; `hardware` in the run unless given.
         say: what a person is told.
@@ -329,6 +326,8 @@ def run_policy(
     Raises:
         InputError: for what can't be run, where no robot answers, or a check fails or isn't confirmed.
     """
+    if lockstep and not rehearse:
+        raise InputError("a real robot waits for nobody: --lockstep is for a rehearsal")
     folder = RunFolder(run)
     config, policy = folder.config(), Policy.load(folder.path)
     environment = _on_a_robot(config.task, config.environment, station)
@@ -343,8 +342,13 @@ def run_policy(
         raise InputError(f"{config.task} has no pose that an arm could approach to begin: run an insertion")
     skill = make_skill(config.task, policy, **environment)
     bus = skill.diagram.GetSubsystemByName("station")
-    with _stand_in(config.task, robot, lcm_url) if rehearse else _nothing(), _stop_key() as is_stopped:
-        pace: Pace = StepByStep(bus.lcm, PATIENCE, bus.driver.status_channel) if rehearse else RealTime()
+    with (
+        _stand_in(config.task, robot, lcm_url, None if lockstep else rate) if rehearse else _nothing(),
+        _stop_key() as is_stopped,
+    ):
+        channel, period = bus.driver.status_channel, bus.period
+        clock = RealTime(bus.lcm, channel, period, rate if rehearse else 1.0)
+        pace: Pace = StepByStep(bus.lcm, PATIENCE, channel, period) if lockstep else clock
         say(f"waiting for a status of {robot} on {lcm_url or 'the default bus'}, channel {bus.driver.status_channel}")
         operation = Operation(task, skill, pace, is_stopped)
         checks = operation.checks()
@@ -355,10 +359,12 @@ def run_policy(
             raise InputError(f"the arm stays where it is: {wrong[0].name}: {wrong[0].words}")
         if not yes:
             _confirm()
+        if not lockstep and not hurry():
+            say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
         say("Enter or Ctrl-C stops the arm")
         with _no_pauses():
             outcome = operation.run(say)
-    found = {
+    found: dict[str, Any] = {
         "task": config.task,
         "run": folder.path.name,
         "robot": robot,
@@ -368,6 +374,12 @@ def run_policy(
         "steps": outcome.steps,
         "checks": {check.name: check.words for check in checks},
     }
+    if not lockstep:
+        found["milliseconds_between_statuses"] = {
+            "period": period / (rate if rehearse else 1.0) / MM,
+            "99 %": clock.gaps.quantile(0.99) / MM,
+            "longest": clock.gaps.longest / MM,
+        }
     if outcome.steps:
         away, turned = _distance(operation.trace.measured[-1], np.zeros(6))
         found |= {"millimetres_from_target": away / MM, "degrees_from_target": turned / DEGREE}
@@ -444,11 +456,12 @@ def _stop_key() -> Iterator[Callable[[], bool]]:
 
 
 @contextmanager
-def _stand_in(task: str, robot: str, lcm_url: str) -> Iterator[None]:
+def _stand_in(task: str, robot: str, lcm_url: str, rate: float | None) -> Iterator[None]:
     """A simulated robot in a process of its own."""
     if robot != DEFAULT_ROBOT:
         raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver to rehearse with, not {robot}")
     arguments = ["serve-iiwa", "--url", lcm_url, "--task", task, "--patience", "30"]
+    arguments += [] if rate is None else ["--rate", str(rate)]
     call = f"from guiderail.tools.command import main; main({arguments!r})"
     # Ctrl-C is meant for us: a robot that ends can't come to rest.
     process = subprocess.Popen([sys.executable, "-c", call], start_new_session=True)

@@ -10,8 +10,7 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.make import make_skill, resolve
-from guiderail.diagrams.stations.hardware import HardwareStation, SimulatedIiwa
-from guiderail.diagrams.stations.station import PLANT_PERIOD
+from guiderail.diagrams.stations.hardware import IIWA_DRIVER, HardwareStation, SimulatedIiwa
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
 from guiderail.systems.policy_system import PolicyError
@@ -36,14 +35,14 @@ class Together:
     def begin(self):
         pass
 
-    def advance(self, simulator, steps):
+    def advance(self, simulator, station, steps):
         start = simulator.get_context().get_time()
         for step in range(steps):
             self.step += 1
             self.happens.get(self.step, lambda: None)()
             if not self.is_silent:
-                self.simulator.AdvanceTo(self.step * PLANT_PERIOD)
-            simulator.AdvanceTo(start + (step + 1) * PLANT_PERIOD)
+                self.simulator.AdvanceTo(self.step * IIWA_DRIVER.period)
+            simulator.AdvanceTo(start + (step + 1) * IIWA_DRIVER.period)
 
 
 @pytest.fixture
@@ -84,15 +83,22 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
     assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "done"
 
 
-def test_a_policy_that_returns_no_action_leaves_the_arm_at_rest(operated):
-    operation, pace = operated(policy=lambda observation: np.full(2, np.nan))
+@pytest.mark.parametrize("sound", [0, 2])  # of its actions: it is asked once before anything moves
+def test_a_policy_that_returns_no_action_leaves_the_arm_at_rest(operated, sound):
+    asked = []
+
+    def policy(observation):
+        asked.append(observation)
+        return np.full(2, 0.0 if len(asked) <= sound else np.nan)
+
+    operation, pace = operated(policy=policy)
     commands = []
     operation._station.lcm.Subscribe(
         "IIWA_COMMAND", lambda message: commands.append(lcmt_iiwa_command.decode(message).joint_torque)
     )
     with pytest.raises(PolicyError):
         operation.run(print)
-    assert commands[-1] == (0.0,) * 7
+    assert commands[-1:] == ([(0.0,) * 7] if sound else [])
     velocities = pace.robot.plant.GetVelocities(pace.robot.plant.GetMyContextFromRoot(pace.simulator.get_context()))
     assert np.abs(velocities).max() < 0.01
 
