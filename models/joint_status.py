@@ -117,7 +117,8 @@ class StatusLimits:
         max_age: beyond which a status is stale [s], positive. Some of them may be lost on the way.
         max_lead: by which a status may be ahead of this clock [s], positive.
         position_jump: beyond what the velocity explains [rad], positive.
-        velocity_jump: from one status to the next [rad/s], positive; a collision is not slower than 1.
+        velocity_jump: from one status to the next, and beyond what the positions' change explains [rad/s], positive; a
+            collision is not slower than 1.
         settling: for how long statuses must have been sound before they are believed [s], not negative: the time for
             which a driver that has just been started wants no commands.
         clock_drift: of the two clocks against each other [s/s], not negative: slower changes are no fault.
@@ -199,4 +200,10 @@ def judge_status(status: JointStatus | None, last: Heard, now: float, limits: St
         return Fault.POSITION_JUMP
     if (change[num_joints : 2 * num_joints] > limits.velocity_jump).any():
         return Fault.VELOCITY_JUMP
+    # A speed with which nothing moves would be damped all the same, and so drive the arm.
+    elapsed = status.time - last.time
+    if 0.0 < elapsed <= limits.max_age:
+        moving = (status.positions - last.values[:num_joints]) / elapsed
+        if (np.abs(moving - status.velocities) > limits.velocity_jump).any():
+            return Fault.VELOCITY_JUMP
     return Fault.NONE

@@ -59,7 +59,7 @@ class SafetyLimits:
     lower: tuple[float, float, float] = (-0.2, -0.2, -0.1)
     upper: tuple[float, float, float] = (0.2, 0.2, 0.3)
     damping_time: float = 0.5
-    decay_time: float = 0.05
+    decay_time: float = 0.02
     ramp_time: float = 0.5
 
     def __post_init__(self) -> None:
@@ -76,11 +76,11 @@ class SafetyLimits:
 class TorqueGuard(LeafSystem):
     """Passes wanted torques on while nothing is wrong; otherwise the arm is brought to rest, and then has no torque.
 
-        τ = clip(a τ_wanted + (1 − a) τ_damping),   τ_damping = −M(q) v exp(−age / T) / T
+        τ = clip(a τ_wanted + (1 − a) τ_damping),   τ_damping = −M(q) v exp(−t / T) / T
 
     a is the authority, which grows from 0 to 1 in the ramp time. Damping takes away all joints' speed with the decay
-    time T. Where no status comes any more, it goes by the last: what it then still takes away is exactly what the arm
-    had, so that nothing is ever driven backwards by a speed that is long gone.
+    time T. Where no status comes any more, it goes by the last: t is for how long that has been damped, so that what is
+    taken away is exactly what the arm had, and nothing is ever driven backwards by a speed that is long gone.
 
     A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
     is called. At first it waits until the status is sound, and takes over by itself. What is sent is always finite and
@@ -326,21 +326,24 @@ class TorqueGuard(LeafSystem):
         return EventStatus.Succeeded()
 
     def _calc_safe_torque(self, context: Context, output: BasicVector) -> None:
-        phase, _, _, authority = self._memory_of(context)
+        phase, _, phase_time, authority = self._memory_of(context)
         is_active = phase in (Phase.RAMPING, Phase.RUNNING)
         torque = np.zeros(self._num_joints)
         if is_active and not self._found.Eval(context):
             torque = authority * self._torque_port.Eval(context)
             if authority < 1.0:
-                torque = torque + (1.0 - authority) * self._damping_torque(context)
-        elif is_active or phase == Phase.DAMPING:
-            torque = self._damping_torque(context)
+                torque = torque + (1.0 - authority) * self._damping_torque(context, np.inf)
+        elif is_active:
+            torque = self._damping_torque(context, 0.0)
+        elif phase == Phase.DAMPING:
+            torque = self._damping_torque(context, phase_time + self._period)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
 
-    def _damping_torque(self, context: Context) -> np.ndarray:
+    def _damping_torque(self, context: Context, damped: float) -> np.ndarray:
+        """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s]."""
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = self._state_port.Eval(context)[self._num_joints :]
-        return damping_torque(M, v, self._limits.decay_time, float(self._status_age_port.Eval(context)[0]))
+        return damping_torque(M, v, self._limits.decay_time, min(float(self._status_age_port.Eval(context)[0]), damped))
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         phase, fault, _, _ = self._memory_of(context)

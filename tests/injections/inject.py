@@ -1,0 +1,51 @@
+"""Lets everything that can happen on a bus happen to a moving arm, and checks the robot's side: `make injections`.
+
+No part of the test suite, which has one of each kind. In turn and not by the wall's clock, so that the same seed gives
+the same injections and the same torques, bit for bit.
+"""
+
+import argparse
+import sys
+import time
+from collections import defaultdict
+
+import numpy as np
+
+from tests.injections.bus import Bus, Seen
+from tests.injections.faults import Injection, all_kinds
+
+
+def main() -> int:
+    """Prints a row for each kind; 1 if anything was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--injections", type=int, default=500, help="how many at least")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    rng, bus = np.random.default_rng(arguments.seed), Bus()
+    found: dict[str, list[tuple[Injection, Seen]]] = defaultdict(list)
+    started, total = time.monotonic(), 0
+    while total < arguments.injections:
+        for injection in all_kinds(rng):
+            seen = injection.inject(bus)
+            found[injection.kind].append((injection, seen))
+            total += 1
+            for wrong in seen.wrong:
+                print(f"WRONG  {injection.kind}, {injection.words}: {wrong}", flush=True)
+    print(f"{'kind':<22}{'injected':>9}{'stopped':>9}{'borne':>7}{'wrong':>7}   detected after [ms]   faults")
+    for kind, rows in found.items():
+        times = [1000.0 * seen.detected for _, seen in rows if seen.detected is not None]
+        faults = sorted({seen.fault for _, seen in rows if seen.fault})
+        between = f"{min(times):.0f} to {max(times):.0f}" if times else ""
+        wrong = sum(bool(seen.wrong) for _, seen in rows)
+        print(
+            f"{kind:<22}{len(rows):>9}{len(times):>9}{len(rows) - len(times):>7}{wrong:>7}   {between:<20}  {', '.join(faults)}"
+        )
+    wrong = sum(bool(seen.wrong) for rows in found.values() for _, seen in rows)
+    slowest = max(seen.after for rows in found.values() for _, seen in rows)
+    print(f"{total} injections, {wrong} of them with something wrong, in {time.monotonic() - started:.0f} s;", end=" ")
+    print(f"the fastest joint of any arm 50 ms after a detection: {slowest:.3f} rad/s")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
