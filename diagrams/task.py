@@ -1,6 +1,8 @@
 """What a task has to build, so that one environment class runs them all."""
 
-from collections.abc import Callable, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,19 +55,30 @@ def _nothing_to_randomize(context: Context, rng: np.random.Generator, options: M
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A half turn or a mirror under which a task stays what it is, up to small things such as demonstrations' means.
+    """Turns and mirrors under which a task stays what it is, up to small things such as demonstrations' means.
 
     Args:
-        observation: (n,) of ±1, what each observed number is multiplied by.
-        action: (A,) of ±1, what each action is multiplied by.
+        observations: K sides from which an observation can be seen, (K, n, n): each exchanges numbers or their signs.
+        actions: and an action, (K, A, A).
     """
 
-    observation: tuple[float, ...]
-    action: tuple[float, ...]
+    observations: np.ndarray
+    actions: np.ndarray
 
     def __post_init__(self):
-        if not set(self.observation) | set(self.action) <= {-1.0, 1.0}:
-            raise ValueError("a symmetry multiplies by 1 or -1")
+        if len(self.observations) != len(self.actions):
+            raise ValueError("a symmetry has as many sides of the action as of the observation")
+        for side in (*self.observations, *self.actions):
+            exchanged = np.abs(side)
+            if not (
+                np.isin(side, (-1, 0, 1)).all() and (exchanged.sum(0) == 1).all() and (exchanged.sum(1) == 1).all()
+            ):
+                raise ValueError("a symmetry exchanges numbers or their signs")
+
+    @classmethod
+    def of_signs(cls, observation: Sequence[float], action: Sequence[float]) -> Symmetry:
+        """One other side, from which each observed number (n,) and each action (A,) is multiplied by 1 or −1."""
+        return cls(np.diag(np.asarray(observation, float))[None], np.diag(np.asarray(action, float))[None])
 
 
 @dataclass(frozen=True)
@@ -112,6 +125,7 @@ class TaskDiagram:
             pushes the robot. None where a task has no such thing.
         meshcat: where the diagram publishes to, for `render_mode="human"`.
         symmetry: of the task, where it has one; a learner may learn from what it saw, seen from the other side.
+        near_symmetry: the same, with sides from which only most of an episode stays what it is.
         declaration: the `Task` that this was assembled of, where it was.
     """
 
@@ -125,6 +139,7 @@ class TaskDiagram:
     push: Callable[[Context, np.ndarray], None] | None = None
     meshcat: Meshcat | None = None
     symmetry: Symmetry | None = None
+    near_symmetry: Symmetry | None = None
     declaration: Any = None
 
     def __post_init__(self):
@@ -135,10 +150,11 @@ class TaskDiagram:
             raise ValueError(f"the task's diagram '{self.diagram.get_name()}' exports no port {', '.join(missing)}")
         if self.num_steps < 1 or not self.control_period > 0:
             raise ValueError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
-        if self.symmetry is not None and (
-            np.shape(self.symmetry.observation) != self.observation_space.shape
-            or len(self.symmetry.action) != self.diagram.GetInputPort("action").size()
-        ):
-            raise ValueError("a symmetry has a sign for every observed number and one for every action")
+        for symmetry in (self.symmetry, self.near_symmetry):
+            if symmetry is not None and (
+                symmetry.observations.shape[1:] != 2 * self.observation_space.shape
+                or symmetry.actions.shape[1:] != 2 * (self.diagram.GetInputPort("action").size(),)
+            ):
+                raise ValueError("a symmetry is of every observed number and of every action")
         if len(self.ledger_fields) != self.diagram.GetOutputPort("ledger").size():
             raise ValueError(f"the ledger has {self.diagram.GetOutputPort('ledger').size()} fields, not the named ones")

@@ -24,6 +24,7 @@ from .measured_pose import MeasuredPose as MeasuredPose
 from .meshcat_device import MeshcatDevice as MeshcatDevice
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
+from .pose_wrench import PoseWrench as PoseWrench
 from .recorder import Recorder as Recorder
 from .recorder import Recording as Recording
 from .relative_poses import RelativePoses as RelativePoses

@@ -382,15 +382,18 @@ def bench(
     what: Annotated[str, _arg("What is measured: {benchmarks}.", "WHAT", "benchmarks")],
     task: Annotated[str | None, _arg("Whose training is measured: {tasks}.", "TASK", "tasks")] = None,
     env: Env = None,
+    picture: Annotated[Path | None, _opt("Where a picture of the time steps' errors is written.")] = None,
     as_json: Json = False,
 ) -> None:
     """Measure how fast the primitive, the simulation or a learner is here, or where a training run's time goes.
+
+    Of the simulation's time_step it measures the error, too.
 
     It takes a minute or two.
     """
     from guiderail.tools.benchmarks import run_benchmark
 
-    result, show = run_benchmark(what, task=task, environment=_environment(env))
+    result, show = run_benchmark(what, picture=picture, task=task, environment=_environment(env))
     typer.echo(json.dumps(result)) if as_json else show(result)
 
 

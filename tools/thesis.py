@@ -89,8 +89,7 @@ THESIS = {
             _SIMULATED,
             ("five demonstrations of a script (thesis: of a hand)", _always),
             (
-                f"a plug whose mouth leads in by a chamfer of {BncDimensions().mouth_chamfer / MM:g} mm "
-                "(thesis: no dimensions are given)",
+                "a plug whose mouth leads in by a chamfer of {mouth_chamfer_mm:g} mm (thesis: no dimensions are given)",
                 _always,
             ),
             ("a cost of force in units of 10 N and 0.5 Nm (thesis: none are given)", _always),
@@ -136,7 +135,7 @@ THESIS = {
 # A setting of the learner that the thesis has no word for, and what it does.
 _ADDITIONS: tuple[tuple[str, Callable[[Preset], bool], str], ...] = (
     ("greedy_share", lambda p: p.greedy_share > 0, "{greedy_share:.0%} of the episodes are greedy"),
-    ("symmetry", lambda p: p.symmetry, "what was seen is also learned from as seen from the other side"),
+    ("symmetry", lambda p: p.symmetry, "what was seen is also learned from as seen from other sides"),
     (
         "selection_window",
         lambda p: p.selection_window > 0,
@@ -169,7 +168,8 @@ def differences(config: RunConfig) -> list[str]:
         if not any(_same(environment[name], value) for value in values):
             found.append(f"{_words(name)} {_value(environment[name])} (thesis: {_either(values)})")
     found += _learner_differences(config, setting)
-    known = {"kappa": 1.0, **environment}
+    chamfer = environment.get("mouth_chamfer", BncDimensions().mouth_chamfer)
+    known = {"kappa": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
     found += [words.format(**known) for words, holds in setting.remarks if holds(environment)]
     return found
 

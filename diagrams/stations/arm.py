@@ -11,11 +11,11 @@ from pydrake.multibody.tree import FixedOffsetFrame, Frame, JointActuator, Model
 from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import MatrixGain
 
-from guiderail.diagrams.options import Options
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
+    ContactOptions,
     Impedance,
     Station,
     add_workcell_plant,
@@ -243,7 +243,7 @@ def add_gripper_control(
     return command.get_position_input_port(), state.get_output_port()
 
 
-class ArmOptions(Options):
+class ArmOptions(ContactOptions):
     """Of an arm's station."""
 
     robot: str = Field(DEFAULT_ROBOT, description="which arm")
@@ -271,7 +271,7 @@ class ArmStation(Station):
         self,
         workcell: Workcell,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
-        time_step: float = PLANT_PERIOD,
+        time_step: float | None = None,
         wrench_time_constant: float = 0.01,
         *,
         robot: Robot | str = DEFAULT_ROBOT,
@@ -281,7 +281,8 @@ class ArmStation(Station):
         Args:
             workcell: what stands in the world and what is held.
             impedance: at the tool centre.
-            time_step: of the plant and of the controller [s].
+            time_step: of the plant and of the controller [s]; half a rails' plant's for a gripper, whose fingers would
+                sink into what they hold, and the rails' plant's for other tools, unless given.
             wrench_time_constant: of the wrench sensor's low-pass filter [s].
             robot: which arm, or its name: see `robot_names()`.
             end_effector: which tool, or its name: see `end_effector_names()`.
@@ -289,6 +290,8 @@ class ArmStation(Station):
         super().__init__()
         builder = DiagramBuilder()
         end_effector = find_end_effector(end_effector)
+        if time_step is None:
+            time_step = PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD
         self._known = KnownArm(workcell, robot, end_effector)
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)

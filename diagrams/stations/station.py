@@ -35,11 +35,13 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+from pydantic import Field, field_validator
 from pydrake.geometry import SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import Frame, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
+from guiderail.diagrams.options import Number, Options
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
@@ -52,8 +54,32 @@ OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "holding")
 """The ports of every station."""
 
 POSE_SIZE = 6
-PLANT_PERIOD = exact_period(0.005)  # [s]
-CONTROL_PERIOD = 4 * PLANT_PERIOD  # [s]
+CONTROL_PERIOD = 4 * exact_period(0.005)  # [s]
+# `guiderail bench time_step` shows by how much a longer and a shorter one are wrong, and what they cost.
+PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
+MAX_HALVINGS = 7
+
+
+class ContactOptions(Options):
+    """Of a station whose plant simulates an insertion's contact."""
+
+    time_step: Number | None = Field(
+        None, gt=0, description="of the plant [s]: the control period, or half, a quarter, an eighth … of it"
+    )
+
+    @field_validator("time_step")
+    @classmethod
+    def _part_of_control_period(cls, value: float | None) -> float | None:
+        if value is None:
+            return None
+        halvings = np.log2(CONTROL_PERIOD / value)
+        if abs(halvings - round(halvings)) > 1e-6 or not 0 <= round(halvings) <= MAX_HALVINGS:
+            raise ValueError(
+                f"it is the control period, {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} "
+                "times halved"
+            )
+        # Whose multiples are exact: see `exact_period`.
+        return CONTROL_PERIOD / 2 ** round(halvings)
 
 
 @dataclass(frozen=True)

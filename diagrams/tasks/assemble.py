@@ -228,6 +228,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         push=_push(station) if task.pushable else None,
         meshcat=meshcat,
         symmetry=task.symmetry(),
+        near_symmetry=task.near_symmetry(),
         declaration=task,
     )
 

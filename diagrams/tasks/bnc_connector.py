@@ -16,9 +16,15 @@ from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewp
 from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, BncWorkcell
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import Symmetry
-from guiderail.diagrams.tasks.bnc_observation import LEAST_FORCE, OBSERVATIONS, half_turn, observed
+from guiderail.diagrams.tasks.bnc_observation import (
+    LEAST_FORCE,
+    OBSERVATIONS,
+    half_turn,
+    observed,
+    sides_of_the_rim,
+)
 from guiderail.diagrams.tasks.bnc_options import HARD, BncOptions
-from guiderail.diagrams.tasks.bnc_rewards import reward_terms
+from guiderail.diagrams.tasks.bnc_rewards import REWARDS, reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
@@ -54,12 +60,12 @@ def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
 
 @register_task("BncConnector")
 class BncConnector(InsertionTask):
-    """Insert, align and lock: "sparse" is the thesis's reward (4.27, 4.28), "shaped" adds the depth gained."""
+    """Insert, align and lock: "sparse" is the thesis's reward (4.27, 4.28); "shaped" and "aligned" add to it."""
 
     Options = BncOptions
     options: BncOptions
     workpiece, fixture = "plug", "jack"
-    rewards = ("sparse", "shaped")
+    rewards = REWARDS
     observations = OBSERVATIONS
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
     defaults = {"guidance": "skgrl", "station": "rails", "hold": 10, "explored": (0, 1), "history_variance": RHO}
@@ -112,7 +118,13 @@ class BncConnector(InsertionTask):
         """Half a turn about the jack's axis."""
         explored = self.choice.values["explored"]
         action = HALF_TURN if explored is None else HALF_TURN[list(explored)]
-        return Symmetry(half_turn(self.choice.observation), tuple(action))
+        return Symmetry.of_signs(half_turn(self.choice.observation), action)
+
+    def near_symmetry(self) -> Symmetry:
+        """Quarter turns and mirrors too: alike as long as the plug stands on the rim, which has no sides."""
+        explored = self.choice.values["explored"]
+        sides = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if explored is None else explored)
+        return self.symmetry() if sides is None else Symmetry(*sides)
 
     def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Moves the jack by (x, y) and its turn, the plug by (x, y) and its tilt about x and y, where they have one."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
+from scipy.linalg import block_diag
 
 from guiderail.diagrams.observation import Observed
 from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, HALF_TURN_OF_WRENCH
@@ -39,3 +42,31 @@ def half_turn(observation: str) -> tuple[float, ...]:
     """What half a turn about the jack's axis multiplies an observation by."""
     across = () if observation == "state" else (-1.0,) * 4
     return (1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH, *across)
+
+
+def sides_of_the_rim(observation: str, explored: Iterable[int]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Seven other sides from which a plug on the rim feels the same: quarter turns about the axis, and their mirrors.
+
+    Vectors across the axis turn; a mirror also changes the sign of torques and tilts. What is about the axis stays.
+
+    Args:
+        observation: one of `OBSERVATIONS`.
+        explored: the outputs that actions move.
+
+    Returns:
+        Of observations (7, n, n) and of actions (7, A, A); None where actions move x and not y, or one tilt alone.
+    """
+    quarter, mirror = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
+    turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
+    observations, actions, outputs = [], [], list(explored)
+    for across in [*turns[1:], *(turn @ mirror for turn in turns)]:
+        axial = np.linalg.det(across).round() * across
+        # A pose has Ry before Rx.
+        pose = block_diag(across, np.eye(2), axial[::-1, ::-1])
+        wrench = block_diag(across, np.eye(1), axial, np.eye(1))
+        further = () if observation == "state" else (across, across)
+        observations.append(block_diag(np.eye(1), pose, wrench, *further))
+        actions.append(pose[np.ix_(outputs, outputs)])
+    if any((np.abs(action).sum(0) != 1).any() for action in actions):
+        return None
+    return np.array(observations), np.array(actions)

@@ -16,17 +16,27 @@ TERMINAL = {"success": 60.0, "collision": -50.0}
 # wiggles until it drops is worth as much as one that feels where to go, and fails now and then. From the start to the
 # lock it is 15.6 mm, the last 5.5 of them in the jack.
 DEPTH_REWARD = 5.0
+# [1/mm] of coming nearer to the jack's axis. On the rim, the depth says nothing of where it is better.
+ALIGNMENT_REWARD = 5.0
+
+REWARDS = ("sparse", "shaped", "aligned")
 
 
 def reward_terms(reward: str, num_actions: int) -> list[RewardTerm]:
-    """ "sparse" is the thesis's reward, "shaped" adds the depth gained."""
+    """ "sparse" is the thesis's reward, "shaped" adds the depth gained, "aligned" nearness to the jack's axis, too.
+
+    Where the axis is, only a simulation knows: it is rewarded and not observed. What is added is gained from step to
+    step, a difference of potentials.
+    """
     terms = [
         RewardTerm("action_cost", {"action": num_actions}, lambda action: -ACTION_WEIGHT * float(action @ action)),
         RewardTerm("force_cost", {"wrench": 6}, _force_cost),
         RewardTerm("terminal_reward", {"termination": 1}, _terminal_reward),
     ]
-    if reward == "shaped":
+    if reward in ("shaped", "aligned"):
         terms.append(RewardTerm("depth", {"plug": 6, "last_plug": 6}, _depth_gained))
+    if reward == "aligned":
+        terms.append(RewardTerm("alignment", {"plug": 6, "last_plug": 6}, _alignment_gained))
     return terms
 
 
@@ -41,3 +51,8 @@ def _terminal_reward(termination: np.ndarray) -> float:
 
 def _depth_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
     return DEPTH_REWARD * float(last_plug[2] - plug[2]) / MM
+
+
+def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
+    nearer = np.hypot(*last_plug[:2]) - np.hypot(*plug[:2])
+    return ALIGNMENT_REWARD * float(nearer) / MM

@@ -140,8 +140,12 @@ class Task(ABC):
         """What ends an episode; the first that holds counts."""
 
     def symmetry(self) -> Symmetry | None:
-        """A half turn or a mirror under which the task stays what it is."""
+        """Turns and mirrors under which the task stays what it is."""
         return None
+
+    def near_symmetry(self) -> Symmetry | None:
+        """More of them, from which only most of an episode stays what it is; the exact ones unless there are more."""
+        return self.symmetry()
 
     # How an episode begins.
 

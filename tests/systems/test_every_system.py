@@ -81,6 +81,7 @@ def built():
         systems.MeasuredPose(plant, body, RigidTransform()),
         systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
         systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
+        systems.PoseWrench(),
         systems.Recorder({"u": 2}, 4, PERIOD),
         systems.RelativePoses(plant, [body], other),
         systems.Residual(np.ones(2)),

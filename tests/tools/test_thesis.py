@@ -65,7 +65,7 @@ def test_kgrl_has_no_history_to_differ_in():
     ("setting", "words"),
     [
         ({"greedy_share": 0.8}, "80% of the episodes are greedy"),
-        ({"symmetry": True}, "seen from the other side"),
+        ({"symmetry": True}, "seen from other sides"),
         ({"selection_window": 8}, "checkpoint selection"),
         ({"learning_rate": 3e-4}, "learning rate 0.0003 (thesis: 0.001)"),
         ({"discount": 0.99}, "discount of a control step 0.99 (thesis: 0.995)"),
@@ -89,3 +89,8 @@ def test_pouring_names_its_weights_and_its_speed():
     sparse = told("Pouring", {"reward": "sparse"})
     assert any("1.7 times" in one for one in sparse)
     assert not any("equation 3.7" in one for one in sparse)
+
+
+def test_the_connectors_dimensions_are_the_runs_own():
+    told = " ".join(differences(configure("BncConnector", {"difficulty": "hard"})))
+    assert "chamfer of 0.1 mm" in told

@@ -3,33 +3,43 @@
 import sys
 from collections.abc import Callable, Collection, Iterator
 from importlib import import_module
+from pathlib import Path
 from typing import Any, TypeVar
 
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 
 Item = TypeVar("Item")
-BENCHMARKS = ("primitive", "simulation", "saving", "learner", "training")
+BENCHMARKS = ("primitive", "simulation", "time_step", "saving", "learner", "training")
 OF_A_TASK = ("training",)  # those that are told which task, and how it is set up
+DRAWN = ("time_step",)  # those that can be drawn
 
 
-def run_benchmark(what: str, **told_of: Any) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
+def run_benchmark(
+    what: str, *, picture: Path | None = None, **told_of: Any
+) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
     """What one of `BENCHMARKS` measured, with its progress on standard error; and what shows it to a person.
 
     Args:
         what: its name.
+        picture: where a picture of it is written, if it can be drawn.
         told_of: `task` and `environment`, where it takes them.
 
     Raises:
-        InputError: if there is no such benchmark, or it takes no task.
+        InputError: if there is no such benchmark, it takes no task, or it can't be drawn.
     """
     if what not in BENCHMARKS:
         raise InputError(f"there is no benchmark {what!r}: {did_you_mean(what, BENCHMARKS)}")
     given = {name: value for name, value in told_of.items() if value}
     if given and what not in OF_A_TASK:
         raise InputError(f"the benchmark {what} is of no task: leave {' and '.join(given)} out")
+    if picture is not None and what not in DRAWN:
+        raise InputError(f"the benchmark {what} is printed and not drawn: leave --picture out")
     module = import_module(f"guiderail.tools.benchmarks.{what}")
-    return module.measure(**given), module.show
+    results = module.measure(**given)
+    if picture is not None:
+        module.draw(results, picture)
+    return results, module.show
 
 
 def told(what: Collection[Item], words: str) -> Iterator[Item]:

@@ -125,7 +125,7 @@ class OffPolicyLearner(Learner):
             symmetry: of the task, where it has one; used if the preset says so.
         """
         self.symmetry = symmetry if preset.symmetry else None
-        self._sides = 1 if self.symmetry is None else 2
+        self._sides = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)
         networks: dict[str, Any] = {"net_arch": list(preset.units), "optimizer_kwargs": {"fused": True}}
         if preset.layer_norm:
             networks["activation_fn"] = NormalizedReLU
@@ -239,10 +239,9 @@ class OffPolicyLearner(Learner):
             observation, following = np.moveaxis(observation, -1, 0), np.moveaxis(following, -1, 0)
         seen, did, then = [observation], [action[0]], [following]
         if self.symmetry is not None:
-            signs = np.array(self.symmetry.observation)
-            seen.append(signs * observation)
-            did.append(np.array(self.symmetry.action) * action[0])
-            then.append(signs * following)
+            seen.extend(self.symmetry.observations @ observation)
+            did.extend(self.symmetry.actions @ action[0])
+            then.extend(self.symmetry.observations @ following)
         self.model.replay_buffer.add(
             np.array(seen),
             np.array(then),

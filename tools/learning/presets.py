@@ -53,7 +53,9 @@ class Preset:
     ez_greedy_until: Least = 0  # greedy successes in a row after which there are no more; 0 for never
     greedy_share: Share = 0.0  # part of the episodes, evenly spread, that do not explore
     layer_norm: bool = False  # of the hidden layers, before their activation
-    symmetry: bool = False  # remember what was seen as seen from the other side too, where the task has one
+    # Remember what was seen as seen from the other sides too, where the task has any; "near": from those, too, from
+    # which only most of an episode is the same.
+    symmetry: bool | Literal["near"] = False
     selection_window: Least = 0  # greedy successes before and after an actor that select it; 0 takes the last actor
     averaging: Share = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
 

@@ -50,8 +50,9 @@ def train(
     task = cast(Any, env.unwrapped).task
     decisions = config.episodes * -(-task.num_steps // config.hold)  # the most that the run can take
     make_learner = LEARNERS.get(config.learner.algorithm)
+    symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
     learner = make_learner(
-        config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=task.symmetry
+        config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=symmetry
     )
     env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
     if not resume:

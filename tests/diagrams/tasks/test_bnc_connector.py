@@ -98,7 +98,7 @@ def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
 
 
 def test_half_a_turn_of_everything_is_the_same_task(kmp):
-    signs = np.array(kmp.task.symmetry.observation)
+    signs = np.diag(kmp.task.symmetry.observations[0])
     across = signs < 0
     felt = []
     for side in (1.0, -1.0):
@@ -221,3 +221,24 @@ class TestUncertainty:
 def test_refuses_what_makes_no_sense(wrong):
     with pytest.raises(InputError):
         make_env("BncConnector", **wrong)
+
+
+def test_on_the_rim_a_quarter_turn_of_everything_feels_the_same(kmp):
+    """Not exactly so: the demonstrations search the rim one way round."""
+    near = kmp.task.near_symmetry
+    assert len(near.actions) == 7
+    quarter = near.observations[0]
+    felt = []
+    for offset in ((1.0 * MM, 0.5 * MM), (-0.5 * MM, 1.0 * MM)):
+        observations = play(kmp, still(kmp), options={"offset": offset})[3]
+        felt.append(observations[6:14].mean(axis=0))  # while the plug stands on the rim
+    seen, turned = felt
+    torques = slice(10, 12)
+    expected = (quarter @ seen)[torques]
+    assert np.linalg.norm(expected - turned[torques]) < 0.5 * np.linalg.norm(expected)
+
+
+def test_the_near_symmetry_contains_the_exact_one(kmp):
+    exact, near = kmp.task.symmetry, kmp.task.near_symmetry
+    sides = [k for k in range(7) if np.array_equal(near.actions[k], exact.actions[0])]
+    assert any(np.array_equal(near.observations[k], exact.observations[0]) for k in sides)

@@ -108,7 +108,7 @@ def test_the_connector_at_its_hardest_is_searched_for_where_it_may_be(connector)
         radii.append(np.linalg.norm(info["jack_offset"]))
     assert 2.6 * MM <= min(radii) < max(radii) <= 3.0 * MM
     assert connector.observation_space.shape == (17,)
-    assert len(connector.unwrapped.task.symmetry.observation) == 17
+    assert connector.unwrapped.task.symmetry.observations.shape == (1, 17, 17)
 
 
 def test_a_turned_jack_is_turned():

@@ -112,7 +112,7 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
 
 
 def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
-    half_turn = Symmetry((-1.0, -1.0, 1.0), (-1.0, 1.0))
+    half_turn = Symmetry.of_signs((-1.0, -1.0, 1.0), (-1.0, 1.0))
     learner = TqcLearner(preset, Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
     plain = TqcLearner(replace(preset, symmetry=False), Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
     for one in (learner, plain):

@@ -19,6 +19,8 @@ from guiderail.models.errors import InputError
 from guiderail.systems.recorder import Recording
 
 TIMES = CONTROL_PERIOD * np.arange(NUM_STEPS + 1)
+# [s] with which the demonstrations in this package were recorded.
+TIME_STEP = CONTROL_PERIOD / 4
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ SEARCH_SESSION = Session(bnc_search.demonstrator_motions, bnc_search.PATH)
 def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
     """One motion (N, 6) through the rails' impedance, and whether the plug was locked in the end."""
     workcell = BncWorkcell()
-    driven, recording = drive_along(RailsStation(workcell), TIMES, motion)
+    driven, recording = drive_along(RailsStation(workcell, time_step=TIME_STEP), TIMES, motion)
     return recording, workcell.is_locked(workcell.plug_in_locked_frame(driven.station.plant, driven.plant_context))
 
 
