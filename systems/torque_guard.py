@@ -76,11 +76,12 @@ class SafetyLimits:
 class TorqueGuard(LeafSystem):
     """Passes wanted torques on while nothing is wrong; otherwise the arm is brought to rest, and then has no torque.
 
-        τ = clip(a τ_wanted + (1 − a) τ_damping),   τ_damping = −M(q) v exp(−t / T) / T
+        τ = clip(a f τ_wanted + (1 − a) τ_damping)
 
-    a is the authority, which grows from 0 to 1 in the ramp time. Damping takes away all joints' speed with the decay
-    time T. Where no status comes any more, it goes by the last: t is for how long that has been damped, so that what is
-    taken away is exactly what the arm had, and nothing is ever driven backwards by a speed that is long gone.
+    a is the authority, which grows from 0 to 1 in the ramp time. f is 1 for a new status, and 0 for one that is two
+    periods old: what was wanted of an arm that isn't seen would drive it ever faster. τ_damping (`damping_torque`)
+    takes away all joints' speed with the decay time; where no status comes any more, what was seen last is taken away
+    once.
 
     A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
     is called. At first it waits until the status is sound, and takes over by itself. What is sent is always finite and
@@ -330,7 +331,8 @@ class TorqueGuard(LeafSystem):
         is_active = phase in (Phase.RAMPING, Phase.RUNNING)
         torque = np.zeros(self._num_joints)
         if is_active and not self._found.Eval(context):
-            torque = authority * self._torque_port.Eval(context)
+            freshness = np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0)
+            torque = authority * freshness * self._torque_port.Eval(context)
             if authority < 1.0:
                 torque = torque + (1.0 - authority) * self._damping_torque(context, np.inf)
         elif is_active:
@@ -343,7 +345,8 @@ class TorqueGuard(LeafSystem):
         """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s]."""
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = self._state_port.Eval(context)[self._num_joints :]
-        return damping_torque(M, v, self._limits.decay_time, min(float(self._status_age_port.Eval(context)[0]), damped))
+        damped = min(float(self._status_age_port.Eval(context)[0]), damped)
+        return damping_torque(M, v, self._limits.decay_time, period=self._period, damped=damped)
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         phase, fault, _, _ = self._memory_of(context)

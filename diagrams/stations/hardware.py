@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
 from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.manipulation import BuildIiwaControl, IiwaDriver
+from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
@@ -16,7 +19,7 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, Seriali
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.options import Number, Options
-from guiderail.diagrams.stations.arm import KnownArm, add_arm, add_controller
+from guiderail.diagrams.stations.arm import ArmModel, KnownArm, add_arm, add_controller
 from guiderail.diagrams.stations.deputy import WordSerializer, word_channel
 from guiderail.diagrams.stations.driver import MICROSECOND, Driver
 from guiderail.diagrams.stations.registry import register_station
@@ -206,6 +209,7 @@ class HardwareStation(Station):
         robot = find_robot(robot)
         self.driver = driver = find_driver(robot)
         self.lcm = bus = lcm or DrakeLcm(lcm_url)
+        self.lcm_url = lcm_url
         self.period = period = driver.period if period is None else period
         self.known = known = KnownArm(workcell, robot, end_effector)
         self.limits = limits = limits or safety_limits(known.plant, driver)
@@ -410,6 +414,7 @@ class SimulatedIiwa(Diagram):
         lcm: DrakeLcmInterface,
         time_step: float = IIWA_DRIVER.period,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
+        directives: Sequence[ModelDirective] = (),
     ):
         """
         Args:
@@ -417,13 +422,24 @@ class SimulatedIiwa(Diagram):
             lcm: the bus.
             time_step: of the plant [s], a divisor of the status's period.
             end_effector: which tool is bolted on, or its name; a gripper has a driver of its own, and stays open here.
+            directives: what stands around them.
+
+        Raises:
+            InputError: if the directives can't be followed.
         """
         super().__init__()
         builder = DiagramBuilder()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm))
-        self.plant, self.scene_graph, self.arm = add_workcell_plant(
-            builder, workcell, time_step, lambda plant: add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
-        )
+
+        def add(plant: MultibodyPlant) -> ArmModel:
+            arm = add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
+            try:
+                ProcessModelDirectives(ModelDirectives(directives=list(directives)), Parser(plant))
+            except RuntimeError as error:
+                raise InputError(f"what should stand around the robot can't be added: {error}") from error
+            return arm
+
+        self.plant, self.scene_graph, self.arm = add_workcell_plant(builder, workcell, time_step, add)
         self.known = KnownArm(workcell, IIWA14, end_effector)
         BuildIiwaControl(
             builder,

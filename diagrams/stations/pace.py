@@ -80,7 +80,8 @@ class Gaps:
 def hurry() -> bool:
     """Asks the system to serve this process before others, as a robot waits for it; whether it will."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(URGENCY))
+        # Processes that this one starts are as any other.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(URGENCY))
     except (AttributeError, OSError):
         return False
     return True

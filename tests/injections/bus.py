@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,7 +22,8 @@ from guiderail.tools.operate.serve_iiwa import START
 
 PERIOD = IIWA_DRIVER.period
 STOPPED_WITHIN = 0.05  # [s] of a fault's detection
-STANDSTILL = 0.05  # [rad/s] of the fastest joint
+STANDSTILL = 0.05  # [rad/s] of the fastest joint, which was up to 1 rad/s fast
+UNSEEN = 0.15  # [rad/s], where it was stopped without a status to go by
 RADIUS, TURN, FREQUENCY = 0.01, 0.15, 1.0  # [m], [rad], [Hz] of the motion during which faults happen
 WORDS = word_channel(IIWA_DRIVER.command_channel)
 
@@ -198,22 +200,21 @@ class Bus:
             if self.phase == Phase.RUNNING and self.fault == Fault.NONE:
                 break
             if self.phase == Phase.OFF:
-                try:
+                with contextlib.suppress(InputError):  # while something is wrong still
                     self.station.resume(self.simulator.get_mutable_context())
-                except InputError:
-                    pass  # something is wrong still
             self.one()
         else:
             raise AssertionError(f"the arm does not go on: {self.phase.name}, {self.fault.name}")
         self.go(seconds)
 
-    def watch(self, seconds: float, mend: Callable[[], None], lasts: float) -> Seen:
+    def watch(self, seconds: float, mend: Callable[[], None], lasts: float, standstill: float = STANDSTILL) -> Seen:
         """What comes of a fault that has just begun.
 
         Args:
             seconds: to watch.
             mend: ends the fault.
             lasts: after how long [s].
+            standstill: what counts as such [rad/s].
         """
         seen, begun, self.torques = Seen(), self.step, []
         is_mended = False
@@ -240,7 +241,7 @@ class Bus:
         for torque in self.torques:
             if len(torque) != len(self.limits) or not (np.abs(torque) <= self.limits + 1e-12).all():
                 seen.wrong.append(f"sent {torque}")
-        if seen.after > STANDSTILL:
+        if seen.after > standstill:
             seen.wrong.append(f"{seen.after:.3f} rad/s after {STOPPED_WITHIN} s")
         return seen
 

@@ -34,7 +34,8 @@ class Injection:
         """Lets it happen to an arm that is moving, checks what comes of it, and that the arm then goes on."""
         bus.run_in()
         self.begin(bus)
-        seen = bus.watch(self.lasts + 0.35, lambda: self.end(bus), self.lasts)
+        standstill = buses.UNSEEN if self.kind.startswith("status") else buses.STANDSTILL
+        seen = bus.watch(self.lasts + 0.35, lambda: self.end(bus), self.lasts, standstill)
         if self.stops is not None and self.stops != (seen.detected is not None):
             seen.wrong.append("not detected" if self.stops else f"stopped the arm: {seen.fault}")
         try:

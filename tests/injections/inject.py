@@ -8,11 +8,13 @@ import argparse
 import sys
 import time
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 
-from tests.injections.bus import Bus, Seen
-from tests.injections.faults import Injection, all_kinds
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from injections.bus import Bus, Seen
+from injections.faults import Injection, all_kinds
 
 
 def main() -> int:
@@ -37,9 +39,8 @@ def main() -> int:
         faults = sorted({seen.fault for _, seen in rows if seen.fault})
         between = f"{min(times):.0f} to {max(times):.0f}" if times else ""
         wrong = sum(bool(seen.wrong) for _, seen in rows)
-        print(
-            f"{kind:<22}{len(rows):>9}{len(times):>9}{len(rows) - len(times):>7}{wrong:>7}   {between:<20}  {', '.join(faults)}"
-        )
+        counts = f"{len(rows):>9}{len(times):>9}{len(rows) - len(times):>7}{wrong:>7}"
+        print(f"{kind:<22}{counts}   {between:<20}  {', '.join(faults)}")
     wrong = sum(bool(seen.wrong) for rows in found.values() for _, seen in rows)
     slowest = max(seen.after for rows in found.values() for _, seen in rows)
     print(f"{total} injections, {wrong} of them with something wrong, in {time.monotonic() - started:.0f} s;", end=" ")

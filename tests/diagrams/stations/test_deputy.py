@@ -67,7 +67,8 @@ def test_damps_within_the_limits_where_commands_stop_then_says_no_torque_and_fal
     bus.status(velocities=10.0 * MOVING, steps=2)
     assert bus.deputy.duty == Duty.DAMPING
     M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
-    wanted = -(M @ (10.0 * MOVING)) / bus.limits.decay_time
+    decay_time = bus.limits.decay_time
+    wanted = -(M @ (10.0 * MOVING)) * (1.0 - np.exp(-PERIOD / decay_time)) / PERIOD
     np.testing.assert_allclose(bus.heard[-1], np.clip(wanted, -np.array(bus.limits.torque), bus.limits.torque))
     assert (np.abs(wanted) > bus.limits.torque).any()
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
