@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench docs kills newest clean
+.PHONY: demo test lint bench docs kills injections newest clean
 
 demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
@@ -22,6 +22,11 @@ lint: $(VENV)/.ready
 # Minutes each, and no part of `make test`: runs that are killed at random, and the newest versions of everything.
 kills: $(VENV)/.ready
 	$(BIN)/python tests/kills/kill.py --kills 40
+
+# Faults on a robot's bus, in turn and then with real processes that are killed: the robot's side is judged.
+injections: $(VENV)/.ready
+	$(BIN)/python tests/injections/inject.py --injections 500
+	$(BIN)/python tests/injections/processes.py
 
 newest:
 	.ci/newest python3.12

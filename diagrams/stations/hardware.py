@@ -10,7 +10,7 @@ from pydantic import Field
 from pydrake.common.value import Value
 from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.manipulation import BuildIiwaControl, IiwaDriver
-from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, ProcessModelDirectives
+from pydrake.multibody.parsing import ModelDirective
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
@@ -33,6 +33,7 @@ from guiderail.diagrams.stations.station import (
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import MISSED, StatusLimits
+from guiderail.models.parsing import follow_directives
 from guiderail.models.registry import did_you_mean
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.panda import PANDA
@@ -433,10 +434,7 @@ class SimulatedIiwa(Diagram):
 
         def add(plant: MultibodyPlant) -> ArmModel:
             arm = add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
-            try:
-                ProcessModelDirectives(ModelDirectives(directives=list(directives)), Parser(plant))
-            except RuntimeError as error:
-                raise InputError(f"what should stand around the robot can't be added: {error}") from error
+            follow_directives(plant, directives)
             return arm
 
         self.plant, self.scene_graph, self.arm = add_workcell_plant(builder, workcell, time_step, add)
