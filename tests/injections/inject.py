@@ -31,8 +31,17 @@ def main() -> int:
             seen = injection.inject(bus)
             found[injection.kind].append((injection, seen))
             total += 1
+            if total % 100 == 0:
+                table(found)
             for wrong in seen.wrong:
                 print(f"WRONG  {injection.kind}, {injection.words}: {wrong}", flush=True)
+    wrong = table(found)
+    print(f"in {time.monotonic() - started:.0f} s")
+    return 1 if wrong else 0
+
+
+def table(found: dict[str, list[tuple[Injection, Seen]]]) -> int:
+    """Prints a row for each kind; how many had something wrong."""
     print(f"{'kind':<22}{'injected':>9}{'stopped':>9}{'borne':>7}{'wrong':>7}   detected after [ms]   faults")
     for kind, rows in found.items():
         times = [1000.0 * seen.detected for _, seen in rows if seen.detected is not None]
@@ -41,11 +50,12 @@ def main() -> int:
         wrong = sum(bool(seen.wrong) for _, seen in rows)
         counts = f"{len(rows):>9}{len(times):>9}{len(rows) - len(times):>7}{wrong:>7}"
         print(f"{kind:<22}{counts}   {between:<20}  {', '.join(faults)}")
-    wrong = sum(bool(seen.wrong) for rows in found.values() for _, seen in rows)
-    slowest = max(seen.after for rows in found.values() for _, seen in rows)
-    print(f"{total} injections, {wrong} of them with something wrong, in {time.monotonic() - started:.0f} s;", end=" ")
-    print(f"the fastest joint of any arm 50 ms after a detection: {slowest:.3f} rad/s")
-    return 1 if wrong else 0
+    everything = [seen for rows in found.values() for _, seen in rows]
+    wrong = sum(bool(seen.wrong) for seen in everything)
+    print(f"{len(everything)} injections, {wrong} of them with something wrong;", end=" ")
+    slowest = max(seen.after for seen in everything)
+    print(f"the fastest joint of any arm 50 ms after a detection: {slowest:.3f} rad/s", flush=True)
+    return wrong
 
 
 if __name__ == "__main__":
