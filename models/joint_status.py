@@ -40,7 +40,7 @@ FAULTS = {
     Fault.NONE: "none",
     Fault.NO_STATUS: "no status has come, or not for long enough",
     Fault.STALE: "the status is old: it stopped, or comes late",
-    Fault.OUT_OF_ORDER: "a status is older than the one before it",
+    Fault.OUT_OF_ORDER: "a status is much older than the one before it: the robot's clock was set back",
     Fault.FUTURE: "a status is from the future: the robot's clock has jumped",
     Fault.MALFORMED: "a status can't be read",
     Fault.WRONG_SIZE: "a status is of another number of joints",
@@ -114,7 +114,7 @@ class StatusLimits:
 
     Args:
         velocity: of each joint, beyond which nothing moves (n,) [rad/s], positive: what positions may change by.
-        max_age: beyond which a status is stale [s], positive. Some of them may be lost on the way.
+        max_age: beyond which a status is stale [s], positive. Some of them may be lost on the way, or overtaken.
         max_lead: by which a status may be ahead of this clock [s], positive.
         position_jump: beyond what the velocity explains [rad], positive.
         velocity_jump: from one status to the next, and beyond what the positions' change explains [rad/s], positive; a
@@ -186,14 +186,15 @@ def judge_status(status: JointStatus | None, last: Heard, now: float, limits: St
         return Fault.NOT_FINITE
     if not np.isfinite(last.time):
         return Fault.NONE
-    is_repeated = status.time == last.time and np.array_equal(values, last.values)
-    if status.time <= last.time and not is_repeated:
+    if last.time - status.time > limits.max_age:
         return Fault.OUT_OF_ORDER
     age = now - (status.time + last.offset)
     if age < -limits.max_lead:
         return Fault.FUTURE
     if age > limits.max_age:
         return Fault.STALE
+    if status.time <= last.time:
+        return Fault.NONE  # it comes again, or was overtaken on its way: nothing is made of it
     change = np.abs(values - last.values)
     reachable = limits.position_jump + np.array(limits.velocity) * (status.time - last.time)
     if (change[:num_joints] > reachable).any():

@@ -144,7 +144,8 @@ class StatusWatchdog(LeafSystem):
         if status is None or fault in (Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE):
             return _Verdict(fault, False, believed)
         newest = status.values()
-        is_new = status.time != last.time or not np.array_equal(newest, values)
+        is_overtaken = status.time <= last.time and not fault
+        is_new = not is_overtaken and (status.time != last.time or not np.array_equal(newest, values))
         return _Verdict(fault, is_new, newest if is_new and fault in _SOUND else believed)
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:

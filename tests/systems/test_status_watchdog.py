@@ -74,7 +74,7 @@ def test_believes_nobody_before_the_settling_time():
 
 
 WRONG = {
-    Fault.OUT_OF_ORDER: lambda sound: replace(sound, time=sound.time - 3 * PERIOD),
+    Fault.OUT_OF_ORDER: lambda sound: replace(sound, time=sound.time - 1.0),
     Fault.FUTURE: lambda sound: replace(sound, time=sound.time + 1.0),
     Fault.MALFORMED: lambda sound: UNREADABLE,
     Fault.WRONG_SIZE: lambda sound: replace(sound, velocities=np.zeros(3)),
@@ -219,3 +219,26 @@ def test_the_limits_follow_from_the_rate():
     assert (limits.max_age, limits.max_lead, limits.max_gap) == (0.03, 0.03, 0.03)
     with pytest.raises(InputError):
         StatusLimits((1.0,), max_gap=0.0)
+
+
+def test_a_speed_with_which_nothing_moves_is_never_believed():
+    """The first such status is a jump; the ones after it agree with each other, and with no motion."""
+    watched = Watched().settle()
+    before = watched.state
+    for _ in range(5):
+        sound = watched.sound()
+        assert watched.check(replace(sound, velocities=sound.velocities + 3.0)) == Fault.VELOCITY_JUMP
+        np.testing.assert_array_equal(watched.state[2:], before[2:])
+
+
+def test_a_status_that_was_overtaken_counts_as_none():
+    watched = Watched().settle()
+    late = watched.sound()
+    watched.check(watched.sound())
+    newest = watched.sound()
+    watched.check(newest)
+    changed = replace(late, external_torque=late.external_torque + 50.0)
+    assert watched.check(changed) == Fault.NONE
+    np.testing.assert_array_equal(watched.state, newest.values()[:4])
+    assert watched.age > 0.0
+    assert watched.check(watched.sound()) == Fault.NONE
