@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -142,9 +143,10 @@ def _learn(
         student.warm_up()
         gymnasium.Env.reset(env, seed=config.seed)
         while len(rows) < config.episodes:
+            started = time.perf_counter()
             row = rollout(env, student.act, student, index=len(rows))
             env.idle()
-            row["fault"] = env.fault.name
+            row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
             rows.append(row)
             if config.ledger:
                 student.write(ledger_file(folder.ledger, row["episode"]), table(env.trace, row["episode"]))

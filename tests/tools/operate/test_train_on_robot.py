@@ -23,35 +23,40 @@ from guiderail.tools.rollouts.rollout import Decision, rollout
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "reward": "shaped", "hold": 5}
 
 
+def make(patch, start):
+    """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
+    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
+    patch.setattr(type(resolved.task), "num_steps", 10)
+    with patch.context() as bus:
+        bus.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
+        station = make_station(resolved)
+    task = assemble(resolved.task, station, make_guidance(resolved, station))
+    pace, keys, asked = Together(resolved.task.world(), lcm, start), Keys(), []
+    begin = resolved.task.start(np.random.default_rng(0))
+    elsewhere = station.alike(resolved.task.world())
+    env = RobotEnv(task, station, elsewhere, begin, pace, hold=5, keys=keys, go_on=asked.append, say=lambda words: None)
+    env.pace, env.keys, env.asked, env.begin = pace, keys, asked, begin
+    return env
+
+
+@pytest.fixture(scope="module")
+def shared():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("guiderail.tools.operate.crawl.SETTLE", 0.1)
+        yield make(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
 @pytest.fixture
-def made(monkeypatch):
-    """From where the robot is, to an environment; `env.pace` is its robot, `env.asked` what go_on was told."""
-
-    def made(start=START):
-        lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
-        monkeypatch.setattr(type(resolved.task), "num_steps", 10)
-        with monkeypatch.context() as patch:
-            patch.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
-            station = make_station(resolved)
-        task = assemble(resolved.task, station, make_guidance(resolved, station))
-        pace, keys, asked = Together(resolved.task.world(), lcm, start), Keys(), []
-        begin = resolved.task.start(np.random.default_rng(0))
-        elsewhere = station.alike(resolved.task.world())
-        env = RobotEnv(
-            task, station, elsewhere, begin, pace, hold=5, keys=keys, go_on=asked.append, say=lambda words: None
-        )
-        env.pace, env.keys, env.asked, env.begin = pace, keys, asked, begin
-        return env
-
-    return made
+def env(shared):
+    shared.asked.clear()
+    return shared
 
 
 def still(observation):
     return np.zeros(2)
 
 
-def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(made):
-    env = made(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
     assert all(check.is_well for check in env.checks())
     for index in range(2):
         row = rollout(env, still, index=index)
@@ -63,8 +68,7 @@ def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(made):
         env.reset(options={"offset": (0.0, 0.0)})
 
 
-def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(made):
-    env = made()
+def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     env.reset()
     env.step(np.zeros(2))
     env.keys.press()
@@ -79,8 +83,7 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(made):
     assert env.asked == ["somebody asked for it"]
 
 
-def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(made):
-    env = made()
+def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(env):
     env.reset()
     env.step(np.zeros(2))
     step = env.pace.step
@@ -99,19 +102,17 @@ def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(m
     assert row["termination"] == "time_limit"
 
 
-def test_what_stops_a_reset_stops_no_more_than_that(made):
-    env = made()
+def test_what_stops_a_reset_stops_no_more_than_that(env):
     env.pace.happens = {env.pace.step + 150: env.keys.press}
     env.reset()
     assert env.asked == ["somebody asked for it"]
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
-def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(made):
-    free, locked = made(), made(np.zeros(6))
-    for env, holds in ((free, False), (locked, True)):
-        env._try(env._take_over)
-        assert env._holds() == holds
+def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, monkeypatch):
+    for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
+        one._try(one._take_over)
+        assert one._holds() == holds
 
 
 def test_only_sound_episodes_are_learned_from(tmp_path):
