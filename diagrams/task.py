@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram
 
@@ -76,7 +77,7 @@ class Symmetry:
                 raise ValueError("a symmetry exchanges numbers or their signs")
 
     @classmethod
-    def of_signs(cls, observation: Sequence[float], action: Sequence[float]) -> Symmetry:
+    def of_signs(cls, observation: ArrayLike, action: ArrayLike) -> Symmetry:
         """One other side, from which each observed number (n,) and each action (A,) is multiplied by 1 or −1."""
         return cls(np.diag(np.asarray(observation, float))[None], np.diag(np.asarray(action, float))[None])
 

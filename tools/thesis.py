@@ -135,7 +135,7 @@ THESIS = {
 # A setting of the learner that the thesis has no word for, and what it does.
 _ADDITIONS: tuple[tuple[str, Callable[[Preset], bool], str], ...] = (
     ("greedy_share", lambda p: p.greedy_share > 0, "{greedy_share:.0%} of the episodes are greedy"),
-    ("symmetry", lambda p: p.symmetry, "what was seen is also learned from as seen from other sides"),
+    ("symmetry", lambda p: bool(p.symmetry), "what was seen is also learned from as seen from other sides"),
     (
         "selection_window",
         lambda p: p.selection_window > 0,

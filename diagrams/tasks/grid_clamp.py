@@ -16,7 +16,7 @@ from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewp
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.grid_clamp_options import HARD, GridClampOptions
-from guiderail.diagrams.tasks.grid_clamp_rewards import reward_terms
+from guiderail.diagrams.tasks.grid_clamp_rewards import REWARDS, reward_terms
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.registry import register_task
@@ -47,13 +47,13 @@ def make_skill() -> Skill:
 @register_task("GridClamp")
 class GridClamp(InsertionTask):
     """Insert the clamp: "shaped" is the thesis's reward (3.11, 3.12), "no_force" the same without the cost of force,
-    "sparse" without the distance gained. Without `active_constraints` only the impedance's own limits of force hold a
-    policy back."""
+    "sparse" without the distance gained, "aligned" with nearness to the holes' axis. Without `active_constraints` only
+    the impedance's own limits of force hold a policy back."""
 
     Options = GridClampOptions
     options: GridClampOptions
     workpiece, fixture = "clamp", "table"
-    rewards = ("shaped", "no_force", "sparse")
+    rewards = REWARDS
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
     defaults = {"guidance": "sct", "station": "rails", "hold": 5, "active_constraints": True}
     learner = {"algorithm": "sac", "preset": "clamp"}

@@ -54,12 +54,6 @@ class GridClampOptions(Options):
         return GridClampWorkcell(dimensions, friction=self.friction)
 
 
-HARD: dict[str, Any] = {
-    "uncertainty": "disc",
-    "force_limit": 10.0,
-    "start_height": (0.015, 0.030),
-    "hole_chamfer": 0.35 * MM,
-    "peg_chamfer": 0.5 * MM,
-}
+HARD: dict[str, Any] = {"force_limit": 10.0}
 """The force limit is the difficulty: what comes down anywhere but in a hole, and goes on, has pushed too hard before it
 has slid there by itself; the snap alone asks for six of the ten newtons."""

@@ -10,14 +10,20 @@ import runpy
 import sys
 import traceback
 
-files, found = sys.argv[1:], {}
-for file in files:
-    sys.argv = [file]
-    printed, wrong = io.StringIO(), ""
-    with contextlib.redirect_stdout(printed):
-        try:
-            runpy.run_path(file, run_name="__main__")
-        except Exception:
-            wrong = traceback.format_exc()
-    found[file] = {"printed": printed.getvalue(), "wrong": wrong}
-print(json.dumps(found))
+
+def main() -> None:
+    files, found = sys.argv[1:], {}
+    for file in files:
+        sys.argv = [file]
+        printed, wrong = io.StringIO(), ""
+        with contextlib.redirect_stdout(printed):
+            try:
+                runpy.run_path(file, run_name="__main__")
+            except Exception:
+                wrong = traceback.format_exc()
+        found[file] = {"printed": printed.getvalue(), "wrong": wrong}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":  # an example may begin processes, which import this file
+    main()

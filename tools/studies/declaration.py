@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -59,6 +60,21 @@ class JudgedOn(_Strict):
     file: str = "{name}-{mark}-{digest}.csv"  # in the run's folder: what was evaluated already
 
 
+class Sweep(_Strict):
+    """One number of the environment made harder and harder: judged at each of its values, and drawn."""
+
+    quantity: str  # what is varied, with its unit, under the picture
+    at: dict[float, dict[str, Any]] = Field(min_length=1)  # arguments of the environment, by the quantity's value
+    options: dict[str, Any] = {}  # of each reset
+    episodes: int = Field(default=40, ge=1)  # at each value
+
+    def judged_on(self, value: float) -> JudgedOn:
+        """What is judged at one of its values."""
+        name = f"{self.quantity} {value:g}"
+        file = re.sub(r"\W+", "_", self.quantity).strip("_") + f"-{value:g}-{{mark}}-{{digest}}.csv"
+        return JudgedOn(name=name, env=self.at[value], options=self.options, episodes=self.episodes, file=file)
+
+
 class Ratio(_Strict):
     """A column of one method as a part of another's."""
 
@@ -80,6 +96,7 @@ class Study(_Strict):
         Annotated[int, Field(ge=1)], ...
     ] = ()  # training episodes after which a policy is judged; all of them unless given
     judged_on: tuple[JudgedOn, ...] = (JudgedOn(),)  # each of them, after every mark
+    sweeps: tuple[Sweep, ...] = ()  # of which each value is judged on, too
     statistics: tuple[str, ...] = ()  # of training, besides the usual ones
     ratios: tuple[Ratio, ...] = ()  # what is said beside the table
     folder: str = "{method}-{seed}"  # of a run
@@ -92,6 +109,11 @@ class Study(_Strict):
             if name not in STATISTICS:
                 raise ValueError(f"there is no statistic {name!r}: {did_you_mean(name, STATISTICS)}")
         return names
+
+    @property
+    def judgements(self) -> tuple[JudgedOn, ...]:
+        """All that is judged on, sweeps included."""
+        return (*self.judged_on, *(sweep.judged_on(value) for sweep in self.sweeps for value in sweep.at))
 
     def only(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
         """The same study with some of its methods, or with other seeds.
@@ -154,7 +176,7 @@ def _sentence(error: ValidationError) -> str:
     first = error.errors()[0]
     where = ", ".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        kinds: tuple[type[BaseModel], ...] = (Study, Method, LearnerChoice, JudgedOn, Ratio, Smoothness)
+        kinds: tuple[type[BaseModel], ...] = (Study, Method, LearnerChoice, JudgedOn, Sweep, Ratio, Smoothness)
         known = {str(field.alias) for kind in kinds for field in kind.model_fields.values()}
         return f"{where} is nothing that a study has: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":

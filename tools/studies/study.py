@@ -33,6 +33,7 @@ from guiderail.tools.studies.board import Board
 from guiderail.tools.studies.declaration import LEARNED, JudgedOn, Ratio, Study
 from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
+from guiderail.tools.studies.sweep import draw_sweeps
 from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import import_modules, make_environment
 
@@ -157,6 +158,8 @@ def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict
         if not len(rows):
             return result
     result["table"] = str(write_table(out / study.name, rows.drop(columns="folder")))
+    if study.sweeps:
+        result["picture"] = str(draw_sweeps(study, rows, out / f"{study.name}.png"))
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
         after = f" after {mark} episodes" if mark else ""
         if judged:
@@ -219,13 +222,13 @@ def _check(job: Job) -> None:
     config, policy = job.config(job.marks[-1]), job.study.methods[job.method].policy
     if policy not in (LEARNED, BEST_CONSTANT):
         untrained(job.study.task, policy)
-    for judged in job.study.judged_on:
+    for judged in job.study.judgements:
         extra = {**judged.env, **{name: low for name, (low, _) in judged.sampled.items()}}
         configure(job.study.task, config.environment | extra, episodes=1)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
         for mark in job.marks:
-            if not all(_evaluated_file(job, mark, judged).exists() for judged in job.study.judged_on):
+            if not all(_evaluated_file(job, mark, judged).exists() for judged in job.study.judgements):
                 _refuse_gone(job, mark)
     elif job.learns:
         job.folder.refuse_existing()
@@ -264,16 +267,16 @@ def run_job(job: Job) -> list[dict[str, Any]]:
         row = {"method": job.method, "policy": policy, "algorithm": algorithm, "seed": job.seed, "mark": mark}
         training = summary(trained, (*TRAINING, *job.study.statistics), "training_")
         training["folder"] = str(job.folder.path)
-        for judged in job.study.judged_on:
+        for judged in job.study.judgements:
             rows.append(row | {"judged_on": judged.name} | summary(_evaluated(job, mark, judged), JUDGED) | training)
-        if not job.study.judged_on:
+        if not job.study.judgements:
             rows.append(row | {"judged_on": ""} | training)
     return rows
 
 
 def _is_done(job: Job) -> bool:
     """Whether its rows only have to be read."""
-    evaluated = (_evaluated_file(job, mark, judged) for mark in job.marks for judged in job.study.judged_on)
+    evaluated = (_evaluated_file(job, mark, judged) for mark in job.marks for judged in job.study.judgements)
     return all(file.exists() for file in evaluated) and not any(_is_to_train(job, mark) for mark in job.marks)
 
 

@@ -8,7 +8,7 @@ import guiderail.diagrams  # noqa: F401 (registers)
 from guiderail.diagrams.make import make_env
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, reference_trajectory
 from guiderail.diagrams.tasks.bnc_options import ALIGNMENT, COLLISION_FORCE
-from guiderail.diagrams.tasks.bnc_rewards import DEPTH_REWARD
+from guiderail.diagrams.tasks.bnc_rewards import ALIGNMENT_REWARD, DEPTH_REWARD
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
@@ -150,6 +150,16 @@ def test_shaped_reward_adds_the_depth_gained():
     for _ in range(12):
         depth += env.step(np.zeros(2))[4]["depth"]
     assert depth == pytest.approx(DEPTH_REWARD * (start - env.trace.measured[-1, 2]) / MM, abs=0.5)
+
+
+def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
+    """From 2 mm beside the jack to where a constant action leads."""
+    env = make_env("BncConnector", guidance="kgrl", reward="aligned", uncertainty="known", hold=10)
+    env.reset(seed=0, options={"offset": (2.0 * MM, 0.0)})
+    gained = sum(env.step(np.array([1.0, 0.0]))[4]["alignment"] for _ in range(10))
+    nearer = np.hypot(2.0 * MM, 0.0) - np.linalg.norm(env.trace.measured[-1, :2] - [2.0 * MM, 0.0])
+    assert gained > 1.0
+    assert gained == pytest.approx(ALIGNMENT_REWARD * nearer / MM, abs=0.5)
 
 
 def test_the_same_policy_drives_rails_and_arm():

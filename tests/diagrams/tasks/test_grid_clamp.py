@@ -67,6 +67,18 @@ def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
     assert 300.0 * 0.014 < terms["shaping"] < 300.0 * 0.0185
 
 
+def test_an_aligned_reward_pays_what_comes_nearer_to_the_holes_and_costs_who_pushes_too_hard():
+    """Two millimetres beside, straight down onto the table, until it is too much."""
+    env = make_env("GridClamp", reward="aligned", difficulty="hard")
+    info, _, terms = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (2.0 * MM, 0.0)})
+    assert info["termination"] == "collision"
+    assert terms["collision_cost"] == -25.0
+    _, _, sideways = play(env, lambda _: np.array([-0.3, 0.0, 0.3]), seed=0, options={"offset": (2.0 * MM, 0.0)})
+    assert sideways["collision_cost"] == 0.0
+    # The cuboid ends 4 mm beside the holes' place: from 2 mm on one side to 2 mm on the other nothing is gained.
+    assert sideways["alignment"] == pytest.approx(0.0, abs=1.5)
+
+
 def test_the_straight_descent_mostly_fails_where_the_offset_is_drawn(env):
     """Pushed with 12 N for the whole 10 s."""
     rows = evaluate_policy(env, straight_descent, episodes=2, seed=1, options=NEW_RUN)

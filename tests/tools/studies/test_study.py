@@ -299,3 +299,17 @@ def test_a_run_of_a_study_is_a_run(tmp_path):
     folder = RunFolder(tmp_path / "learner-5")
     assert folder.config().episodes == 4
     assert np.array_equal(folder.episodes()["episode"], range(4))
+
+
+def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
+    """The wall of beads is where they start, or far away, where nothing succeeds."""
+    walls = {"quantity": "wall [m]", "at": {0.0: {}, -0.5: {"wall": -0.5}}, "episodes": 2}
+    methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "white"}}
+    one = study(methods=methods, sweeps=[walls], **{"judged on": []})
+    found = study_command(one, tmp_path, make_engine(processes=1))
+    rows = read_table(tmp_path / "beads.csv")
+    assert rows["judged_on"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
+    assert rows[rows["judged_on"] == "wall [m] -0.5"]["success_rate"].eq(0).all()
+    assert found["picture"] == str(tmp_path / "beads.png")
+    assert (tmp_path / "beads.png").stat().st_size > 10_000
+    assert run_study(one, tmp_path, make_engine(processes=1))["judged_on"].tolist() == rows["judged_on"].tolist()

@@ -1,0 +1,21 @@
+"""How do I step many environments at once? Gymnasium's own vector environment, a process each: as many as cores."""
+
+import gymnasium
+
+if __name__ == "__main__":  # each process imports this file first
+    envs = gymnasium.make_vec(
+        "guiderail.diagrams:guiderail/NarrowPassage-v0",  # so that each process registers it, too
+        num_envs=2,
+        vectorization_mode="async",
+        # A process that is begun anew: one that is forked shares a parent's threads' locks.
+        vector_kwargs={"context": "spawn"},
+        guidance="skgrl",
+        hold=5,
+    )
+    observations, infos = envs.reset(seed=0)  # environment i has the seed 0 + i
+    print("observations", observations.shape)
+    for _ in range(10):
+        observations, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
+    print("control steps so far:", infos["control_steps"])
+    print("nothing beyond a constraint:", bool((infos["constraint_violation"] <= 1e-9).all()))
+    envs.close()
