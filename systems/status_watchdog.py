@@ -21,15 +21,19 @@ from guiderail.systems.support.sampling import check_period
 # Entries of the state besides the last readable status itself.
 _CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT = range(7)
 _SOUND = (Fault.NONE, Fault.LATE)  # what is no fault of the status itself
+# After these the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of long ago
+# drives an arm.
+_OUT_OF_TIME = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE)
 _FORGOTTEN = (0.0, np.nan, 0.0, 0.0, 0.0, float(Fault.NO_STATUS), 0.0)
 
 
 @dataclass(frozen=True)
 class _Verdict:
-    """Of the newest status: what is wrong with it, whether it was seen before, and what is believed, (3n,)."""
+    """Of the newest status: what is wrong with it, whether it is new and believed, and what is believed then, (3n,)."""
 
     fault: Fault
     is_new: bool
+    is_believed: bool
     believed: np.ndarray
 
 
@@ -40,7 +44,8 @@ class StatusWatchdog(LeafSystem):
     after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
     when the first status comes, slowly after that, and anew after a fault or a silence: then the next status is judged
     by the one that was at fault, if its numbers were sound. Where the clock on the wall is told, this program's own
-    delays are no robot's fault, and one that is too long is a fault of its own.
+    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump of a clock
+    nothing is believed before the settling time is over.
 
     .. pydrake_system::
 
@@ -142,11 +147,12 @@ class StatusWatchdog(LeafSystem):
         if not fault and now - memory[_CLOCK] > self._limits.max_gap:
             fault = Fault.LATE
         if status is None or fault in (Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE):
-            return _Verdict(fault, False, believed)
+            return _Verdict(fault, False, False, believed)
         newest = status.values()
         is_overtaken = status.time <= last.time and not fault
         is_new = not is_overtaken and (status.time != last.time or not np.array_equal(newest, values))
-        return _Verdict(fault, is_new, newest if is_new and fault in _SOUND else believed)
+        is_believed = is_new and fault in _SOUND and memory[_FAULT] not in _OUT_OF_TIME
+        return _Verdict(fault, is_new, is_believed, newest if is_believed else believed)
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._memory, _FORGOTTEN)
@@ -167,7 +173,7 @@ class StatusWatchdog(LeafSystem):
                 wanted = memory[_OFFSET] + np.clip(wanted - memory[_OFFSET], -drift, drift)
             memory[_TIME], memory[_OFFSET], memory[_HEARD_AT] = status.time, wanted, now
             discrete_state.set_value(self._last, status.values())
-            if verdict.fault in _SOUND:
+            if verdict.is_believed:
                 memory[_BELIEVED_AT] = now
                 discrete_state.set_value(self._believed, verdict.believed)
         # Added up instead of read, so that what is remembered can be carried over to a diagram with another clock.
@@ -190,5 +196,4 @@ class StatusWatchdog(LeafSystem):
 
     def _calc_age(self, context: Context, output: BasicVector) -> None:
         verdict, memory = self._verdict.Eval(context), self._memory_of(context)
-        is_fresh = verdict.is_new and verdict.fault in _SOUND
-        output.SetAtIndex(0, 0.0 if is_fresh else max(self._now(context) - memory[_BELIEVED_AT], 0.0))
+        output.SetAtIndex(0, 0.0 if verdict.is_believed else max(self._now(context) - memory[_BELIEVED_AT], 0.0))

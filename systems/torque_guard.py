@@ -58,7 +58,7 @@ class SafetyLimits:
     force: float = 60.0
     lower: tuple[float, float, float] = (-0.2, -0.2, -0.1)
     upper: tuple[float, float, float] = (0.2, 0.2, 0.3)
-    damping_time: float = 0.5
+    damping_time: float = 0.2
     decay_time: float = 0.02
     ramp_time: float = 0.5
 

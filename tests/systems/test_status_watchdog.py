@@ -99,6 +99,7 @@ def test_names_the_fault_believes_nothing_of_it_and_recovers(fault):
         watched.check(watched.sound())
         assert np.abs(watched.state).max() < 0.2
     assert LIMITS.settling <= steps * PERIOD <= LIMITS.settling + 4 * PERIOD
+    watched.check(watched.sound())
     np.testing.assert_array_equal(watched.state, replace_time(watched).values()[:4])
 
 
@@ -242,3 +243,18 @@ def test_a_status_that_was_overtaken_counts_as_none():
     np.testing.assert_array_equal(watched.state, newest.values()[:4])
     assert watched.age > 0.0
     assert watched.check(watched.sound()) == Fault.NONE
+
+
+def test_after_a_silence_nothing_is_believed_before_it_has_settled():
+    """How late the statuses are that come then nobody knows."""
+    watched = Watched().settle()
+    before = watched.sound()
+    watched.check(before)
+    for _ in range(20):
+        watched.check(before)
+    assert watched.fault == Fault.STALE
+    late = [replace(watched.sound(), time=watched.sound().time - 0.05 + k * PERIOD) for k in range(10)]
+    for status in late:
+        watched.check(status)
+        np.testing.assert_array_equal(watched.state, before.values()[:4])
+        assert watched.age > LIMITS.max_age

@@ -18,7 +18,7 @@ from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.models.units import MM
 from guiderail.tools.operate.scenario import load_scenario
 
-PATIENCE = 3.0  # [s] of wall clock that a rehearsal in step waits for a status
+PATIENCE = 20.0  # [s] of wall clock that a rehearsal in step waits for a status
 # Contact takes a simulated robot with 1 kHz longer than the wall's clock would allow, on the machines that we know.
 REHEARSAL_RATE = 0.2
 
@@ -97,7 +97,7 @@ class Other:
         if not self.rehearse:
             yield
             return
-        arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "30"]
+        arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300"]
         arguments += [] if self.lockstep else ["--rate", str(self.rate)]
         arguments += [] if offset is None else ["--offset", ",".join(repr(float(value)) for value in offset)]
         arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]

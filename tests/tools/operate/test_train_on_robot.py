@@ -49,6 +49,7 @@ def shared():
 @pytest.fixture
 def env(shared):
     shared.asked.clear()
+    shared.keys.take_back()
     return shared
 
 
@@ -103,7 +104,7 @@ def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(e
 
 
 def test_what_stops_a_reset_stops_no_more_than_that(env):
-    env.pace.happens = {env.pace.step + 150: env.keys.press}
+    env.pace.happens = {env.pace.step + 20: env.keys.press}
     env.reset()
     assert env.asked == ["somebody asked for it"]
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
