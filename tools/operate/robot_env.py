@@ -236,6 +236,7 @@ class RobotEnv(GuidedEnv):
 
     def _take_over(self) -> None:
         """Until the arm follows."""
+        self._elsewhere_acts()
         here, waited = self.pose, 0.0
         while self._elsewhere.get_phase_output_port().Eval(self._mine)[0] != Phase.RUNNING:
             self._command(here)
