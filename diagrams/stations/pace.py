@@ -19,6 +19,7 @@ from guiderail.models.errors import InputError
 TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
 REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
 URGENCY = 20  # of a process that a robot waits for, among those that the system serves first
+HEAD = 16  # bytes of a message: its type, and the time that a status or a command begins with
 BIN = 1e-4  # [s] of a histogram
 
 
@@ -40,7 +41,7 @@ class Pace(Protocol):
 
 
 class NewMessages:
-    """Counts the messages of a channel; one that is sent again counts once."""
+    """Counts the messages of a channel; one that is sent again counts once, even where it says a little more by then."""
 
     def __init__(self, lcm: DrakeLcmInterface, channel: str):
         """
@@ -53,8 +54,8 @@ class NewMessages:
         lcm.Subscribe(channel, self._hear)
 
     def _hear(self, message: bytes) -> None:
-        if message != self._last:
-            self._last, self.count = message, self.count + 1
+        if message[:HEAD] != self._last:
+            self._last, self.count = message[:HEAD], self.count + 1
 
 
 class Gaps:

@@ -62,3 +62,13 @@ def test_gaps_are_counted_without_being_kept():
     assert gaps.quantile(0.5) == pytest.approx(0.005, abs=1.01e-4)
     assert gaps.quantile(0.99) == pytest.approx(0.0312, abs=1.01e-4)
     assert gaps.longest == 1.5
+
+
+def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
+    lcm = DrakeLcm("memq://")
+    messages = NewMessages(lcm, "STATUS")
+    head = bytes(range(16))
+    for message in (head + b"a", head + b"b", head[:-1] + b"\x00" + b"b"):
+        lcm.Publish("STATUS", message)
+        lcm.HandleSubscriptions(0)
+    assert messages.count == 2
