@@ -41,7 +41,7 @@ class Pace(Protocol):
 
 
 class NewMessages:
-    """Counts the messages of a channel; one that is sent again counts once, even where it says a little more by then."""
+    """Counts the messages of a channel; one that is sent again counts once, whatever torques it says by then."""
 
     def __init__(self, lcm: DrakeLcmInterface, channel: str):
         """
@@ -174,10 +174,9 @@ class StepByStep:
         for step in range(steps):
             # A robot that has fallen silent is not waited for again and again.
             patience = self._period if self._is_silent else self._patience
-            for _ in range(10):
-                if self._statuses.count > self._taken:
-                    break
-                self._lcm.HandleSubscriptions(max(1, int(1000 * patience / 10)))
+            end = time.monotonic() + patience
+            while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
+                self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
             self._is_silent = self._statuses.count == self._taken
             self._taken = self._statuses.count
             simulator.AdvanceTo(start + (step + 1) * self._period)
