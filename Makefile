@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench docs kills fuzz mutants newest clean
+.PHONY: demo test lint bench docs kills fuzz mutants injections newest clean
 
 demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
@@ -29,6 +29,11 @@ fuzz: $(VENV)/.ready
 
 mutants: $(VENV)/.ready
 	$(BIN)/python tests/mutation/mutate.py --results mutants.json
+
+# Faults on a robot's bus, in turn and then with real processes that are killed: the robot's side is judged.
+injections: $(VENV)/.ready
+	$(BIN)/python tests/injections/inject.py --injections 500
+	$(BIN)/python tests/injections/processes.py
 
 newest:
 	.ci/newest python3.12

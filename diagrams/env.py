@@ -163,6 +163,11 @@ class GuidedEnv(DrakeGymEnv):
         self._action_value.GetMutableData().set_value(self._neutral)
         self.drawn = self.task.randomize(context, self.np_random, dict(options or {}))
         self.simulator.Initialize()
+        return self._begun()
+
+    def _begun(self) -> tuple[np.ndarray, dict[str, Any]]:
+        """What a reset returns, with an initialized simulator."""
+        context = self.simulator.get_context()
         self._control_steps = 0
         self.trace.clear()
         self._running = True
@@ -194,8 +199,7 @@ class GuidedEnv(DrakeGymEnv):
         first_step = self._control_steps
         for _ in range(self.hold):
             try:
-                # By an integer count: a sum of periods would drift across the plant's steps.
-                simulator.AdvanceTo((self._control_steps + 1) * self.task.control_period)
+                self._advance()
                 pose = self._pose_port.Eval(context)
                 if not np.isfinite(pose).all():
                     failure = "the measured pose is not finite"
@@ -242,6 +246,10 @@ class GuidedEnv(DrakeGymEnv):
                 )
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
+
+    def _advance(self) -> None:
+        """One control step. By an integer count: a sum of periods would drift across the plant's steps."""
+        self.simulator.AdvanceTo((self._control_steps + 1) * self.task.control_period)
 
     def render(self):
         """An (h, w, 3) image of uint8 for "rgb_array"; publishes to Meshcat for "human"."""

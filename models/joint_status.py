@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
 from guiderail.models.errors import InputError
+
+MISSED = 6  # messages in a row without which nobody goes on
 
 
 class Fault(IntEnum):
@@ -29,13 +32,15 @@ class Fault(IntEnum):
     EXTERNAL_TORQUE = 13
     TORQUE = 14
     ASKED = 15
+    LATE = 16
+    DEPUTY = 17
 
 
 FAULTS = {
     Fault.NONE: "none",
     Fault.NO_STATUS: "no status has come, or not for long enough",
     Fault.STALE: "the status is old: it stopped, or comes late",
-    Fault.OUT_OF_ORDER: "a status is older than the one before it",
+    Fault.OUT_OF_ORDER: "a status is much older than the one before it: the robot's clock was set back",
     Fault.FUTURE: "a status is from the future: the robot's clock has jumped",
     Fault.MALFORMED: "a status can't be read",
     Fault.WRONG_SIZE: "a status is of another number of joints",
@@ -48,6 +53,8 @@ FAULTS = {
     Fault.EXTERNAL_TORQUE: "the surroundings load a joint too much",
     Fault.TORQUE: "the wanted torques are no numbers",
     Fault.ASKED: "somebody asked for it",
+    Fault.LATE: "this program was held up, and sent nothing for too long",
+    Fault.DEPUTY: "the deputy at the robot has stopped it, or is gone",
 }
 """Each fault in words."""
 
@@ -80,6 +87,23 @@ class JointStatus:
         return np.concatenate([self.positions, self.velocities, self.external_torque])
 
 
+@dataclass(frozen=True)
+class DeputyWord:
+    """What a robot's deputy says with every status.
+
+    Attributes:
+        number: another one each time.
+        is_acting: whether it is stopping the arm.
+    """
+
+    number: int
+    is_acting: bool
+
+    def __deepcopy__(self, memo: object) -> DeputyWord:
+        """Itself: nobody writes into this one."""
+        return self
+
+
 UNREADABLE = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
 """What stands for a message that could not be read."""
 
@@ -90,13 +114,16 @@ class StatusLimits:
 
     Args:
         velocity: of each joint, beyond which nothing moves (n,) [rad/s], positive: what positions may change by.
-        max_age: beyond which a status is stale [s], positive. Some of them may be lost on the way.
+        max_age: beyond which a status is stale [s], positive. Some of them may be lost on the way, or overtaken.
         max_lead: by which a status may be ahead of this clock [s], positive.
         position_jump: beyond what the velocity explains [rad], positive.
-        velocity_jump: from one status to the next [rad/s], positive; a collision is not slower than 1.
+        velocity_jump: from one status to the next, and beyond what the positions' change explains [rad/s], positive; a
+            collision is not slower than 1.
         settling: for how long statuses must have been sound before they are believed [s], not negative: the time for
             which a driver that has just been started wants no commands.
         clock_drift: of the two clocks against each other [s/s], not negative: slower changes are no fault.
+        max_gap: between two checks, by the clock on the wall, beyond which this program itself was held up for too
+            long [s], positive.
     """
 
     velocity: tuple[float, ...]
@@ -106,13 +133,21 @@ class StatusLimits:
     velocity_jump: float = 1.5
     settling: float = 0.25
     clock_drift: float = 1e-3
+    max_gap: float = 0.03
 
     def __post_init__(self) -> None:
         positive = (*self.velocity, self.max_age, self.max_lead, self.position_jump, self.velocity_jump)
+        positive += (self.max_gap,)
         if not self.velocity or not all(0.0 < value < np.inf for value in positive):
             raise InputError("the limits of a robot's status must be positive")
         if not min(self.settling, self.clock_drift) >= 0.0:
             raise InputError("a robot's settling time and its clock's drift must not be negative")
+
+    @classmethod
+    def at_rate(cls, velocity: Sequence[float], period: float) -> StatusLimits:
+        """The limits for a driver that speaks once in `period` [s]: some messages in a row may be lost or late."""
+        silence = MISSED * period
+        return cls(tuple(velocity), max_age=silence, max_lead=silence, max_gap=silence)
 
 
 @dataclass(frozen=True)
@@ -151,18 +186,25 @@ def judge_status(status: JointStatus | None, last: Heard, now: float, limits: St
         return Fault.NOT_FINITE
     if not np.isfinite(last.time):
         return Fault.NONE
-    is_repeated = status.time == last.time and np.array_equal(values, last.values)
-    if status.time <= last.time and not is_repeated:
+    if last.time - status.time > limits.max_age:
         return Fault.OUT_OF_ORDER
     age = now - (status.time + last.offset)
     if age < -limits.max_lead:
         return Fault.FUTURE
     if age > limits.max_age:
         return Fault.STALE
+    if status.time <= last.time:
+        return Fault.NONE  # it comes again, or was overtaken on its way: nothing is made of it
     change = np.abs(values - last.values)
     reachable = limits.position_jump + np.array(limits.velocity) * (status.time - last.time)
     if (change[:num_joints] > reachable).any():
         return Fault.POSITION_JUMP
     if (change[num_joints : 2 * num_joints] > limits.velocity_jump).any():
         return Fault.VELOCITY_JUMP
+    # A speed with which nothing moves would be damped all the same, and so drive the arm.
+    elapsed = status.time - last.time
+    if 0.0 < elapsed <= limits.max_age:
+        moving = (status.positions - last.values[:num_joints]) / elapsed
+        if (np.abs(moving - status.velocities) > limits.velocity_jump).any():
+            return Fault.VELOCITY_JUMP
     return Fault.NONE

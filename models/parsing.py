@@ -1,13 +1,15 @@
 """Model files, read where no network is."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pydrake.multibody.parsing import Parser
+from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
+
+from guiderail.models.errors import InputError
 
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
 _DIRECTIVES = (".yaml", ".yml")
@@ -33,6 +35,20 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
         if Path(path).suffix in _DIRECTIVES:
             parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
         return parser.AddModels(str(path))
+
+
+def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective]) -> None:
+    """Adds what Drake's model directives say; files are named with their whole path (file://).
+
+    Raises:
+        InputError: if they can't be followed.
+    """
+    try:
+        with _remote_packages_may_be_named():
+            ProcessModelDirectives(ModelDirectives(directives=list(directives)), Parser(plant))
+    except RuntimeError as error:
+        words = " ".join(str(error).split())
+        raise InputError(f"what should stand around the robot can't be added: {words}") from error
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_lever import ContactLever as ContactLever
 from .contact_watch import ContactWatch as ContactWatch
+from .deputy_watch import DeputyWatch as DeputyWatch
 from .desired_pose_ramp import DesiredPoseRamp as DesiredPoseRamp
 from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import Condition as Condition

@@ -20,15 +20,20 @@ from guiderail.systems.support.sampling import check_period
 
 # Entries of the state besides the last readable status itself.
 _CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT = range(7)
+_SOUND = (Fault.NONE, Fault.LATE)  # what is no fault of the status itself
+# After these the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of long ago
+# drives an arm.
+_OUT_OF_TIME = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE)
 _FORGOTTEN = (0.0, np.nan, 0.0, 0.0, 0.0, float(Fault.NO_STATUS), 0.0)
 
 
 @dataclass(frozen=True)
 class _Verdict:
-    """Of the newest status: what is wrong with it, whether it was seen before, and what is believed, (3n,)."""
+    """Of the newest status: what is wrong with it, whether it is new and believed, and what is believed then, (3n,)."""
 
     fault: Fault
     is_new: bool
+    is_believed: bool
     believed: np.ndarray
 
 
@@ -38,20 +43,24 @@ class StatusWatchdog(LeafSystem):
     `judge_status` names the fault. A fault is reported until statuses have been sound for the settling time, so that
     after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
     when the first status comes, slowly after that, and anew after a fault or a silence: then the next status is judged
-    by the one that was at fault, if its numbers were sound.
+    by the one that was at fault, if its numbers were sound. Where the clock on the wall is told, this program's own
+    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump of a clock
+    nothing is believed before the settling time is over.
 
     .. pydrake_system::
 
         name: StatusWatchdog
         input_ports:
         - status
+        - clock (optional)
         output_ports:
         - state
         - external_torque
         - fault
         - age
 
-    ``status`` is an abstract value: the newest `JointStatus`, or None. ``state`` is (2n,), positions and velocities
+    ``status`` is an abstract value: the newest `JointStatus`, or None. ``clock`` is (1,), the time on the wall at this
+    check [s]; unconnected, each check is a period after the one before. ``state`` is (2n,), positions and velocities
     [rad, rad/s], and ``external_torque`` (n,) [Nm], both of the last sound status and zero before it. ``fault`` is
     (1,), a code of `Fault`. ``age`` is (1,), for how long no new sound status has come [s].
     """
@@ -70,11 +79,13 @@ class StatusWatchdog(LeafSystem):
         self._limits, self._period = limits, period
         self._num_joints = num_joints = len(limits.velocity)
         self._status_port = self.DeclareAbstractInputPort("status", Value[object]())
+        self._clock_port = self.DeclareVectorInputPort("clock", 1)
         self._memory = self.DeclareDiscreteState(_FORGOTTEN)
         self._last = self.DeclareDiscreteState(3 * num_joints)  # readable, whether sound or not
         self._believed = self.DeclareDiscreteState(3 * num_joints)
         tickets = {
             self._status_port.ticket(),
+            self._clock_port.ticket(),
             self.discrete_state_ticket(self._memory),
             self.discrete_state_ticket(self._last),
             self.discrete_state_ticket(self._believed),
@@ -98,6 +109,10 @@ class StatusWatchdog(LeafSystem):
         """The newest status, an abstract `JointStatus` or None."""
         return self._status_port
 
+    def get_clock_input_port(self) -> InputPort:
+        """The time on the wall, (1,) [s]; optional."""
+        return self._clock_port
+
     def get_state_output_port(self) -> OutputPort:
         """Positions and velocities of the last sound status, (2n,) [rad, rad/s]."""
         return self._state_port
@@ -117,17 +132,27 @@ class StatusWatchdog(LeafSystem):
     def _memory_of(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._memory).value()
 
+    def _now(self, context: Context) -> float:
+        if self._clock_port.HasValue(context):
+            return float(self._clock_port.Eval(context)[0])
+        return float(self._memory_of(context)[_CLOCK])
+
     def _judge(self, context: Context) -> _Verdict:
         status: JointStatus | None = self._status_port.Eval(context)
         memory, values = self._memory_of(context), context.get_discrete_state(self._last).value()
         last = Heard(float(memory[_TIME]), float(memory[_OFFSET]), values)
         believed = context.get_discrete_state(self._believed).value().copy()
-        fault = judge_status(status, last, float(memory[_CLOCK]), self._limits)
+        now = self._now(context)
+        fault = judge_status(status, last, now, self._limits)
+        if not fault and now - memory[_CLOCK] > self._limits.max_gap:
+            fault = Fault.LATE
         if status is None or fault in (Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE):
-            return _Verdict(fault, False, believed)
+            return _Verdict(fault, False, False, believed)
         newest = status.values()
-        is_new = status.time != last.time or not np.array_equal(newest, values)
-        return _Verdict(fault, is_new, newest if is_new and not fault else believed)
+        is_overtaken = status.time <= last.time and not fault
+        is_new = not is_overtaken and (status.time != last.time or not np.array_equal(newest, values))
+        is_believed = is_new and fault in _SOUND and memory[_FAULT] not in _OUT_OF_TIME
+        return _Verdict(fault, is_new, is_believed, newest if is_believed else believed)
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._memory, _FORGOTTEN)
@@ -137,18 +162,18 @@ class StatusWatchdog(LeafSystem):
 
     def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         verdict, memory = self._verdict.Eval(context), self._memory_of(context).copy()
-        now = memory[_CLOCK]
+        now = self._now(context)
         if verdict.is_new:
             status: JointStatus = self._status_port.Eval(context)
             wanted = now - status.time
-            is_in_step = verdict.fault == Fault.NONE and np.isfinite(memory[_TIME])
+            is_in_step = verdict.fault in _SOUND and np.isfinite(memory[_TIME])
             is_late = verdict.fault == Fault.STALE and now - memory[_HEARD_AT] <= self._limits.max_age
             if is_in_step or is_late:
                 drift = self._limits.clock_drift * self._period
                 wanted = memory[_OFFSET] + np.clip(wanted - memory[_OFFSET], -drift, drift)
             memory[_TIME], memory[_OFFSET], memory[_HEARD_AT] = status.time, wanted, now
             discrete_state.set_value(self._last, status.values())
-            if not verdict.fault:
+            if verdict.is_believed:
                 memory[_BELIEVED_AT] = now
                 discrete_state.set_value(self._believed, verdict.believed)
         # Added up instead of read, so that what is remembered can be carried over to a diagram with another clock.
@@ -171,5 +196,4 @@ class StatusWatchdog(LeafSystem):
 
     def _calc_age(self, context: Context, output: BasicVector) -> None:
         verdict, memory = self._verdict.Eval(context), self._memory_of(context)
-        is_fresh = verdict.is_new and not verdict.fault
-        output.SetAtIndex(0, 0.0 if is_fresh else float(memory[_CLOCK] - memory[_BELIEVED_AT]))
+        output.SetAtIndex(0, 0.0 if verdict.is_believed else max(self._now(context) - memory[_BELIEVED_AT], 0.0))

@@ -16,6 +16,7 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.errors import InputError
+from guiderail.models.joint_damping import damping_torque
 from guiderail.models.joint_status import FAULTS, Fault
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
 from guiderail.systems.support.sampling import check_period
@@ -23,7 +24,7 @@ from guiderail.systems.support.sampling import check_period
 # Entries of the state.
 _PHASE, _FAULT, _PHASE_TIME, _AUTHORITY = range(4)
 # For how long no torque is said once more before a silent robot is sent nothing [s].
-_FAREWELL = 0.05
+FAREWELL = 0.05
 
 
 class Phase(IntEnum):
@@ -57,8 +58,8 @@ class SafetyLimits:
     force: float = 60.0
     lower: tuple[float, float, float] = (-0.2, -0.2, -0.1)
     upper: tuple[float, float, float] = (0.2, 0.2, 0.3)
-    damping_time: float = 0.5
-    decay_time: float = 0.05
+    damping_time: float = 0.2
+    decay_time: float = 0.02
     ramp_time: float = 0.5
 
     def __post_init__(self) -> None:
@@ -75,11 +76,12 @@ class SafetyLimits:
 class TorqueGuard(LeafSystem):
     """Passes wanted torques on while nothing is wrong; otherwise the arm is brought to rest, and then has no torque.
 
-        τ = clip(a τ_wanted + (1 − a) τ_damping),   τ_damping = −M(q) v exp(−age / T) / T
+        τ = clip(a f τ_wanted + (1 − a) τ_damping)
 
-    a is the authority, which grows from 0 to 1 in the ramp time. Damping takes away all joints' speed with the decay
-    time T. Where no status comes any more, it goes by the last: what it then still takes away is exactly what the arm
-    had, so that nothing is ever driven backwards by a speed that is long gone.
+    a is the authority, which grows from 0 to 1 in the ramp time. f is 1 for a new status, and 0 for one that is two
+    periods old: what was wanted of an arm that isn't seen would drive it ever faster. τ_damping (`damping_torque`)
+    takes away all joints' speed with the decay time; where no status comes any more, what was seen last is taken away
+    once.
 
     A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
     is called. At first it waits until the status is sound, and takes over by itself. What is sent is always finite and
@@ -325,22 +327,26 @@ class TorqueGuard(LeafSystem):
         return EventStatus.Succeeded()
 
     def _calc_safe_torque(self, context: Context, output: BasicVector) -> None:
-        phase, _, _, authority = self._memory_of(context)
+        phase, _, phase_time, authority = self._memory_of(context)
         is_active = phase in (Phase.RAMPING, Phase.RUNNING)
         torque = np.zeros(self._num_joints)
         if is_active and not self._found.Eval(context):
-            torque = authority * self._torque_port.Eval(context)
+            freshness = np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0)
+            torque = authority * freshness * self._torque_port.Eval(context)
             if authority < 1.0:
-                torque = torque + (1.0 - authority) * self._damping_torque(context)
-        elif is_active or phase == Phase.DAMPING:
-            torque = self._damping_torque(context)
+                torque = torque + (1.0 - authority) * self._damping_torque(context, np.inf)
+        elif is_active:
+            torque = self._damping_torque(context, 0.0)
+        elif phase == Phase.DAMPING:
+            torque = self._damping_torque(context, phase_time + self._period)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
 
-    def _damping_torque(self, context: Context) -> np.ndarray:
-        age, decay_time = float(self._status_age_port.Eval(context)[0]), self._limits.decay_time
+    def _damping_torque(self, context: Context, damped: float) -> np.ndarray:
+        """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s]."""
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = self._state_port.Eval(context)[self._num_joints :]
-        return -(M @ v) * (np.exp(-age / decay_time) / decay_time)
+        damped = min(float(self._status_age_port.Eval(context)[0]), damped)
+        return damping_torque(M, v, self._limits.decay_time, period=self._period, damped=damped)
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         phase, fault, _, _ = self._memory_of(context)
@@ -357,7 +363,7 @@ class TorqueGuard(LeafSystem):
         phase, _, phase_time, _ = self._memory_of(context)
         is_sending = phase in (Phase.RAMPING, Phase.RUNNING, Phase.DAMPING)
         if phase == Phase.OFF:
-            is_sending = phase_time <= _FAREWELL or self._status_fault_port.Eval(context)[0] == Fault.NONE
+            is_sending = phase_time <= FAREWELL or self._status_fault_port.Eval(context)[0] == Fault.NONE
         output.SetAtIndex(0, float(is_sending))
 
     def _calc_not_following(self, context: Context, output: BasicVector) -> None:

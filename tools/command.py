@@ -138,10 +138,21 @@ def train(
     reward: Annotated[str | None, _opt("sparse or shaped; Pouring: hand_shaped too, GridClamp: no_force.")] = None,
     observation: Annotated[str | None, _opt("state or image.")] = None,
     uncertainty: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
-    station: Annotated[str | None, _opt("rails or arm, where a task has both.")] = None,
+    station: Annotated[str | None, _opt("rails or arm, where a task has both; hardware for a robot.")] = None,
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
     ] = None,
+    lcm_url: Annotated[str, _opt("On a robot: the URL of LCM.  [default: LCM's own]")] = "",
+    robot: Annotated[str, _opt("On a robot: which arm.", of="robots")] = "iiwa14",
+    rehearse: Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")] = False,
+    lockstep: Annotated[
+        bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--lockstep")
+    ] = False,
+    rate: Annotated[float, _opt("Of a rehearsal: the simulated robot's clock to the wall's.")] = 0.2,
+    scenario: Annotated[
+        Path | None, _opt("A file that says robot, bus and surroundings, and whether the robot is simulated.")
+    ] = None,
+    yes: Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")] = False,
     resume: Annotated[bool, _opt("Go on with the run in --out.", "--resume")] = False,
     imports: Imports = None,
     as_json: Json = False,
@@ -152,21 +163,46 @@ def train(
     a checkpoint, the policy, a learning curve and a replay. A run that was stopped goes on with --resume to the result
     it would have had.
     """
-    from guiderail.tools.learning import configure
-
     task, folders = (None, ()) if task is None else _named(task)
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     words |= {"uncertainty": uncertainty, "station": station}
+    environment = {k: v for k, v in words.items() if v is not None} | _environment(env)
     if folders and task is not None and not resume:
         from guiderail.tools.recording.followed import leaves_demonstrations
 
-        given = {k: v for k, v in words.items() if v is not None} | _environment(env)
-        if (sentence := leaves_demonstrations(task, given)) is not None:
+        if (sentence := leaves_demonstrations(task, environment)) is not None:
             _say(sentence)
+    if (
+        station is not None
+        and not import_module("guiderail.diagrams.stations.registry").STATIONS.get(station).simulated
+    ):
+        there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
+        given = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
+        if task is None or out is None or resume:
+            raise InputError("on a robot a run begins anew: name a task and a folder, without --resume")
+        from guiderail.tools.operate.rehearsal import Other
+        from guiderail.tools.operate.train_on_robot import train_on_robot
+
+        found = train_on_robot(
+            task,
+            out,
+            Other.in_scenario(scenario, **there),
+            environment=environment,
+            given={name: value for name, value in given.items() if value is not None},
+            settings=_pairs(setting, "--set", "batch_size=128"),
+            yes=yes,
+            say=_say,
+        )
+        _print(found, as_json)
+        return
+    if rehearse or lockstep or yes:
+        raise InputError("--rehearse, --lockstep and --yes are for a robot: give --station hardware too")
+    from guiderail.tools.learning import configure
+
     summary = configure.run(
         task,
         out,
-        environment={k: v for k, v in words.items() if v is not None} | _environment(env),
+        environment=environment,
         algorithm=algorithm,
         preset=preset,
         settings=_pairs(setting, "--set", "batch_size=128"),
@@ -653,6 +689,13 @@ def run(
     lcm_url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
     robot: Annotated[str, _opt("Which arm.", of="robots")] = "iiwa14",
     rehearse: Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")] = False,
+    lockstep: Annotated[
+        bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--lockstep")
+    ] = False,
+    rate: Annotated[float, _opt("Of a rehearsal: the simulated robot's clock to the wall's.")] = 0.2,
+    scenario: Annotated[
+        Path | None, _opt("A file that says robot, bus and surroundings, and whether the robot is simulated.")
+    ] = None,
     yes: Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")] = False,
     out: Annotated[Path | None, _opt("The folder of what is recorded.  [default: hardware in the run]")] = None,
 ) -> None:
@@ -662,12 +705,12 @@ def run(
     the start at a crawl and executes the skill; every control step is recorded. It ends with 0 if the skill was
     executed to its end, and with 1 if a limit, a fault of the status or a key stopped it.
     """
+    from guiderail.tools.operate.rehearsal import Other
     from guiderail.tools.operate.run_policy import run_policy
 
-    code = run_policy(
-        run, station=station, lcm_url=lcm_url, robot=robot, rehearse=rehearse, yes=yes, out=out, say=_tell
-    )
-    raise typer.Exit(code)
+    there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
+    other = Other.in_scenario(scenario, **there)
+    raise typer.Exit(run_policy(run, other, station=station, yes=yes, out=out, say=_tell))
 
 
 @command("serve-iiwa --seconds 60", "serve-iiwa")
@@ -676,15 +719,38 @@ def serve_iiwa(
     seconds: Annotated[float, _opt("How long, in simulated time.")] = 3600.0,
     patience: Annotated[float, _opt("How many seconds to wait for a command.")] = 5.0,
     task: Annotated[str, _opt("What stands in front of it: {tasks}.", of="tasks")] = "BncConnector",
-    real_time: Annotated[bool, _opt("Go by the wall's clock, and wait for nobody.", "--real-time")] = False,
+    rate: Annotated[
+        float | None, _opt("Go by the wall's clock, or so much slower, and wait for nobody; 1 is real time.")
+    ] = None,
+    offset: Annotated[
+        str | None, _opt("x,y of the fixture from where it is thought to be [m], such as 0.001,-0.0005.")
+    ] = None,
+    scenario: Annotated[Path | None, _opt("A file that says what stands around it.")] = None,
 ) -> None:
-    """Simulate an iiwa at the other end of LCM.
+    """Simulate an iiwa at the other end of LCM, with a deputy who stands by.
 
     It stands in front of a task's fixture; the command ends with 1 if commands stopped coming.
     """
     from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
 
-    raise typer.Exit(0 if serve(url, seconds, patience, task, real_time=real_time) else 1)
+    is_done = serve(url, seconds, patience, task, rate=rate, offset=_numbers(offset), scenario=scenario)
+    raise typer.Exit(0 if is_done else 1)
+
+
+@command("stand-by --task BncConnector", "stand-by")
+def stand_by(
+    url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
+    robot: Annotated[str, _opt("Which arm.", of="robots")] = "iiwa14",
+    task: Annotated[str, _opt("What the arm carries is this task's: {tasks}.", of="tasks")] = "BncConnector",
+) -> None:
+    """Stop a robot where commands stop.
+
+    For a driver that repeats the last torque for ever when the program that sent it is gone. It runs beside the driver,
+    on the same machine, until it is ended; where it is missing, guiderail run moves nothing.
+    """
+    from guiderail.tools.operate.stand_by import stand_by as wait
+
+    wait(url, robot, task, say=_tell)
 
 
 @command("generate connector-demonstrations --out .")
@@ -836,6 +902,14 @@ def _floats(text: str, count: int, option: str) -> list[float]:
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise InputError(f"{option} takes {count} numbers separated by commas, not {text!r}")
     return numbers
+
+
+def _numbers(given: str | None) -> tuple[float, ...] | None:
+    """Numbers that are separated by commas."""
+    try:
+        return None if given is None else tuple(float(value) for value in given.split(","))
+    except ValueError:
+        raise InputError(f"numbers are separated by commas, such as 0.001,-0.0005, not {given!r}") from None
 
 
 def _environment(given: list[str] | None) -> dict[str, Any]:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
 from pydantic import Field
 from pydrake.common.value import Value
-from pydrake.lcm import DrakeLcm, DrakeLcmInterface, Subscriber
-from pydrake.manipulation import BuildIiwaControl, IiwaDriver, kIiwaLcmStatusPeriod
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
+from pydrake.manipulation import BuildIiwaControl, IiwaDriver
+from pydrake.multibody.parsing import ModelDirective
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.analysis import Simulator
@@ -21,10 +19,11 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, Seriali
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.options import Number, Options
-from guiderail.diagrams.stations.arm import KnownArm, add_arm, add_controller
+from guiderail.diagrams.stations.arm import ArmModel, KnownArm, add_arm, add_controller
+from guiderail.diagrams.stations.deputy import WordSerializer, word_channel
+from guiderail.diagrams.stations.driver import MICROSECOND, Driver
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
-    CONTROL_PERIOD,
     Impedance,
     Station,
     add_workcell_plant,
@@ -33,60 +32,22 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
-from guiderail.models.joint_status import UNREADABLE, JointStatus, StatusLimits
+from guiderail.models.joint_status import MISSED, StatusLimits
+from guiderail.models.parsing import follow_directives
 from guiderail.models.registry import did_you_mean
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.panda import PANDA
 from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector, Robot, find_robot
 from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.deputy_watch import DeputyWatch
 from guiderail.systems.desired_pose_ramp import DesiredPoseRamp
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.status_watchdog import StatusWatchdog
 from guiderail.systems.torque_guard import SafetyLimits, TorqueGuard
 from guiderail.systems.torque_publisher import TorquePublisher
 
-TORQUE_PERIOD = CONTROL_PERIOD / 4  # [s] between torques that are sent, as often as the status arrives
-
 # Of what a driver stops at by itself: how much is sent, how much of the surroundings' is borne, and of a joint's speed.
 TORQUE_SHARE, EXTERNAL_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
-MICROSECOND = 1e-6  # [s]
-TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
-REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
-
-
-@dataclass(frozen=True)
-class Driver:
-    """How the program that drives a robot speaks over LCM, and what it does by itself.
-
-    Attributes:
-        name: what Drake calls its ports.
-        status_channel, command_channel: of the bus.
-        status_type: its message, of the fields that `status_fields` names.
-        status_fields: of position, velocity and external torque.
-        external_torque_sign: what the last of these is multiplied by to be what the surroundings do to the arm.
-        encode: from the time [s] and torques (n,) to a command.
-        trips: external torques at which it stops by itself when it is controlled by torque, (n,) [Nm].
-    """
-
-    name: str
-    status_channel: str
-    command_channel: str
-    status_type: Any
-    status_fields: tuple[str, str, str]
-    external_torque_sign: float
-    encode: Callable[[float, np.ndarray], bytes]
-    trips: tuple[float, ...]
-
-    def decode(self, message: bytes) -> JointStatus:
-        """What a message says; `UNREADABLE` where it can't be read."""
-        try:
-            status = self.status_type.decode(message)
-            positions, velocities, external = (
-                np.array(getattr(status, name), dtype=float) for name in self.status_fields
-            )
-        except (ValueError, struct.error, OverflowError):
-            return UNREADABLE
-        return JointStatus(status.utime * MICROSECOND, positions, velocities, self.external_torque_sign * external)
 
 
 def _encode_iiwa(time: float, torque: np.ndarray) -> bytes:
@@ -111,7 +72,9 @@ IIWA_DRIVER = Driver(
     status_type=lcmt_iiwa_status,
     status_fields=("joint_position_measured", "joint_velocity_estimated", "joint_torque_external"),
     external_torque_sign=1.0,
+    command_type=lcmt_iiwa_command,
     encode=_encode_iiwa,
+    stops_by_itself=False,
     trips=tuple(60.0 * share for share in (1.0, 1.0, 1.0, 0.5, 0.2, 0.2, 0.1)),
 )
 # Franka's external torque is what the arm does to the surroundings. The trips are those of libfranka's examples.
@@ -122,13 +85,13 @@ PANDA_DRIVER = Driver(
     status_type=lcmt_panda_status,
     status_fields=("joint_position", "joint_velocity", "joint_torque_external"),
     external_torque_sign=-1.0,
+    command_type=lcmt_panda_command,
     encode=_encode_panda,
+    stops_by_itself=True,
     trips=(20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0),
 )
 DRIVERS = {IIWA14.name: IIWA_DRIVER, PANDA.name: PANDA_DRIVER}
 """By the name of the robot."""
-
-STATUS_CHANNEL, COMMAND_CHANNEL = IIWA_DRIVER.status_channel, IIWA_DRIVER.command_channel
 
 
 def find_driver(robot: Robot | str) -> Driver:
@@ -192,9 +155,11 @@ class HardwareStation(Station):
     external torques; there is no wrist sensor. `start` waits for the robot's first status. Then nothing is sent until
     statuses have come for the settling time, and from there the arm takes over gradually, where it is.
 
-    A `StatusWatchdog` judges what comes and a `TorqueGuard` what is measured and sent; they stop the arm, `fault` says
-    why, and `resume` goes on. Beside every station's ports it has these outputs, the last of them under the names that
-    they have in Drake's own stations, after the name of the driver and a dot:
+    A `StatusWatchdog` judges what comes, a `DeputyWatch` hears whoever stands by at the robot, and a `TorqueGuard`
+    judges what is measured and sent; they stop the arm, `fault` says why, and `resume` goes on. In real time
+    `tell_time` says before each step what the clock on the wall shows. Beside every station's ports it has these
+    outputs, the last of them under the names that they have in Drake's own stations, after the name of the driver and a
+    dot:
 
     =====================  =====  =====================================================================================
     output                 size   meaning
@@ -214,7 +179,7 @@ class HardwareStation(Station):
         workcell: Workcell,
         lcm: DrakeLcmInterface | None = None,
         impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
-        period: float = TORQUE_PERIOD,
+        period: float | None = None,
         wrench_time_constant: float = 0.02,
         robot_timeout: float = 10.0,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
@@ -229,14 +194,14 @@ class HardwareStation(Station):
             workcell: for its target frame and for what is held; the fixture is real.
             lcm: the bus; unless given, the one at `lcm_url`.
             impedance: at the tool centre.
-            period: at which commands are sent [s]: the driver's.
+            period: at which commands are sent [s]; the driver's unless given.
             wrench_time_constant: of the wrench estimate's low-pass filter [s].
             robot_timeout: how long an initialization waits for the robot [s].
             end_effector: which tool is bolted on, or its name; a gripper has a driver of its own, and stays open here.
             robot: which arm, or its name.
             lcm_url: of the bus; LCM's own default where it is empty.
             limits: of what is measured and sent; `safety_limits` unless given.
-            status_limits: of the statuses; unless given, the joints' speeds and otherwise the defaults.
+            status_limits: of the statuses; unless given, they follow from the joints' speeds and the period.
 
         Raises:
             InputError: if nothing here speaks to such a robot.
@@ -245,6 +210,8 @@ class HardwareStation(Station):
         robot = find_robot(robot)
         self.driver = driver = find_driver(robot)
         self.lcm = bus = lcm or DrakeLcm(lcm_url)
+        self.lcm_url = lcm_url
+        self.period = period = driver.period if period is None else period
         self.known = known = KnownArm(workcell, robot, end_effector)
         self.limits = limits = limits or safety_limits(known.plant, driver)
         self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
@@ -256,8 +223,13 @@ class HardwareStation(Station):
             "status_subscriber",
             LcmSubscriberSystem(driver.status_channel, _StatusSerializer(driver), bus, robot_timeout),
         )
-        status_limits = status_limits or StatusLimits(tuple(known.plant.GetVelocityUpperLimits().tolist()))
-        status = builder.AddNamedSystem("status", StatusWatchdog(status_limits, period=period))
+        status_limits = status_limits or StatusLimits.at_rate(known.plant.GetVelocityUpperLimits().tolist(), period)
+        self._status = status = builder.AddNamedSystem("status", StatusWatchdog(status_limits, period=period))
+        words = builder.AddNamedSystem(
+            "deputy_subscriber", LcmSubscriberSystem(word_channel(driver.command_channel), WordSerializer(), bus)
+        )
+        # A deputy speaks as often as the robot; it may be late by as much again.
+        deputy = builder.AddNamedSystem("deputy", DeputyWatch(period=period, patience=2.0 * MISSED * period))
         positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
         velocities = builder.AddNamedSystem("velocities", MatrixGain(np.eye(num_joints, 2 * num_joints, num_joints)))
         wrench = builder.AddNamedSystem(
@@ -299,7 +271,9 @@ class HardwareStation(Station):
             (wrench.get_wrench_output_port(), guard.get_wrench_input_port()),
             (pose, guard.get_pose_input_port()),
             (watchdog.get_safe_pose_output_port(), guard.get_desired_pose_input_port()),
-            (status.get_fault_output_port(), guard.get_status_fault_input_port()),
+            (status.get_fault_output_port(), deputy.get_status_fault_input_port()),
+            (words.get_output_port(), deputy.get_word_input_port()),
+            (deputy.get_fault_output_port(), guard.get_status_fault_input_port()),
             (status.get_age_output_port(), guard.get_status_age_input_port()),
             (watchdog.get_holding_output_port(), guard.get_holding_input_port()),
             (guard.get_safe_torque_output_port(), publisher.get_torque_input_port()),
@@ -364,6 +338,18 @@ class HardwareStation(Station):
         """
         self._guard.resume(self._guard.GetMyMutableContextFromRoot(context))
 
+    def tell_time(self, context: Context, clock: float) -> None:
+        """What the clock on the wall shows [s], for the next step in real time; `context` is the root context.
+
+        Without it each step is a period after the one before.
+        """
+        self._status.get_clock_input_port().FixValue(self._status.GetMyMutableContextFromRoot(context), [clock])
+
+    def has_deputy(self, context: Context) -> bool:
+        """Whether somebody stands by at the robot; `context` is this station's own."""
+        words = self.GetSubsystemByName("deputy_subscriber")
+        return words.get_output_port().Eval(words.GetMyContextFromRoot(context)) is not None
+
     def take_over(self, context: Context, before: Context) -> None:
         """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.
 
@@ -427,140 +413,42 @@ class SimulatedIiwa(Diagram):
         self,
         workcell: Workcell,
         lcm: DrakeLcmInterface,
-        time_step: float = kIiwaLcmStatusPeriod,
+        time_step: float = IIWA_DRIVER.period,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
+        directives: Sequence[ModelDirective] = (),
     ):
         """
         Args:
             workcell: what stands in the world and what is held.
             lcm: the bus.
-            time_step: of the plant [s]; the status goes out every 5 ms, as the real driver's does.
+            time_step: of the plant [s], a divisor of the status's period.
             end_effector: which tool is bolted on, or its name; a gripper has a driver of its own, and stays open here.
+            directives: what stands around them.
+
+        Raises:
+            InputError: if the directives can't be followed.
         """
         super().__init__()
         builder = DiagramBuilder()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm))
-        self.plant, self.scene_graph, self.arm = add_workcell_plant(
-            builder, workcell, time_step, lambda plant: add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
-        )
+
+        def add(plant: MultibodyPlant) -> ArmModel:
+            arm = add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
+            follow_directives(plant, directives)
+            return arm
+
+        self.plant, self.scene_graph, self.arm = add_workcell_plant(builder, workcell, time_step, add)
         self.known = KnownArm(workcell, IIWA14, end_effector)
         BuildIiwaControl(
-            builder, lcm, self.plant, self.arm.model, IiwaDriver(control_mode="torque_only"), self.known.plant
+            builder,
+            lcm,
+            self.plant,
+            self.arm.model,
+            IiwaDriver(control_mode="torque_only", lcm_status_period=IIWA_DRIVER.period),
+            self.known.plant,
         )
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
         self.known.place(self.plant, self.arm.model, context, pose)
-
-
-class NewMessages:
-    """Counts the messages of a channel; one that is sent again counts once."""
-
-    def __init__(self, lcm: DrakeLcmInterface, channel: str):
-        """
-        Args:
-            lcm: the bus.
-            channel: its channel.
-        """
-        self.count = 0
-        self._last = b""
-        lcm.Subscribe(channel, self._hear)
-
-    def _hear(self, message: bytes) -> None:
-        if message != self._last:
-            self._last, self.count = message, self.count + 1
-
-
-def serve(robot: SimulatedIiwa, lcm: DrakeLcm, start: np.ndarray, seconds: float, patience: float) -> float:
-    """Runs a simulated arm for another process: one step, then it waits until its status was answered.
-
-    So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
-    has taken the status in; where that never came, it is a command.
-
-    Args:
-        robot: the arm.
-        lcm: its bus.
-        start: pose at which the tool starts, (6,).
-        seconds: of simulated time to run.
-        patience: how long to wait for each answer, and ten times as long for the first [s of wall clock].
-
-    Returns:
-        The simulated time at which it ended: less than `seconds` if answers stopped.
-    """
-    commands = Subscriber(lcm, COMMAND_CHANNEL, lcmt_iiwa_command)
-    words = NewMessages(lcm, STATUS_CHANNEL + TAKEN)
-    simulator = Simulator(robot)
-    robot.set_pose(simulator.get_mutable_context(), start)
-    simulator.Initialize()
-
-    def answers() -> int:
-        return words.count or commands.count
-
-    steps, repeats = 0, max(1, round(patience / REPEAT))
-    while steps * kIiwaLcmStatusPeriod < seconds:
-        answered = answers()
-        for _ in range(repeats if steps else 10 * repeats):
-            # A command comes before the word that belongs to it.
-            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and answers() == answered:
-                pass
-            if answers() > answered:
-                break
-            # A datagram may be lost, and before its first answer the other side may not have been listening.
-            simulator.get_system().ForcedPublish(simulator.get_context())
-        else:
-            break
-        steps += 1
-        simulator.AdvanceTo(steps * kIiwaLcmStatusPeriod)
-    return steps * kIiwaLcmStatusPeriod
-
-
-class StepByStep:
-    """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
-
-    After each it says so, for `serve`, which waits for it.
-    """
-
-    def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str = STATUS_CHANNEL):
-        """
-        Args:
-            lcm: the bus.
-            patience: how long to wait for a status [s]; then steps go without, and the station's watchdog notices.
-            channel: of the statuses.
-        """
-        self._lcm, self._patience, self._answers = lcm, patience, channel + TAKEN
-        self._statuses = NewMessages(lcm, channel)
-        self._taken = self._said = 0
-        self._is_silent = False
-
-    def begin(self) -> None:
-        """Called when a simulator was initialized, with the newest status: asks for the next."""
-        self._lcm.HandleSubscriptions(0)
-        self._taken = self._statuses.count
-        self._say()
-
-    def advance(self, simulator: Simulator, steps: int) -> None:
-        """Advances by so many periods of `TORQUE_PERIOD`."""
-        start = simulator.get_context().get_time()
-        for step in range(steps):
-            # A robot that has fallen silent is not waited for again and again.
-            patience = TORQUE_PERIOD if self._is_silent else self._patience
-            for _ in range(10):
-                if self._statuses.count > self._taken:
-                    break
-                self._lcm.HandleSubscriptions(max(1, int(1000 * patience / 10)))
-            self._is_silent = self._statuses.count == self._taken
-            self._taken = self._statuses.count
-            simulator.AdvanceTo(start + (step + 1) * TORQUE_PERIOD)
-            self._say()
-
-    def _say(self) -> None:
-        self._said += 1
-        self._lcm.Publish(self._answers, struct.pack(">q", self._said))
-
-
-def drive_in_step(simulator: Simulator, lcm: DrakeLcm, seconds: float, patience: float) -> None:
-    """Advances a hardware station step by step: see `StepByStep`."""
-    pace = StepByStep(lcm, patience)
-    pace.begin()
-    pace.advance(simulator, round(seconds / TORQUE_PERIOD))

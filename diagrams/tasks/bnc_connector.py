@@ -65,6 +65,7 @@ class BncConnector(InsertionTask):
     Options = BncOptions
     options: BncOptions
     workpiece, fixture = "plug", "jack"
+    simulated_rewards = ("aligned",)
     rewards = REWARDS
     observations = OBSERVATIONS
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
@@ -101,6 +102,14 @@ class BncConnector(InsertionTask):
         lever = builder.AddNamedSystem("contact_lever", ContactLever(LEAST_FORCE))
         builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
         return {**super().signals(builder, station), "lever": lever.get_lever_output_port()}
+
+    def seen_by_robot(self) -> tuple[np.ndarray, np.ndarray]:
+        """Height and turn tell whether it is locked. How far beside the jack it is nobody knows: a pull tells."""
+        size = self._workcell.dimensions
+        D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
+        D[2, 2] = D[5, 3] = 1.0
+        y0[[2, 5]] = size.locked_height, -size.detent_angle
+        return D, y0
 
     def observed(self) -> Sequence[Observed]:
         """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
+from guiderail.diagrams.observation import affine
 from guiderail.diagrams.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets
@@ -34,11 +35,13 @@ class InsertionTask(Task):
 
     Attributes:
         workpiece, fixture: names of their bodies; where the one is in the other is the signal named as the workpiece.
+        simulated_rewards: that ask for more of that signal than a robot can tell.
     """
 
     Reset: ClassVar[type[ResetOptions]] = InsertionReset
     workpiece: ClassVar[str]
     fixture: ClassVar[str]
+    simulated_rewards: ClassVar[tuple[str, ...]] = ()
 
     offsets: HiddenOffsets
     """What a reset draws; made once, as it remembers what is hidden in a run."""
@@ -46,15 +49,27 @@ class InsertionTask(Task):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Where the workpiece really is in the fixture, (6,): position and rotation vector, offsets included.
 
-        Only a simulation knows that.
+        Only a simulation knows that; a robot has what it can tell from its own pose, where somebody wrote that down.
         """
         if not station.HasOutputPort("body_poses"):
-            return {}
+            seen = self.seen_by_robot()
+            if seen is None:
+                return {}
+            told = builder.AddNamedSystem(f"{self.workpiece}_as_seen", affine(*seen))
+            builder.Connect(station.get_pose_output_port(), told.get_input_port())
+            return {self.workpiece: told.get_output_port()}
         plant = station.plant
         relative = RelativePoses(plant, [plant.GetBodyByName(self.workpiece)], plant.GetBodyByName(self.fixture))
         builder.AddNamedSystem(f"{self.workpiece}_in_{self.fixture}", relative)
         builder.Connect(station.GetOutputPort("body_poses"), relative.get_body_poses_input_port())
         return {self.workpiece: relative.get_relative_poses_output_port()}
+
+    def seen_by_robot(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """D (6, 6) and y0 (6,) of D X_TP + y0: where a robot without eyes would say that the workpiece is.
+
+        None where nobody wrote it down: then the task can't be learned on a robot.
+        """
+        return None
 
     def force_limit(self) -> Condition:
         """Ends an episode as a collision where the impedance pushes harder than `collision.above` [N]."""

@@ -69,6 +69,7 @@ def built():
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.ContactLever(0.5),
         systems.ContactWatch(plant, [body], [other], PERIOD),
+        systems.DeputyWatch(period=PERIOD, patience=1.0),
         systems.DesiredPoseRamp(period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),

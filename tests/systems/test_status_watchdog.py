@@ -74,7 +74,7 @@ def test_believes_nobody_before_the_settling_time():
 
 
 WRONG = {
-    Fault.OUT_OF_ORDER: lambda sound: replace(sound, time=sound.time - 3 * PERIOD),
+    Fault.OUT_OF_ORDER: lambda sound: replace(sound, time=sound.time - 1.0),
     Fault.FUTURE: lambda sound: replace(sound, time=sound.time + 1.0),
     Fault.MALFORMED: lambda sound: UNREADABLE,
     Fault.WRONG_SIZE: lambda sound: replace(sound, velocities=np.zeros(3)),
@@ -99,6 +99,7 @@ def test_names_the_fault_believes_nothing_of_it_and_recovers(fault):
         watched.check(watched.sound())
         assert np.abs(watched.state).max() < 0.2
     assert LIMITS.settling <= steps * PERIOD <= LIMITS.settling + 4 * PERIOD
+    watched.check(watched.sound())
     np.testing.assert_array_equal(watched.state, replace_time(watched).values()[:4])
 
 
@@ -170,3 +171,90 @@ def test_refuses_limits_that_make_no_sense(wrong):
 def test_refuses_a_period_that_is_none():
     with pytest.raises(InputError):
         StatusWatchdog(LIMITS, period=0.0)
+
+
+class WithClock(Watched):
+    """The same by the clock on the wall, which goes by itself."""
+
+    def __init__(self):
+        super().__init__()
+        self.wall = 5000.0
+
+    def check(self, status, gap=PERIOD):
+        self.wall += gap
+        self.system.get_clock_input_port().FixValue(self.context, [self.wall])
+        return super().check(status)
+
+    def sound(self, gap=PERIOD):
+        return replace(super().sound(), time=CLOCK + self.wall + gap)
+
+
+def test_by_the_clock_on_the_wall_a_delay_of_ones_own_is_no_fault_of_the_status():
+    """A program that was held up for a few periods finds a status that is as much newer, and goes on."""
+    watched = WithClock().settle()
+    for gap in (3.0, 1.0, 4.0, 0.5):
+        assert watched.check(watched.sound(gap * PERIOD), gap * PERIOD) == Fault.NONE
+        assert watched.age <= PERIOD
+
+
+def test_a_program_that_was_held_up_for_too_long_says_so_and_believes_the_newest_status():
+    watched = WithClock().settle()
+    status = watched.sound(0.2)
+    assert watched.check(status, 0.2) == Fault.LATE
+    np.testing.assert_array_equal(watched.state, status.values()[:4])
+    assert watched.check(watched.sound()) == Fault.LATE  # until it has settled again
+    watched.settle()
+
+
+def test_by_the_clock_on_the_wall_a_status_that_stops_is_stale_however_few_checks_there_were():
+    watched = WithClock().settle()
+    last = watched.sound()
+    watched.check(last)
+    gap = 0.7 * LIMITS.max_gap
+    assert [watched.check(last, gap) for _ in range(2)] == [Fault.NONE, Fault.STALE]
+    assert watched.age == pytest.approx(2.0 * gap)
+
+
+def test_the_limits_follow_from_the_rate():
+    limits = StatusLimits.at_rate((1.0, 2.0), 0.005)
+    assert (limits.max_age, limits.max_lead, limits.max_gap) == (0.03, 0.03, 0.03)
+    with pytest.raises(InputError):
+        StatusLimits((1.0,), max_gap=0.0)
+
+
+def test_a_speed_with_which_nothing_moves_is_never_believed():
+    """The first such status is a jump; the ones after it agree with each other, and with no motion."""
+    watched = Watched().settle()
+    before = watched.state
+    for _ in range(5):
+        sound = watched.sound()
+        assert watched.check(replace(sound, velocities=sound.velocities + 3.0)) == Fault.VELOCITY_JUMP
+        np.testing.assert_array_equal(watched.state[2:], before[2:])
+
+
+def test_a_status_that_was_overtaken_counts_as_none():
+    watched = Watched().settle()
+    late = watched.sound()
+    watched.check(watched.sound())
+    newest = watched.sound()
+    watched.check(newest)
+    changed = replace(late, external_torque=late.external_torque + 50.0)
+    assert watched.check(changed) == Fault.NONE
+    np.testing.assert_array_equal(watched.state, newest.values()[:4])
+    assert watched.age > 0.0
+    assert watched.check(watched.sound()) == Fault.NONE
+
+
+def test_after_a_silence_nothing_is_believed_before_it_has_settled():
+    """How late the statuses are that come then nobody knows."""
+    watched = Watched().settle()
+    before = watched.sound()
+    watched.check(before)
+    for _ in range(20):
+        watched.check(before)
+    assert watched.fault == Fault.STALE
+    late = [replace(watched.sound(), time=watched.sound().time - 0.05 + k * PERIOD) for k in range(10)]
+    for status in late:
+        watched.check(status)
+        np.testing.assert_array_equal(watched.state, before.values()[:4])
+        assert watched.age > LIMITS.max_age

@@ -73,7 +73,8 @@ class Guarded:
         context = self.plant.CreateDefaultContext()
         self.plant.SetPositionsAndVelocities(context, [*POSTURE, *SPEED])
         momentum = self.plant.CalcMassMatrix(context) @ SPEED
-        return -momentum * np.exp(-age / LIMITS.decay_time) / LIMITS.decay_time
+        T = LIMITS.decay_time
+        return -momentum * np.exp(-age / T) * (1.0 - np.exp(-PERIOD / T)) / PERIOD
 
 
 def test_passes_on_what_is_wanted_while_all_is_well(plant):
@@ -166,16 +167,28 @@ def test_never_sends_more_than_the_limits(plant):
     np.testing.assert_array_equal(guarded["safe_torque"], np.clip(np.linspace(-200.0, 200.0, n), -20.0, 20.0))
 
 
-def test_damping_takes_away_no_more_than_the_arm_had(plant):
+@pytest.mark.parametrize("before", [0.0, 0.03])  # [s] for which no status had come when that was found
+def test_damping_takes_away_exactly_what_the_arm_had(plant, before):
     """Where no status comes, the speed is that of the last one for ever: what is taken away in all is its momentum."""
     guarded = Guarded(plant)
     guarded.set(state=[*POSTURE, *(0.1 * SPEED)], status_fault=[Fault.STALE])
     taken = np.zeros(n)
     for step in range(round(LIMITS.damping_time / PERIOD)):
-        guarded.set(status_age=[(step + 0.5) * PERIOD])
+        guarded.set(status_age=[before + step * PERIOD])
         taken += PERIOD * guarded["safe_torque"]
         guarded.go(PERIOD)
-    np.testing.assert_allclose(taken, 0.1 * LIMITS.decay_time * guarded.damping(), rtol=0.01)
+    momentum = -guarded.damping() * PERIOD / (1.0 - np.exp(-PERIOD / LIMITS.decay_time))
+    np.testing.assert_allclose(taken, -0.1 * momentum, rtol=1e-3)
+
+
+def test_what_is_wanted_of_an_arm_that_is_not_seen_fades(plant):
+    guarded = Guarded(plant)
+    sent = []
+    for age in (0.0, 1.0, 1.5, 2.0, 3.0):
+        guarded.set(status_age=[age * PERIOD])
+        sent.append(guarded["safe_torque"])
+    wanted = guarded.ok["torque"]
+    np.testing.assert_allclose(sent, np.outer([1.0, 1.0, 0.5, 0.0, 0.0], wanted))
 
 
 def test_a_silent_robot_is_sent_no_torque_and_then_nothing(plant):

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import gc
 import io
 import json
-import os
-import select
-import signal
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +17,8 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.make import make_skill, resolve
 from guiderail.diagrams.options import Options
-from guiderail.diagrams.stations.hardware import TORQUE_PERIOD, HardwareStation, StepByStep
+from guiderail.diagrams.stations.hardware import HardwareStation
+from guiderail.diagrams.stations.pace import Pace, hurry
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.assemble import SkillDiagram
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -32,55 +26,22 @@ from guiderail.diagrams.trace import Trace
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import FAULTS, Fault
 from guiderail.models.policy import Policy
-from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.models.units import DEGREE, MM
 from guiderail.systems.torque_guard import Phase
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.operate.checks import Check, check_robot, read_out
+from guiderail.tools.operate.crawl import CRAWL, crawl, distance, is_near
+from guiderail.tools.operate.keys import listening, no_pauses
+from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.rollouts.ledger import ledger_file, table
 
-CRAWL, CRAWL_TURN = 0.02, 0.1  # [m/s], [rad/s] of the approach
-FARTHEST, FARTHEST_TURN = 0.15, 1.0  # [m], [rad] from the skill's start, beyond which nobody wants to approach it alone
-NEAR, NEAR_TURN = 3.0 * MM, 2.0 * DEGREE  # of the start, to begin there
-SETTLE = 0.5  # [s], after the approach
-STANDSTILL = 0.05  # [rad/s] of a joint
-UNLOADED = 5.0  # [N]: what a robot feels at rest whose payload is known to it
 SIGNALS = {"wrench": 6, "saturation": 1, "holding": 1, "fallback": 1, "commanded_violation": 1, "fault": 1, "phase": 1}
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
-PATIENCE = 3.0  # [s] of wall clock that a rehearsal waits for a status
+LISTENING = 20  # statuses before anything is judged
+WARM_UP = 0.1  # [s], less than a driver's hold-off
 
 Say = Callable[[str], None]
-
-
-class Pace(Protocol):
-    """How time passes."""
-
-    def begin(self) -> None:
-        """Called when a simulator was initialized."""
-
-    def advance(self, simulator: Simulator, steps: int) -> None:
-        """Advances by so many periods of the station."""
-
-
-class RealTime:
-    """The wall's clock: a real robot waits for nobody."""
-
-    def begin(self) -> None:
-        """Nothing: an initialization starts the clock."""
-
-    def advance(self, simulator: Simulator, steps: int) -> None:
-        """Advances by so many periods of the station."""
-        simulator.set_target_realtime_rate(1.0)
-        simulator.AdvanceTo(simulator.get_context().get_time() + steps * TORQUE_PERIOD)
-
-
-@dataclass(frozen=True)
-class Check:
-    """What a person should know before the arm moves, and whether it is as it should be."""
-
-    name: str
-    words: str
-    is_well: bool = True
 
 
 @dataclass(frozen=True)
@@ -117,9 +78,11 @@ class Operation:
         self._skills_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
         # The guidance begins with its first control step. So another station on the same bus approaches the start.
         self._station = self._skills_station.alike(task.world())
-        self._steps = round(skill.control_period / TORQUE_PERIOD)
+        self._steps = round(skill.control_period / self._skills_station.period)
         self._start = task.start(np.random.default_rng(0))
         self._simulator = self._initialized()
+        # A deputy may need a status or two to be heard; nothing is sent so soon.
+        pace.advance(self._simulator, self._station, LISTENING)
         self.trace = Trace(skill.num_steps, 6, skill.control_period, SIGNALS)
         self._joints: dict[str, list[np.ndarray]] = {name: [] for name in JOINT_SIGNALS}
 
@@ -131,51 +94,15 @@ class Operation:
         return simulator
 
     def checks(self) -> list[Check]:
-        """What the robot's first status says, and what is assumed of it."""
-        station, context = self._station, self._simulator.get_context()
-        plant, arm = station.known.plant, station.known.arm
-        pose = station.get_pose_output_port().Eval(context)
-        away, turned = _distance(pose, self._start)
-        name = station.driver.name
-        positions, velocities = (
-            station.GetOutputPort(f"{name}.{signal}").Eval(context)
-            for signal in ("position_measured", "velocity_estimated")
-        )
-        external = station.GetOutputPort(f"{name}.torque_external").Eval(context)
-        force = float(np.linalg.norm(station.force_of(positions, external)))
-        fastest = float(np.abs(velocities).max())
-        p_WT = arm.target.CalcPoseInWorld(plant.CreateDefaultContext()).translation()
-        lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
-        payload = sum(body.default_mass() for body in arm.tool)
-        load = station.load_of_force(positions).max()
-        limits = station.limits
-        return [
-            Check("robot", f"{name}, {len(positions)} joints, {station.driver.status_channel}"),
-            Check(
-                "joints",
-                f"{np.rad2deg(positions).round(1).tolist()} degrees",
-                bool((lower < positions).all() and (positions < upper).all()),
-            ),
-            Check("standstill", f"fastest joint {fastest:.3f} rad/s", fastest < STANDSTILL),
-            Check("payload", f"{payload:.2f} kg bolted to the flange, as the robot must have been told"),
-            Check("load", f"{force:.1f} N felt at rest", force < UNLOADED),
-            Check("target", f"at {p_WT} m of the base"),
-            Check("tool", f"at {pose[:3].round(4)} m and {np.rad2deg(pose[3:]).round(1)} degrees of the target"),
-            Check(
-                "start",
-                f"{away / MM:.0f} mm and {turned / DEGREE:.0f} degrees away",
-                away < FARTHEST and turned < FARTHEST_TURN,
-            ),
-            Check("force", f"at most {max(station.impedance.limits[:3]):.0f} N commanded, {limits.force:.0f} N felt"),
-            Check("torques", f"at most {list(limits.torque)} Nm sent; the full force takes {load:.0%} of the nearest"),
-            Check("workspace", f"from {limits.lower} to {limits.upper} m around the target"),
-        ]
+        """What the robot's first statuses say, and what is assumed of it."""
+        return check_robot(self._station, self._simulator.get_context(), self._start)
 
     def run(self, say: Say) -> Outcome:
         """Takes over where the arm is, approaches the skill's start at a crawl, executes it, and lets the arm rest.
 
         The arm is brought to rest whatever is raised, such as by a policy that returns no action.
         """
+        self._warm_up()
         self._simulator = self._initialized()
         here = self._station.get_pose_output_port().Eval(self._simulator.get_context()).copy()
         say(f"taking over, and approaching the start at {CRAWL / MM:.0f} mm/s")
@@ -191,10 +118,20 @@ class Operation:
         self._rest()
         return stopped
 
+    def _warm_up(self) -> None:
+        """Whatever is called for the first time takes longer than the arm could wait between approach and skill.
+
+        The skill's station hears statuses here, and is not yet settled enough to send anything.
+        """
+        simulator = Simulator(self._diagram)
+        self._skills_station.start(simulator)
+        self._pace.begin()
+        self._pace.advance(simulator, self._skills_station, round(WARM_UP / self._skills_station.period))
+
     def _rest(self) -> None:
         station, context = self._acting()
         station.stop(context)
-        self._pace.advance(self._simulator, round((station.limits.damping_time + 0.1) / TORQUE_PERIOD))
+        self._pace.advance(self._simulator, station, round((station.limits.damping_time + 0.1) / station.period))
 
     def _give_back(self) -> None:
         """Lets the station that approached go on instead of the skill, which can't be advanced any more."""
@@ -211,8 +148,8 @@ class Operation:
 
     def _step(self) -> Outcome | None:
         """Advances by a control step; how it ended, if it did."""
-        self._pace.advance(self._simulator, self._steps)
         station, root = self._acting()
+        self._pace.advance(self._simulator, station, self._steps)
         context = station.GetMyContextFromRoot(root)
         phase, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("phase", "fault"))
         force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
@@ -229,7 +166,6 @@ class Operation:
     def _approach(self, here: np.ndarray) -> Outcome | None:
         station, context = self._station, self._simulator.get_mutable_context()
         desired = station.get_desired_pose_input_port()
-        away, turned = _distance(here, self._start)
         ready = 0.0
         while station.get_phase_output_port().Eval(context)[0] != Phase.RUNNING:
             desired.FixValue(context, here)
@@ -239,14 +175,13 @@ class Operation:
             if ready > 5.0:
                 fault = Fault(int(station.get_fault_output_port().Eval(context)[0]))
                 return Outcome(fault, f"could not take over: {FAULTS[fault]}", 0)
-        moving = int(np.ceil(max(away / CRAWL, turned / CRAWL_TURN) / self._skill.control_period)) or 1
-        change = _difference(self._start, here)
-        for step in range(1, moving + round(SETTLE / self._skill.control_period)):
-            desired.FixValue(context, here + min(step / moving, 1.0) * change)
+        for pose in crawl(here, self._start, self._skill.control_period):
+            desired.FixValue(context, pose)
             if (stopped := self._step()) is not None:
                 return stopped
-        away, turned = _distance(station.get_pose_output_port().Eval(context), self._start)
-        if away > NEAR or turned > NEAR_TURN:
+        there = station.get_pose_output_port().Eval(context)
+        if not is_near(there, self._start):
+            away, turned = distance(there, self._start)
             words = f"the arm did not reach the start: {away / MM:.1f} mm and {turned / DEGREE:.1f} degrees are left"
             return Outcome(Fault.NONE, words, 0)
         return None
@@ -291,8 +226,9 @@ class Operation:
         folder.mkdir(parents=True, exist_ok=True)
         number = len(list(folder.glob("episode-*.json")))
         ledger = table(self.trace, number)
+        joints = self._station.known.plant.num_positions()
         for name, values in self._joints.items():
-            for joint, column in enumerate(np.reshape(values, (len(self.trace), -1)).T):
+            for joint, column in enumerate(np.reshape(values, (len(self.trace), joints)).T):
                 ledger = ledger.append_column(f"{name}_{joint}", pa.array(column))
         file = io.BytesIO()
         pq.write_table(ledger, file, compression="NONE", use_dictionary=False)
@@ -304,11 +240,9 @@ class Operation:
 
 def run_policy(
     run: Path,
+    other: Other,
     *,
     station: str = "hardware",
-    lcm_url: str = "",
-    robot: str = DEFAULT_ROBOT,
-    rehearse: bool = False,
     yes: bool = False,
     out: Path | None = None,
     say: Say = print,
@@ -317,10 +251,8 @@ def run_policy(
 
     Args:
         run: the folder of a run.
+        other: the other end of the bus.
         station: a real one.
-        lcm_url: of the bus; LCM's own default where it is empty, and in a rehearsal one of this process alone.
-        robot: which arm.
-        rehearse: a simulated robot stands in, in a process of its own.
         yes: what is read out is confirmed.
         out: the folder of what is recorded; `hardware` in the run unless given.
         say: what a person is told.
@@ -330,45 +262,36 @@ def run_policy(
     """
     folder = RunFolder(run)
     config, policy = folder.config(), Policy.load(folder.path)
-    environment = _on_a_robot(config.task, config.environment, station)
-    if rehearse:
-        # With a time to live of zero no message leaves this machine.
-        lcm_url = lcm_url or f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
-    environment |= {"station": station, "lcm_url": lcm_url, "robot": robot}
-    if rehearse:
-        environment["robot_timeout"] = 60.0  # it starts with this command
+    environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
     task = resolve(config.task, environment).task
     if not isinstance(task, InsertionTask):
         raise InputError(f"{config.task} has no pose that an arm could approach to begin: run an insertion")
     skill = make_skill(config.task, policy, **environment)
-    bus = skill.diagram.GetSubsystemByName("station")
-    with _stand_in(config.task, robot, lcm_url) if rehearse else _nothing(), _stop_key() as is_stopped:
-        pace: Pace = StepByStep(bus.lcm, PATIENCE, bus.driver.status_channel) if rehearse else RealTime()
-        say(f"waiting for a status of {robot} on {lcm_url or 'the default bus'}, channel {bus.driver.status_channel}")
-        operation = Operation(task, skill, pace, is_stopped)
+    bus: HardwareStation = skill.diagram.GetSubsystemByName("station")
+    with other.standing_in(config.task, environment["lcm_url"]), listening() as keys:
+        pace, clock = other.paces(bus)
+        say(f"waiting for {other.robot} on {environment['lcm_url'] or 'LCM'}, channel {bus.driver.status_channel}")
+        operation = Operation(task, skill, pace, keys.stops)
         checks = operation.checks()
-        for check in checks:
-            say(f"{'ok ' if check.is_well else 'NOT'}  {check.name:<12}{check.words}")
-        wrong = [check for check in checks if not check.is_well]
-        if wrong:
-            raise InputError(f"the arm stays where it is: {wrong[0].name}: {wrong[0].words}")
-        if not yes:
-            _confirm()
+        read_out(checks, say, is_confirmed=yes)
+        if not other.lockstep and not hurry():
+            say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
         say("Enter or Ctrl-C stops the arm")
-        with _no_pauses():
+        with no_pauses():
             outcome = operation.run(say)
-    found = {
+    found: dict[str, Any] = {
         "task": config.task,
         "run": folder.path.name,
-        "robot": robot,
-        "rehearsal": rehearse,
+        "robot": other.robot,
+        "rehearsal": other.rehearse,
         "outcome": outcome.words,
         "fault": outcome.fault.name,
         "steps": outcome.steps,
         "checks": {check.name: check.words for check in checks},
+        **other.timing(bus, clock),
     }
     if outcome.steps:
-        away, turned = _distance(operation.trace.measured[-1], np.zeros(6))
+        away, turned = distance(operation.trace.measured[-1], np.zeros(6))
         found |= {"millimetres_from_target": away / MM, "degrees_from_target": turned / DEGREE}
         found["peak_force"] = float(operation.trace.force.max())
         say(f"ended {away / MM:.1f} mm and {turned / DEGREE:.1f} degrees from the nominal target")
@@ -376,83 +299,10 @@ def run_policy(
     return outcome.exit_code
 
 
-def _on_a_robot(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
+def on_a_robot(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
     """An environment's options without those of the station that it was learned on."""
     kind = STATIONS.get(station)
     if kind.simulated:
         raise InputError(f"station {station!r} is a simulation: watch the policy there by guiderail replay")
     learned_on = STATIONS.get(resolve(task, environment).station.name).options or Options
     return {name: value for name, value in environment.items() if name not in learned_on.model_fields}
-
-
-def _difference(to: np.ndarray, at: np.ndarray) -> np.ndarray:
-    change = to - at
-    change[3:] = (change[3:] + np.pi) % (2.0 * np.pi) - np.pi
-    return change
-
-
-def _distance(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Between two poses [m], and between the farthest of their angles [rad]."""
-    change = _difference(one, other)
-    return float(np.linalg.norm(change[:3])), float(np.abs(change[3:]).max())
-
-
-def _confirm() -> None:
-    if not sys.stdin.isatty():
-        raise InputError("nobody is there to confirm this: read it, and say --yes")
-    if input("Is all of this so, and is the workspace clear? Type yes: ").strip().lower() != "yes":
-        raise InputError("not confirmed: nothing has moved")
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield
-
-
-@contextmanager
-def _no_pauses() -> Iterator[None]:
-    """A garbage collection takes longer than a robot waits for a command."""
-    gc.collect()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
-
-
-@contextmanager
-def _stop_key() -> Iterator[Callable[[], bool]]:
-    """Whether Enter or Ctrl-C was pressed since; the second Ctrl-C ends the process."""
-    pressed: list[int] = []
-
-    def press(number: int, frame: object) -> None:
-        pressed.append(number)
-        signal.signal(signal.SIGINT, before)
-
-    def is_stopped() -> bool:
-        if not pressed and sys.stdin.isatty() and select.select([sys.stdin], [], [], 0.0)[0]:
-            sys.stdin.readline()
-            pressed.append(0)
-        return bool(pressed)
-
-    before = signal.signal(signal.SIGINT, press)
-    try:
-        yield is_stopped
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def _stand_in(task: str, robot: str, lcm_url: str) -> Iterator[None]:
-    """A simulated robot in a process of its own."""
-    if robot != DEFAULT_ROBOT:
-        raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver to rehearse with, not {robot}")
-    arguments = ["serve-iiwa", "--url", lcm_url, "--task", task, "--patience", "30"]
-    call = f"from guiderail.tools.command import main; main({arguments!r})"
-    # Ctrl-C is meant for us: a robot that ends can't come to rest.
-    process = subprocess.Popen([sys.executable, "-c", call], start_new_session=True)
-    try:
-        yield
-    finally:
-        process.terminate()
-        process.wait()

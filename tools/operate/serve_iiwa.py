@@ -1,30 +1,50 @@
 """`guiderail serve-iiwa`: a simulated iiwa at the other end of LCM, in a process of its own."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.make import resolve
-from guiderail.diagrams.stations.hardware import SimulatedIiwa, serve
+from guiderail.diagrams.options import validated
+from guiderail.diagrams.stations.deputy import Deputy
+from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa, safety_limits
+from guiderail.diagrams.stations.pace import hurry, serve, serve_in_real_time
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.errors import InputError
+from guiderail.tools.operate.scenario import load_scenario
 
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # the plug above the jack
 TASK = "BncConnector"
 ASIDE = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # of where another task starts: a robot is never just there
+PLANT_SHARE = 5  # plant steps to a status in real time: the arm's own loop has 1 kHz
 
 
-def serve_iiwa(url: str, seconds: float, patience: float, task: str = TASK, *, real_time: bool = False) -> bool:
+def serve_iiwa(
+    url: str,
+    seconds: float,
+    patience: float,
+    task: str = TASK,
+    *,
+    rate: float | None = None,
+    offset: Sequence[float] | None = None,
+    scenario: Path | None = None,
+) -> bool:
     """Serves the arm in front of a task's fixture; whether commands kept coming until the end.
 
-    Unless in real time, it waits for an answer to every status: so neither side outruns the other on a slow machine.
+    A deputy stands by. Unless a rate is given it waits for an answer to every status: so neither side outruns the other
+    on a slow machine.
 
     Args:
         url: LCM's; its own default where it is empty.
         seconds: of simulated time.
         patience: how long to wait for a command [s].
         task: an insertion.
-        real_time: it goes by the wall's clock, as a robot does, and waits for nobody.
+        rate: it goes by the wall's clock, as a robot does, or so much slower, and waits for nobody.
+        offset: (x, y) of the fixture from where it is thought to be [m].
+        scenario: a file that says what stands around it; see `load_scenario`.
 
     Raises:
         InputError: if the task is none.
@@ -33,12 +53,30 @@ def serve_iiwa(url: str, seconds: float, patience: float, task: str = TASK, *, r
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: serve an insertion")
     start = START if task == TASK else declared.start(np.random.default_rng(0)) + ASIDE
-    lcm = DrakeLcm(url)
-    robot = SimulatedIiwa(declared.world(), lcm)
-    if real_time:
-        simulator = Simulator(robot)
-        robot.set_pose(simulator.get_mutable_context(), start)
-        simulator.set_target_realtime_rate(1.0)
-        simulator.AdvanceTo(seconds)
-        return True
-    return serve(robot, lcm, start, seconds, patience) >= seconds
+    directives = [] if scenario is None else load_scenario(scenario).directives
+    lcm, driver = DrakeLcm(url), IIWA_DRIVER
+    robot = SimulatedIiwa(
+        declared.world(), lcm, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
+    )
+    simulator = Simulator(robot)
+    robot.set_pose(simulator.get_mutable_context(), start)
+    # The deputy has ears of its own: beside a real driver it is another process.
+    ears = lcm if rate is None else DrakeLcm(url)
+    Deputy(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
+    if offset is not None:
+        if len(offset) != 2:
+            raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
+        fixture, workpiece = declared.offsets.draw(
+            np.random.default_rng(0), validated(declared.Reset, {"offset": tuple(offset)}, "a robot")
+        )
+        declared.move(robot, simulator.get_mutable_context(), fixture, workpiece)
+    simulator.Initialize()
+    if rate is None:
+        return serve(simulator, lcm, driver, seconds, patience) >= seconds
+    hurry()
+
+    def attend() -> None:
+        ears.HandleSubscriptions(0)
+
+    serve_in_real_time(simulator, driver, seconds, attend, rate)
+    return True

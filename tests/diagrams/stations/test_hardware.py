@@ -15,13 +15,12 @@ from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.hardware import (
     IIWA_DRIVER,
-    TORQUE_PERIOD,
     HardwareStation,
     SimulatedIiwa,
-    drive_in_step,
     find_driver,
     safety_limits,
 )
+from guiderail.diagrams.stations.pace import StepByStep
 from guiderail.diagrams.stations.rails import RailsStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.errors import InputError
@@ -30,6 +29,7 @@ from guiderail.systems.torque_guard import Phase
 from guiderail.tools.operate.serve_iiwa import START
 
 WORKCELL = BncWorkcell()
+PERIOD = IIWA_DRIVER.period
 ALIASES = ("position_measured", "velocity_estimated", "state_estimated", "torque_external", "torque_commanded")
 
 
@@ -66,11 +66,11 @@ class OneProcess:
     def go(self, pose, seconds, robot=True):
         """Both for some time, or the station alone: then no status comes."""
         self.desired.GetMutableData().set_value(pose)
-        for _ in range(round(seconds / TORQUE_PERIOD)):
+        for _ in range(round(seconds / PERIOD)):
             self._steps += 1
             if robot:
-                self.robot_simulator.AdvanceTo(self._steps * TORQUE_PERIOD)
-            self.simulator.AdvanceTo(self._steps * TORQUE_PERIOD)
+                self.robot_simulator.AdvanceTo(self._steps * PERIOD)
+            self.simulator.AdvanceTo(self._steps * PERIOD)
             self.torques.append(self["iiwa.torque_commanded"].copy())
 
     def __getitem__(self, port):
@@ -112,7 +112,9 @@ def test_two_processes_on_one_machine(monkeypatch):
         station.get_desired_pose_input_port().FixValue(context, goal)
         station.start(simulator)
         before = station.get_pose_output_port().Eval(context).copy()
-        drive_in_step(simulator, lcm, 1.4, patience=5.0)
+        pace = StepByStep(lcm, 5.0, IIWA_DRIVER.status_channel)
+        pace.begin()
+        pace.advance(simulator, station, round(1.4 / PERIOD))
         after = station.get_pose_output_port().Eval(context)
         np.testing.assert_allclose(before, START, atol=1e-4)
         assert np.linalg.norm((after - goal)[:3]) < 0.2 * np.linalg.norm((before - goal)[:3])
@@ -123,7 +125,7 @@ def status(both, **changed):
     """The next status as the robot would send it at rest, with some fields changed."""
     message = lcmt_iiwa_status()
     positions = both["iiwa.position_measured"].tolist()
-    message.utime, message.num_joints = round((both.context.get_time() + TORQUE_PERIOD) * 1e6), 7
+    message.utime, message.num_joints = round((both.context.get_time() + PERIOD) * 1e6), 7
     for name in message.__slots__[2:]:
         setattr(message, name, [0.0] * 7)
     message.joint_position_measured = positions
@@ -156,7 +158,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     wrong = bytes(range(100)) if changed is None else status(both, **changed)
     both.torques.clear()
     both.lcm.Publish("IIWA_STATUS", wrong)
-    both.go(goal, TORQUE_PERIOD, robot=False)
+    both.go(goal, PERIOD, robot=False)
     assert both.fault == fault
     both.go(goal, 0.1)
     assert both.phase == Phase.DAMPING
@@ -186,7 +188,7 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     both.torques.clear()
     both.go(goal, 0.5, robot=False)
     found = next(step for step, torque in enumerate(both.torques) if (torque @ moving < 0.0) or not torque.any())
-    assert found * TORQUE_PERIOD <= 0.05
+    assert found * PERIOD <= 0.05
     assert (both.phase, both.fault) == (Phase.OFF, Fault.STALE)
     sent = len(both.commands)
     assert both.commands[-1].joint_torque == (0.0,) * 7
@@ -194,7 +196,7 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     assert len(both.commands) == sent
     # The robot is back: nothing is sent to it before it has settled, and then no torque.
     back = len(both.torques)
-    both.robot_simulator.AdvanceTo(both.robot_simulator.get_context().get_time() + TORQUE_PERIOD)
+    both.robot_simulator.AdvanceTo(both.robot_simulator.get_context().get_time() + PERIOD)
     both.go(goal, 0.2)
     assert len(both.commands) == sent
     both.go(goal, 0.2)
@@ -235,8 +237,8 @@ def test_another_station_takes_over_without_letting_go():
     other.take_over(context, both.context)
     time = both.robot_simulator.get_context().get_time()
     for step in range(1, 40):
-        both.robot_simulator.AdvanceTo(time + step * TORQUE_PERIOD)
-        simulator.AdvanceTo(step * TORQUE_PERIOD)
+        both.robot_simulator.AdvanceTo(time + step * PERIOD)
+        simulator.AdvanceTo(step * PERIOD)
         assert (other.get_phase_output_port().Eval(context)[0], other.get_fault_output_port().Eval(context)[0]) == (
             2,
             0,

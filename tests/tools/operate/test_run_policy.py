@@ -6,50 +6,30 @@ import numpy as np
 import pandas as pd
 import pytest
 from drake import lcmt_iiwa_command
+from injections.together import Together
 from pydrake.lcm import DrakeLcm
-from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.make import make_skill, resolve
-from guiderail.diagrams.stations.hardware import TORQUE_PERIOD, HardwareStation, SimulatedIiwa
+from guiderail.diagrams.stations.hardware import HardwareStation
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
 from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.command import main
-from guiderail.tools.operate import run_policy
+from guiderail.tools.operate import checks, run_policy
+from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.run_policy import Operation
 from guiderail.tools.operate.serve_iiwa import START
 
 OPTIONS = {"station": "hardware", "guidance": "kmp", "uncertainty": "known"}
 
 
-class Together:
-    """Steps a simulated robot and whoever drives it in turn; at some step something may happen."""
-
-    def __init__(self, workcell, lcm, start):
-        self.robot = SimulatedIiwa(workcell, lcm)
-        self.simulator = Simulator(self.robot)
-        self.robot.set_pose(self.simulator.get_mutable_context(), start)
-        self.simulator.Initialize()
-        self.step, self.happens, self.is_silent = 0, {}, False
-
-    def begin(self):
-        pass
-
-    def advance(self, simulator, steps):
-        start = simulator.get_context().get_time()
-        for step in range(steps):
-            self.step += 1
-            self.happens.get(self.step, lambda: None)()
-            if not self.is_silent:
-                self.simulator.AdvanceTo(self.step * TORQUE_PERIOD)
-            simulator.AdvanceTo(start + (step + 1) * TORQUE_PERIOD)
-
-
 @pytest.fixture
 def operated(monkeypatch):
     """From where the robot starts, and a policy, to an operation and its robot."""
 
-    def operated(start=START, policy=lambda observation: np.zeros(2), num_steps=20, is_stopped=lambda: False):
+    def operated(
+        start=START, policy=lambda observation: np.zeros(2), num_steps=20, is_stopped=lambda: False, deputy=True
+    ):
         lcm = DrakeLcm("memq://")
         with monkeypatch.context() as patch:
             # The skill's station makes its own bus from a URL, and a bus in memory is known to its maker alone.
@@ -57,7 +37,7 @@ def operated(monkeypatch):
             skill = make_skill("BncConnector", policy, **OPTIONS)
         task = resolve("BncConnector", OPTIONS).task
         monkeypatch.setattr(type(task), "num_steps", num_steps)
-        pace = Together(task.world(), lcm, start)
+        pace = Together(task.world(), lcm, start, deputy)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
         return Operation(task, skill, pace, is_stopped), pace
 
@@ -83,15 +63,22 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
     assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "done"
 
 
-def test_a_policy_that_returns_no_action_leaves_the_arm_at_rest(operated):
-    operation, pace = operated(policy=lambda observation: np.full(2, np.nan))
+@pytest.mark.parametrize("sound", [0, 2])  # of its actions: it is asked once before anything moves
+def test_a_policy_that_returns_no_action_leaves_the_arm_at_rest(operated, sound):
+    asked = []
+
+    def policy(observation):
+        asked.append(observation)
+        return np.full(2, 0.0 if len(asked) <= sound else np.nan)
+
+    operation, pace = operated(policy=policy)
     commands = []
     operation._station.lcm.Subscribe(
         "IIWA_COMMAND", lambda message: commands.append(lcmt_iiwa_command.decode(message).joint_torque)
     )
     with pytest.raises(PolicyError):
         operation.run(print)
-    assert commands[-1] == (0.0,) * 7
+    assert commands[-1:] == ([(0.0,) * 7] if sound else [])
     velocities = pace.robot.plant.GetVelocities(pace.robot.plant.GetMyContextFromRoot(pace.simulator.get_context()))
     assert np.abs(velocities).max() < 0.01
 
@@ -128,9 +115,9 @@ def test_a_robot_far_from_the_start_is_not_moved(operated):
 
 def test_no_task_without_a_start_and_no_simulated_station(monkeypatch):
     with pytest.raises(InputError, match="is a simulation"):
-        run_policy._on_a_robot("BncConnector", {}, "rails")
+        run_policy.on_a_robot("BncConnector", {}, "rails")
     environment = resolve("BncConnector", {"station": "arm", "robot": "panda"}).values
-    assert "end_effector" not in run_policy._on_a_robot("BncConnector", environment, "hardware")
+    assert "end_effector" not in run_policy.on_a_robot("BncConnector", environment, "hardware")
 
 
 def test_what_a_person_gave_wrong_ends_with_2(capsys, tmp_path):
@@ -142,13 +129,39 @@ def test_what_a_person_gave_wrong_ends_with_2(capsys, tmp_path):
 
 def test_nobody_confirms_for_a_person(monkeypatch):
     with pytest.raises(InputError, match="--yes"):
-        run_policy._confirm()
+        checks.confirm("So?")
     monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
     monkeypatch.setattr("builtins.input", lambda words: "no")
-    with pytest.raises(InputError, match="nothing has moved"):
-        run_policy._confirm()
+    with pytest.raises(InputError, match="nothing moves"):
+        checks.confirm("So?")
     monkeypatch.setattr("builtins.input", lambda words: "yes")
-    run_policy._confirm()
+    checks.confirm("So?")
+
+
+def test_a_check_that_fails_is_never_confirmed():
+    said = []
+    with pytest.raises(InputError, match="stays where it is: load"):
+        checks.read_out([checks.Check("load", "9 N", False)], said.append, is_confirmed=True)
+    assert said == ["NOT  load        9 N"]
+
+
+def test_an_arm_whose_driver_does_not_stop_it_needs_a_deputy(operated):
+    operation, _ = operated(deputy=False)
+    (wrong,) = [check for check in operation.checks() if not check.is_well]
+    assert wrong.name == "deputy"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"lockstep": True}, "waits for nobody"),
+        ({"rehearse": True, "robot": "panda"}, "only the"),
+        ({"rate": 0.0}, "rate"),
+    ],
+)
+def test_refuses_another_end_that_makes_no_sense(wrong, words):
+    with pytest.raises(InputError, match=words):
+        Other(**wrong)
 
 
 def test_the_stations_of_an_operation_have_the_same_limits():

@@ -1,0 +1,245 @@
+"""How time passes between a station on a bus and its robot: by the wall's clock, or in step."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface, Subscriber
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+
+from guiderail.diagrams.stations.driver import STATUS_PERIOD, Driver
+from guiderail.models.errors import InputError
+
+TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
+REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
+URGENCY = 20  # of a process that a robot waits for, among those that the system serves first
+HEAD = 16  # bytes of a message: its type, and the time that a status or a command begins with
+BIN = 1e-4  # [s] of a histogram
+
+
+class Clocked(Protocol):
+    """A station that can be told the time."""
+
+    def tell_time(self, context: Context, clock: float) -> None:
+        """The time on the wall [s]; `context` is the root's."""
+
+
+class Pace(Protocol):
+    """How time passes."""
+
+    def begin(self) -> None:
+        """Called when a simulator was initialized."""
+
+    def advance(self, simulator: Simulator, station: Clocked, steps: int) -> None:
+        """Advances by so many statuses."""
+
+
+class NewMessages:
+    """Counts the messages of a channel; one that is sent again counts once, whatever torques it says by then."""
+
+    def __init__(self, lcm: DrakeLcmInterface, channel: str):
+        """
+        Args:
+            lcm: the bus.
+            channel: its channel.
+        """
+        self.count = 0
+        self._last = b""
+        lcm.Subscribe(channel, self._hear)
+
+    def _hear(self, message: bytes) -> None:
+        if message[:HEAD] != self._last:
+            self._last, self.count = message[:HEAD], self.count + 1
+
+
+class Gaps:
+    """How regularly something happened: seconds between one time and the next, in a histogram."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(1000, np.int64)
+        self.longest = 0.0
+
+    def add(self, seconds: float) -> None:
+        """One more."""
+        self._counts[min(int(seconds / BIN), len(self._counts) - 1)] += 1
+        self.longest = max(self.longest, seconds)
+
+    def quantile(self, share: float) -> float:
+        """Which gap this share of them does not exceed [s], to a tenth of a millisecond; NaN of none."""
+        total = self._counts.sum()
+        if not total:
+            return np.nan
+        return (int(np.searchsorted(np.cumsum(self._counts), share * total)) + 1) * BIN
+
+
+def hurry() -> bool:
+    """Asks the system to serve this process before others, as a robot waits for it; whether it will."""
+    try:
+        # Processes that this one starts are as any other.
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(URGENCY))
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+class RealTime:
+    """Advances a hardware station by the wall's clock: a step for each status, as it arrives.
+
+    Where none comes for one and a half periods a step goes without, and the station's watchdog notices. Of statuses
+    that came while this program was held up only the newest counts: it never hurries after the time that it lost.
+
+    Attributes:
+        gaps: between steps.
+    """
+
+    def __init__(self, lcm: DrakeLcmInterface, channel: str, period: float = STATUS_PERIOD, rate: float = 1.0):
+        """
+        Args:
+            lcm: the bus.
+            channel: of the statuses.
+            period: in which they come [s].
+            rate: of the robot's clock to the wall's, positive: less than 1 where a simulated robot is slow.
+
+        Raises:
+            InputError: if the rate is not positive.
+        """
+        if not 0.0 < rate <= 1.0:
+            raise InputError(f"a robot's clock goes as the wall's or slower, at a rate up to 1, not {rate}")
+        self.gaps = Gaps()
+        self._lcm, self._period, self._rate = lcm, period, rate
+        self._statuses = NewMessages(lcm, channel)
+        self._taken, self._last = 0, time.monotonic()
+
+    def begin(self) -> None:
+        """Called when a simulator was initialized, with the newest status."""
+        self._lcm.HandleSubscriptions(0)
+        self._taken, self._last = self._statuses.count, time.monotonic()
+
+    def advance(self, simulator: Simulator, station: Clocked, steps: int) -> None:
+        """Advances by so many statuses."""
+        context = simulator.get_mutable_context()
+        start = context.get_time()
+        for step in range(steps):
+            self._wait()
+            self._taken, now = self._statuses.count, time.monotonic()
+            self.gaps.add(now - self._last)
+            self._last = now
+            station.tell_time(context, now * self._rate)
+            simulator.AdvanceTo(start + (step + 1) * self._period)
+
+    def _wait(self) -> None:
+        # Whoever floods the bus doesn't set the pace.
+        period = self._period / self._rate
+        time.sleep(max(self._last + 0.5 * period - time.monotonic(), 0.0))
+        end = self._last + 1.5 * period
+        while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
+            self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
+        self._lcm.HandleSubscriptions(0)
+
+
+class StepByStep:
+    """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
+
+    After each it says so, for `serve`, which waits for it.
+    """
+
+    def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str, period: float = STATUS_PERIOD):
+        """
+        Args:
+            lcm: the bus.
+            patience: how long to wait for a status [s]; then steps go without, and the station's watchdog notices.
+            channel: of the statuses.
+            period: in which they come [s].
+        """
+        self._lcm, self._patience, self._answers, self._period = lcm, patience, channel + TAKEN, period
+        self._statuses = NewMessages(lcm, channel)
+        self._taken = self._said = 0
+        self._is_silent = False
+
+    def begin(self) -> None:
+        """Called when a simulator was initialized, with the newest status: asks for the next."""
+        self._lcm.HandleSubscriptions(0)
+        self._taken = self._statuses.count
+        self._say()
+
+    def advance(self, simulator: Simulator, station: Clocked, steps: int) -> None:
+        """Advances by so many statuses; nobody needs the time on the wall."""
+        start = simulator.get_context().get_time()
+        for step in range(steps):
+            # A robot that has fallen silent is not waited for again and again.
+            patience = self._period if self._is_silent else self._patience
+            end = time.monotonic() + patience
+            while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
+                self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
+            self._is_silent = self._statuses.count == self._taken
+            self._taken = self._statuses.count
+            simulator.AdvanceTo(start + (step + 1) * self._period)
+            self._say()
+
+    def _say(self) -> None:
+        self._said += 1
+        self._lcm.Publish(self._answers, struct.pack(">q", self._said))
+
+
+def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, patience: float) -> float:
+    """Runs a simulated arm for another process: one step, then it waits until its status was answered.
+
+    So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
+    has taken the status in; where that never came, it is a command.
+
+    Args:
+        simulator: of the arm, initialized.
+        lcm: its bus.
+        driver: that it has.
+        seconds: of simulated time to run.
+        patience: how long to wait for each answer, and ten times as long for the first [s of wall clock].
+
+    Returns:
+        The simulated time at which it ended: less than `seconds` if answers stopped.
+    """
+    commands = Subscriber(lcm, driver.command_channel, driver.command_type)
+    words = NewMessages(lcm, driver.status_channel + TAKEN)
+
+    def answers() -> int:
+        return words.count or commands.count
+
+    steps, repeats = 0, max(1, round(patience / REPEAT))
+    while steps * driver.period < seconds:
+        answered = answers()
+        for _ in range(repeats if steps else 10 * repeats):
+            # A command comes before the word that belongs to it.
+            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and answers() == answered:
+                pass
+            if answers() > answered:
+                break
+            # A datagram may be lost, and before its first answer the other side may not have been listening.
+            simulator.get_system().ForcedPublish(simulator.get_context())
+        else:
+            break
+        steps += 1
+        simulator.AdvanceTo(steps * driver.period)
+    return steps * driver.period
+
+
+def serve_in_real_time(
+    simulator: Simulator, driver: Driver, seconds: float, attend: Callable[[], None], rate: float = 1.0
+) -> None:
+    """Runs a simulated arm by the wall's clock, as a robot does, which waits for nobody.
+
+    Args:
+        simulator: of the arm, initialized.
+        driver: that it has.
+        seconds: to run.
+        attend: called after every status: for a deputy.
+        rate: of its clock to the wall's.
+    """
+    simulator.set_target_realtime_rate(rate)
+    for step in range(1, round(seconds / driver.period) + 1):
+        simulator.AdvanceTo(step * driver.period)
+        attend()

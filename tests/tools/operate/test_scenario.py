@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import pytest
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.hardware import SimulatedIiwa
+from guiderail.models.errors import InputError
+from guiderail.tools.operate.rehearsal import Other
+from guiderail.tools.operate.scenario import load_scenario
+
+SHIPPED = Path(__file__).parents[3] / "examples" / "connector.scenario.yaml"
+DRIVER = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only, lcm_bus: bus}}\n"
+BUS = "lcm_buses: {bus: {lcm_url: 'udpm://239.255.76.67:7668?ttl=0'}}\n"
+
+
+@pytest.fixture
+def written(tmp_path):
+    def written(text):
+        path = tmp_path / "scenario.yaml"
+        path.write_text(text)
+        return path
+
+    return written
+
+
+def test_one_word_switches_between_a_simulated_robot_and_a_real_one(written):
+    simulated, real = (
+        Other.in_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
+    )
+    assert (simulated.rehearse, real.rehearse) == (True, False)
+    for other in (simulated, real):
+        assert (other.robot, other.environment("hardware")["lcm_url"]) == ("iiwa14", "udpm://239.255.76.67:7668?ttl=0")
+    assert Other.in_scenario(None, robot="panda").robot == "panda"
+    assert Other.in_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot == "panda"
+
+
+def test_the_shipped_one_is_a_rehearsal():
+    assert Other.in_scenario(SHIPPED).rehearse
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("station: both\n", "hardware or simulation"),
+        ("{}\n", "exactly one robot"),
+        ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "takes torques"),
+        (DRIVER, "none of its own"),
+        ("directives: 3\n", "is no scenario"),
+        ("{{", "is no scenario"),
+        ("nonsense: 1\n", "nonsense"),
+    ],
+)
+def test_refuses_in_a_sentence(written, text, words):
+    with pytest.raises(InputError, match=words) as refused:
+        load_scenario(written(text))
+    assert "\n" not in str(refused.value)
+
+
+def test_directives_say_what_stands_around_a_simulated_robot(written, tmp_path):
+    box = tmp_path / "box.sdf"
+    box.write_text(
+        "<sdf version='1.9'><model name='box'><link name='box'><collision name='c'><geometry><box><size>1 1 1</size>"
+        "</box></geometry></collision></link></model></sdf>"
+    )
+    directives = f"""
+directives:
+- add_model: {{name: box, file: 'file://{box}'}}
+- add_weld: {{parent: world, child: 'box::box'}}
+"""
+    scenario = load_scenario(written(BUS + DRIVER + directives))
+    robot = SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=scenario.directives)
+    assert robot.plant.HasModelInstanceNamed("box")
+    lost = load_scenario(
+        written(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'file:///nowhere.sdf'}}]\n")
+    )
+    with pytest.raises(InputError, match="can't be added"):
+        SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=lost.directives)

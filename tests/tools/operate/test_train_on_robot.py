@@ -1,0 +1,150 @@
+"""Learning on a robot: episodes as motions, both sides of the bus in one process."""
+
+import gymnasium
+import numpy as np
+import pytest
+from injections.together import Together
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.make import make_guidance, make_station, resolve
+from guiderail.diagrams.tasks.assemble import assemble
+from guiderail.models.errors import InputError
+from guiderail.models.joint_status import Fault
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.presets import resolve_preset
+from guiderail.tools.operate.keys import Keys
+from guiderail.tools.operate.rehearsal import Other
+from guiderail.tools.operate.robot_env import RobotEnv
+from guiderail.tools.operate.serve_iiwa import START
+from guiderail.tools.operate.student import Student
+from guiderail.tools.operate.train_on_robot import train_on_robot
+from guiderail.tools.rollouts.rollout import Decision, rollout
+
+OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "reward": "shaped", "hold": 5}
+
+
+def make(patch, start):
+    """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
+    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
+    patch.setattr(type(resolved.task), "num_steps", 10)
+    with patch.context() as bus:
+        bus.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
+        station = make_station(resolved)
+    task = assemble(resolved.task, station, make_guidance(resolved, station))
+    pace, keys, asked = Together(resolved.task.world(), lcm, start), Keys(), []
+    begin = resolved.task.start(np.random.default_rng(0))
+    elsewhere = station.alike(resolved.task.world())
+    env = RobotEnv(task, station, elsewhere, begin, pace, hold=5, keys=keys, go_on=asked.append, say=lambda words: None)
+    env.pace, env.keys, env.asked, env.begin = pace, keys, asked, begin
+    return env
+
+
+@pytest.fixture(scope="module")
+def shared():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("guiderail.tools.operate.crawl.SETTLE", 0.1)
+        yield make(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture
+def env(shared):
+    shared.asked.clear()
+    shared.keys.take_back()
+    return shared
+
+
+def still(observation):
+    return np.zeros(2)
+
+
+def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
+    assert all(check.is_well for check in env.checks())
+    for index in range(2):
+        row = rollout(env, still, index=index)
+        assert (row["termination"], row["steps"], env.asked) == ("time_limit", 10, [])
+        np.testing.assert_allclose(env.trace.measured[0][:3], env.begin[:3], atol=2e-3)
+        assert (env.trace.signals["holding"] == 0.0).all()
+        env.idle()
+    with pytest.raises(InputError, match="takes no options"):
+        env.reset(options={"offset": (0.0, 0.0)})
+
+
+def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
+    env.reset()
+    env.step(np.zeros(2))
+    env.keys.press()
+    _, _, _, truncated, info = env.step(np.zeros(2))
+    assert (truncated, info["termination"], info["stopped"]) == (True, "stopped", "somebody asked for it")
+    velocities = env.pace.robot.plant.GetVelocities(
+        env.pace.robot.plant.GetMyContextFromRoot(env.pace.simulator.get_context())
+    )
+    assert np.abs(velocities).max() < 0.01
+    assert env.asked == []
+    env.reset()
+    assert env.asked == ["somebody asked for it"]
+
+
+def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(env):
+    env.reset()
+    env.step(np.zeros(2))
+    step = env.pace.step
+    env.pace.happens = {
+        step + 3: lambda: setattr(env.pace, "is_silent", True),
+        step + 30: lambda: setattr(env.pace, "is_silent", False),
+    }
+    _, _, terminated, truncated, info = env.step(np.zeros(2))
+    assert (terminated, truncated, info["termination"], info["is_success"]) == (False, True, "stopped", False)
+    assert env.fault == Fault.STALE
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+    env.reset()
+    assert len(env.asked) == 1
+    row = rollout(env, still)
+    assert row["termination"] == "time_limit"
+
+
+def test_what_stops_a_reset_stops_no_more_than_that(env):
+    env.pace.happens = {env.pace.step + 20: env.keys.press}
+    env.reset()
+    assert env.asked == ["somebody asked for it"]
+    assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
+
+
+def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, monkeypatch):
+    for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
+        one._try(one._take_over)
+        assert one._holds() == holds
+
+
+def test_only_sound_episodes_are_learned_from(tmp_path):
+    space = gymnasium.Env()
+    space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    small = {"units": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_every": 1}
+    preset = resolve_preset("robust", "sac", small)
+    named = {"hold": 1, "seed": 0, "decisions": 100, "symmetry": None}
+    acting = LEARNERS.get("sac")(preset, space, **named)
+    student = Student(acting, ((preset, space), named), waits=True)
+    before = acting.actor().state_dict()["mu.weight"].clone()
+    rng, last = np.random.default_rng(0), {"success": False}
+    for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):
+        student.begin()
+        for _ in range(6):
+            observation, action = rng.uniform(-1, 1, 3).astype(np.float32), student.act(np.zeros(3, np.float32))
+            student.see(Decision(observation, action, 0.0, observation, False, False, {}))
+        columns = student.end({"termination": termination, **last})
+        assert columns == {"learned_from": termination != "stopped", "episodes_known": known, "late": 0}
+    student.finish()
+    assert (student.known, acting.decisions, acting.episodes) == (4, 24, 4)
+    assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "words"),
+    [("GridClamp", {}, "nobody wrote down"), ("BncConnector", {"reward": "aligned"}, "a simulation alone knows")],
+)
+def test_refuses_what_a_robot_cannot_tell(task, options, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        train_on_robot(
+            task, tmp_path / "run", Other(rehearse=True), environment={"station": "hardware"} | options, given={}
+        )

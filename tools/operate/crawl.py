@@ -1,0 +1,36 @@
+"""From one pose to another at a crawl."""
+
+import numpy as np
+
+from guiderail.models.units import DEGREE, MM
+
+CRAWL, CRAWL_TURN = 0.02, 0.1  # [m/s], [rad/s]
+NEAR, NEAR_TURN = 3.0 * MM, 2.0 * DEGREE  # of where the arm was sent, to be there
+SETTLE = 0.5  # [s] at the end
+
+
+def difference(to: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Of two poses, each angle the shorter way, (6,)."""
+    change = to - at
+    change[3:] = (change[3:] + np.pi) % (2.0 * np.pi) - np.pi
+    return change
+
+
+def distance(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """Between two poses [m], and between the farthest of their angles [rad]."""
+    change = difference(one, other)
+    return float(np.linalg.norm(change[:3])), float(np.abs(change[3:]).max())
+
+
+def crawl(here: np.ndarray, there: np.ndarray, period: float) -> np.ndarray:
+    """A pose for each period [s], along a straight line to `there`, (6,), and some on which the arm settles, (n, 6)."""
+    away, turned = distance(there, here)
+    moving = int(np.ceil(max(away / CRAWL, turned / CRAWL_TURN) / period)) or 1
+    steps = np.arange(1, moving + round(SETTLE / period))
+    return here + np.minimum(steps / moving, 1.0)[:, None] * difference(there, here)
+
+
+def is_near(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether the arm is where it was sent."""
+    away, turned = distance(one, other)
+    return away <= NEAR and turned <= NEAR_TURN

@@ -1,0 +1,111 @@
+"""Who is at the other end of the bus: a robot, or in a rehearsal a simulated one in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from guiderail.diagrams.stations.hardware import HardwareStation
+from guiderail.diagrams.stations.pace import Pace, RealTime, StepByStep
+from guiderail.models.errors import InputError
+from guiderail.models.robots.robot import DEFAULT_ROBOT
+from guiderail.models.units import MM
+from guiderail.tools.operate.scenario import load_scenario
+
+PATIENCE = 20.0  # [s] of wall clock that a rehearsal in step waits for a status
+# Contact takes a simulated robot with 1 kHz longer than the wall's clock would allow, on the machines that we know.
+REHEARSAL_RATE = 0.2
+
+
+@dataclass(frozen=True)
+class Other:
+    """The other end of the bus.
+
+    Args:
+        lcm_url: of the bus; LCM's own default where it is empty, and in a rehearsal one of this process alone.
+        robot: which arm.
+        rehearse: a simulated robot stands in, in a process of its own.
+        lockstep: of a rehearsal: each side waits for the other instead of going by the wall's clock.
+        rate: of a simulated robot's clock to the wall's.
+        scenario: a file that says the first three of these, and what stands around a simulated robot.
+
+    Raises:
+        InputError: for a real robot that should wait, or a simulated one that there is not.
+    """
+
+    lcm_url: str = ""
+    robot: str = DEFAULT_ROBOT
+    rehearse: bool = False
+    lockstep: bool = False
+    rate: float = REHEARSAL_RATE
+    scenario: Path | None = None
+
+    @classmethod
+    def in_scenario(cls, file: Path | None, **given: Any) -> Other:
+        """What a scenario's file says, if there is one, and for the rest what is given by name."""
+        if file is None:
+            return cls(**given)
+        said = load_scenario(file)
+        given |= {"lcm_url": said.lcm_url or given.get("lcm_url", ""), "robot": said.robot, "scenario": file}
+        return cls(**given | {"rehearse": said.is_simulated or given.get("rehearse", False)})
+
+    def __post_init__(self) -> None:
+        if self.lockstep and not self.rehearse:
+            raise InputError("a real robot waits for nobody: --lockstep is for a rehearsal")
+        if self.rehearse and self.robot != DEFAULT_ROBOT:
+            raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver to rehearse with, not {self.robot}")
+        if not 0.0 < self.rate <= 1.0:
+            raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {self.rate}")
+
+    def environment(self, station: str) -> dict[str, Any]:
+        """Options of an environment whose station is there."""
+        url = self.lcm_url
+        if self.rehearse and not url:
+            # With a time to live of zero no message leaves this machine.
+            url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
+        options: dict[str, Any] = {"station": station, "lcm_url": url, "robot": self.robot}
+        # A simulated robot starts with the command.
+        return options | ({"robot_timeout": 60.0} if self.rehearse else {})
+
+    def paces(self, station: HardwareStation) -> tuple[Pace, RealTime]:
+        """How time passes, and the wall's clock, whether it counts or not."""
+        channel, period = station.driver.status_channel, station.period
+        clock = RealTime(station.lcm, channel, period, self.rate if self.rehearse else 1.0)
+        return (StepByStep(station.lcm, PATIENCE, channel, period) if self.lockstep else clock), clock
+
+    def timing(self, station: HardwareStation, clock: RealTime) -> Mapping[str, Any]:
+        """How regularly the robot was heard, where the wall's clock counts."""
+        if self.lockstep:
+            return {}
+        return {
+            "milliseconds_between_statuses": {
+                "period": station.period / (self.rate if self.rehearse else 1.0) / MM,
+                "99 %": clock.gaps.quantile(0.99) / MM,
+                "longest": clock.gaps.longest / MM,
+            }
+        }
+
+    @contextmanager
+    def standing_in(self, task: str, url: str, offset: Sequence[float] | None = None) -> Iterator[None]:
+        """A simulated robot in front of a task's fixture, which may be off by (x, y) [m]; nobody, of a real robot."""
+        if not self.rehearse:
+            yield
+            return
+        arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300"]
+        arguments += [] if self.lockstep else ["--rate", str(self.rate)]
+        arguments += [] if offset is None else ["--offset", ",".join(repr(float(value)) for value in offset)]
+        arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]
+        call = f"from guiderail.tools.command import main; main({arguments!r})"
+        # Ctrl-C is meant for us: a robot that ends can't come to rest.
+        process = subprocess.Popen([sys.executable, "-c", call], start_new_session=True)
+        try:
+            yield
+        finally:
+            process.terminate()
+            process.wait()
