@@ -72,6 +72,8 @@ class SafetyLimits:
         if not (np.array(self.lower) < np.array(self.upper)).all():
             raise InputError(f"a workspace from {self.lower} to {self.upper} holds nothing")
 
+OLDEST_SPEED = 0.1  # [s] after which nobody knows how fast an arm is
+
 
 class TorqueGuard(LeafSystem):
     """Passes wanted torques on while nothing is wrong; otherwise the arm is brought to rest, and then has no torque.
@@ -342,10 +344,17 @@ class TorqueGuard(LeafSystem):
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
 
     def _damping_torque(self, context: Context, damped: float) -> np.ndarray:
-        """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s]."""
+        """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s].
+
+        Nothing where that speed was old when the damping began: whoever was held up himself knows no speed, and
+        somebody else may have stopped the arm meanwhile.
+        """
+        age = float(self._status_age_port.Eval(context)[0])
+        if np.isfinite(damped) and age - damped > OLDEST_SPEED:
+            return np.zeros(self._num_joints)
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = self._state_port.Eval(context)[self._num_joints :]
-        damped = min(float(self._status_age_port.Eval(context)[0]), damped)
+        damped = min(age, damped)
         return damping_torque(M, v, self._limits.decay_time, period=self._period, damped=damped)
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:

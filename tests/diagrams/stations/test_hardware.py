@@ -168,7 +168,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     assert (both.phase, both.fault) == (Phase.OFF, fault)
     np.testing.assert_array_equal(both["iiwa.torque_commanded"], 0.0)
     assert both.commands[-1].joint_torque == (0.0,) * 7
-    assert np.abs(both["iiwa.velocity_estimated"]).max() < 0.02
+    assert np.abs(both["iiwa.velocity_estimated"]).max() < 0.05  # without torque a joint rolls out
     before = both["pose"].copy()
     both.station.resume(both.context)
     both.go(goal, 0.05)
