@@ -72,6 +72,7 @@ class SafetyLimits:
         if not (np.array(self.lower) < np.array(self.upper)).all():
             raise InputError(f"a workspace from {self.lower} to {self.upper} holds nothing")
 
+
 OLDEST_SPEED = 0.1  # [s] after which nobody knows how fast an arm is
 
 
