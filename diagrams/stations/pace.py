@@ -41,7 +41,12 @@ class Pace(Protocol):
 
 
 class NewMessages:
-    """Counts the messages of a channel; one that is sent again counts once, whatever torques it says by then."""
+    """Counts the messages of a channel; one that is sent again counts once, whatever torques it says by then.
+
+    Attributes:
+        count: of different messages.
+        repeats: of those that were sent again.
+    """
 
     def __init__(self, lcm: DrakeLcmInterface, channel: str):
         """
@@ -49,13 +54,15 @@ class NewMessages:
             lcm: the bus.
             channel: its channel.
         """
-        self.count = 0
+        self.count = self.repeats = 0
         self._last = b""
         lcm.Subscribe(channel, self._hear)
 
     def _hear(self, message: bytes) -> None:
         if message[:HEAD] != self._last:
             self._last, self.count = message[:HEAD], self.count + 1
+        else:
+            self.repeats += 1
 
 
 class Gaps:
@@ -176,7 +183,10 @@ class StepByStep:
             patience = self._period if self._is_silent else self._patience
             end = time.monotonic() + patience
             while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
+                repeats = self._statuses.repeats
                 self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
+                if self._statuses.repeats > repeats:
+                    self._say()  # a robot that asks again waits for a word that was lost, or was for two statuses
             self._is_silent = self._statuses.count == self._taken
             self._taken = self._statuses.count
             simulator.AdvanceTo(start + (step + 1) * self._period)
