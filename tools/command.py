@@ -88,6 +88,17 @@ def _arg(words: str, metavar: str, of: str | None = None) -> Any:
 
 
 Json = Annotated[bool, _opt("Print one JSON object, for a program to read.", "--json")]
+LcmUrl = Annotated[str, _opt("Of a robot: the URL of LCM.  [default: LCM's own]")]
+WhichRobot = Annotated[str, _opt("Of a robot: which arm.", of="robots")]
+Rehearse = Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")]
+Lockstep = Annotated[
+    bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--lockstep")
+]
+Rate = Annotated[float, _opt("Of a rehearsal: the simulated robot's clock to the wall's.")]
+Scenario = Annotated[
+    Path | None, _opt("A file that says robot, bus and surroundings, and whether the robot is simulated.")
+]
+Yes = Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")]
 Run = Annotated[Path, _arg("The folder of a run that guiderail train made.", "RUN")]
 Shown = Annotated[str, _arg("The folder of a run; or a task, for --policy: {tasks}.", "RUN or TASK")]
 Seed = Annotated[int, _opt("The seed of the held-out initial conditions.")]
@@ -144,17 +155,13 @@ def train(
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
     ] = None,
-    lcm_url: Annotated[str, _opt("On a robot: the URL of LCM.  [default: LCM's own]")] = "",
-    robot: Annotated[str, _opt("On a robot: which arm.", of="robots")] = "iiwa14",
-    rehearse: Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")] = False,
-    lockstep: Annotated[
-        bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--lockstep")
-    ] = False,
-    rate: Annotated[float, _opt("Of a rehearsal: the simulated robot's clock to the wall's.")] = 0.2,
-    scenario: Annotated[
-        Path | None, _opt("A file that says robot, bus and surroundings, and whether the robot is simulated.")
-    ] = None,
-    yes: Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")] = False,
+    lcm_url: LcmUrl = "",
+    robot: WhichRobot = "iiwa14",
+    rehearse: Rehearse = False,
+    lockstep: Lockstep = False,
+    rate: Rate = 0.2,
+    scenario: Scenario = None,
+    yes: Yes = False,
     resume: Annotated[bool, _opt("Go on with the run in --out.", "--resume")] = False,
     imports: Imports = None,
     as_json: Json = False,
@@ -688,17 +695,13 @@ def teach(
 def run(
     run: Run,
     station: Annotated[str, _opt("Where: a station that is a robot.", of="stations")] = "hardware",
-    lcm_url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
-    robot: Annotated[str, _opt("Which arm.", of="robots")] = "iiwa14",
-    rehearse: Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")] = False,
-    lockstep: Annotated[
-        bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--lockstep")
-    ] = False,
-    rate: Annotated[float, _opt("Of a rehearsal: the simulated robot's clock to the wall's.")] = 0.2,
-    scenario: Annotated[
-        Path | None, _opt("A file that says robot, bus and surroundings, and whether the robot is simulated.")
-    ] = None,
-    yes: Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")] = False,
+    lcm_url: LcmUrl = "",
+    robot: WhichRobot = "iiwa14",
+    rehearse: Rehearse = False,
+    lockstep: Lockstep = False,
+    rate: Rate = 0.2,
+    scenario: Scenario = None,
+    yes: Yes = False,
     out: Annotated[Path | None, _opt("The folder of what is recorded.  [default: hardware in the run]")] = None,
 ) -> None:
     """Run a policy on a robot.
@@ -742,7 +745,7 @@ def serve_iiwa(
 @command("stand-by --task BncConnector", "stand-by")
 def stand_by(
     url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
-    robot: Annotated[str, _opt("Which arm.", of="robots")] = "iiwa14",
+    robot: WhichRobot = "iiwa14",
     task: Annotated[str, _opt("What the arm carries is this task's: {tasks}.", of="tasks")] = "BncConnector",
 ) -> None:
     """Stop a robot where commands stop.

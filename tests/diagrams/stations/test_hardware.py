@@ -148,7 +148,12 @@ def pushing():
     return OneProcess()
 
 
-@pytest.mark.parametrize("name", FAULTY)
+ROLLS_OUT = pytest.mark.xfail(strict=True, reason="after a status from the past 0.03 rad/s are left to roll out")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=ROLLS_OUT) if name == "an old status" else name for name in FAULTY]
+)
 def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told(pushing, name):
     """The arm is on its way; one wrong status comes, in place of the robot's."""
     both, (fault, changed) = pushing, FAULTY[name]
@@ -168,7 +173,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     assert (both.phase, both.fault) == (Phase.OFF, fault)
     np.testing.assert_array_equal(both["iiwa.torque_commanded"], 0.0)
     assert both.commands[-1].joint_torque == (0.0,) * 7
-    assert np.abs(both["iiwa.velocity_estimated"]).max() < 0.05  # without torque a joint rolls out
+    left = np.abs(both["iiwa.velocity_estimated"]).max()
     before = both["pose"].copy()
     both.station.resume(both.context)
     both.go(goal, 0.05)
@@ -177,6 +182,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     assert both.phase == Phase.RUNNING
     assert np.linalg.norm((both["pose"] - goal)[:3]) < 0.5 * np.linalg.norm((before - goal)[:3])
     assert np.isfinite(both["wrench"]).all()
+    assert left < 0.02
 
 
 def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
