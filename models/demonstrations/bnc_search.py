@@ -24,8 +24,8 @@ DEGREE = np.deg2rad(1.0)
 RADIUS = 2.5 * MM  # of the circle
 TURN = 0.3  # [s] for once around: much quicker than the search is long, so that no moment of it has a side
 SEARCH_PUSH = 1.5 * MM  # below the rim, against the impedance: a couple of newtons
-SEARCH = (1.2, 2.0)  # [s] from when the plug stands on the rim to when the demonstrator comes in
-HOLD_UNTIL, IN_BY = 2.6, 3.1  # [s] when the circle begins to shrink, and when it is gone
+SEARCH = (1.2, 3.0)  # [s] from when the plug stands on the rim to when the demonstrator comes in
+HOLD_UNTIL, IN_BY = 3.6, 4.1  # [s] when the circle begins to shrink, and when it is gone
 
 # time [s], z [m], Rz [rad]
 WAYPOINTS = np.array(

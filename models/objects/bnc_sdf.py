@@ -13,9 +13,12 @@ BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 
 
 
 FRICTION = 0.2  # of metal on metal
-# The lugs are stiffer than the barrel because they are small: the same force must not let one through a slot's wall.
-BARREL = ContactMaterial(friction=FRICTION, modulus=1e9, resolution=1.5 * MM)
-LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM)
+# Without it a step of 10 ms leaps as far into metal as the plug moves in it, and the next one throws the plug out.
+MARGIN = 0.1 * MM
+# As stiff as brass. A softer barrel spreads a rim's load evenly, and a plug that stands beside the jack feels a torque
+# that no metal has (docs/experiments.md, "Where a plug on the rim feels its force").
+BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM, margin=MARGIN)
+LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
 PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket is a spring that slips
 RING = ContactMaterial(friction=FRICTION)
 SEAT = ContactMaterial(friction=0.05)

@@ -15,6 +15,7 @@ class ContactMaterial:
     modulus: float | None = None  # [Pa] pressure at full depth
     resolution: float | None = None  # [m] edge length of a curved primitive's mesh
     dissipation: float = 1.0  # [s/m]
+    margin: float | None = None  # [m] by which a compliant surface is felt before it touches, so that no step leaps in
 
 
 def _proximity(material: ContactMaterial) -> str:
@@ -23,6 +24,8 @@ def _proximity(material: ContactMaterial) -> str:
     else:
         modulus = f"<drake:hydroelastic_modulus>{material.modulus:g}</drake:hydroelastic_modulus>"
         compliance = f"<drake:compliant_hydroelastic/>{modulus}"
+    if material.margin is not None:
+        compliance += f"<drake:hydroelastic_margin>{material.margin:g}</drake:hydroelastic_margin>"
     if material.resolution is not None:
         compliance += f"<drake:mesh_resolution_hint>{material.resolution:g}</drake:mesh_resolution_hint>"
     return f"""<drake:proximity_properties>
