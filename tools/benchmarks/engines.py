@@ -25,7 +25,7 @@ ENGINES = {"Drake": "rails", "MuJoCo": "mujoco"}
 COLOURS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
 TASKS = ("BncConnector", "GridClamp")
 OFFSETS = (0.8, 1.25, 2.0, 3.0)  # [mm], of a plug on the rim
-MODULI = (0.1, 1.0, 10.0, 100.0)  # times the contact's own, in Drake
+MODULI = (0.01, 0.1, 1.0, 10.0)  # times the contact's own, in Drake
 PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
 LEAST_FORCE = 0.5  # [N] below which a lever says nothing
 

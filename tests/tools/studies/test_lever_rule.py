@@ -26,7 +26,7 @@ def test_stays_once_the_plug_has_dropped_in():
     np.testing.assert_allclose(action * REACH, [1.0 * MM, 2.0 * MM])
 
 
-@pytest.mark.parametrize("time", [0.5, 3.5])
+@pytest.mark.parametrize("time", [0.5, 3.8])
 def test_does_nothing_before_and_after_the_search(time):
     np.testing.assert_array_equal(lever_rule(seen(time, lever=(5.0 * MM, 0.0))), np.zeros(2))
 
