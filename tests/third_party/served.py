@@ -1,8 +1,8 @@
 """Runs commands in forks of one interpreter, which imports what all of them need once.
 
 A line of JSON in, `{"arguments": [...], "folder": ...}` as an interpreter takes them after its name (`-c`, code and
-what follows), and one out: `{"returncode": ..., "stdout": ..., "stderr": ...}`. A fork has what any new process has: its
-own memory and exit code, and no learner, task or environment that another one made.
+what follows), and one out: `{"returncode": ..., "stdout": ..., "stderr": ...}`. A fork has what any new process has:
+its own memory and exit code, and no learner, task or environment that another one made.
 """
 
 import json
@@ -10,6 +10,7 @@ import os
 import sys
 import tempfile
 import traceback
+
 
 def child(arguments: list[str], folder: str, out: int, err: int) -> None:
     """Becomes the command; never returns."""
