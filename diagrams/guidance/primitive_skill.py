@@ -7,8 +7,9 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
+from guiderail.models.primitives.shared import shared_primitive
 
 HISTORY_SOURCES = ("commanded", "measured")
 
@@ -105,15 +106,15 @@ class PrimitiveSkill:
 
     def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
         """The movement primitive of sKGRL (with history), KGRL (without) or the demonstrations alone."""
-        return LcNsKmp(
+        return shared_primitive(
             self.reference,
-            kernel=SquaredExponential(inverse_length=self.inverse_length),
+            self.constraints if constrained else LinearConstraints.none(self.num_outputs),
+            self.inverse_length,
             lambda_=self.lambda_,
             beta=self.beta,
             horizon=self.horizon,
             history=self.history if history else 0,
             history_variance=self.history_variance,
-            constraints=self.constraints if constrained else LinearConstraints.none(self.num_outputs),
             solver=self.solver,
         )
 
