@@ -5,31 +5,24 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from guiderail.diagrams.options import Number, Numbers, Options
+from guiderail.diagrams.options import Number
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE
+from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.objects.bnc_sdf import FRICTION
 from guiderail.models.units import MM
 
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
 COLLISION_FORCE = 35.0  # [N], of the impedance
-LARGEST_OFFSET = 4.0 * MM  # beyond it the mouth no longer stands on the barrel's rim
 DRAWN = BncDimensions()
 
 
-class BncOptions(Options):
+class BncOptions(HiddenPlace):
     """Of the connector."""
 
-    uncertainty: Literal["calibration", "disc", "known"] = Field("calibration", description="where the jack may be")
-    offset_range: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="least and greatest distance of the jack from where it should be [m], the uncertainty's own",
-    )
     jack_turn: Number = Field(0.0, ge=0, le=10, description="largest turn of the jack about its axis [degrees]")
     grasp_angle: Number = Field(0.0, ge=0, le=LARGEST_GRASP_ANGLE, description="largest tilt of the plug [degrees]")
     start_beside: Number = Field(0.0, ge=0, le=ALIGNMENT, description="how far beside its start the tool may begin [m]")
@@ -46,13 +39,6 @@ class BncOptions(Options):
     )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="of the connector's metal")
     demonstrations: Literal["insert", "search"] = Field("insert", description="what was demonstrated")
-
-    @field_validator("offset_range")
-    @classmethod
-    def _is_a_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not 0.0 <= value[0] <= value[1] <= LARGEST_OFFSET:
-            raise ValueError(f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first")
-        return value
 
     def workcell(self) -> BncWorkcell:
         """The connector that is meant."""

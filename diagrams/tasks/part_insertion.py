@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.observation import Observed
-from guiderail.diagrams.options import Number, Numbers, Options
+from guiderail.diagrams.options import Number
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.part_workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.bnc_rewards import reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
 from guiderail.diagrams.tasks.part_file import FILE_NAME, PartTaskFile, read_task_file
@@ -36,31 +37,16 @@ from guiderail.systems.reward_system import RewardTerm
 
 COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 RHO = 1e-11  # ρ [m², rad²], as the connector's
-LARGEST_OFFSET = 4.0 * MM
 LEAST_FORCE = 0.5  # [N] with which the plug stands on something
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 
 
-class PartOptions(Options):
+class PartOptions(HiddenPlace):
     """Of a task of two meshes."""
 
-    uncertainty: Literal["calibration", "disc", "known"] = Field("calibration", description="where the socket may be")
-    offset_range: Numbers | None = Field(
-        None,
-        min_length=2,
-        max_length=2,
-        description="least and greatest distance of the socket from where it should be [m]",
-    )
     start_beside: Number = Field(0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]")
     force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
-
-    @field_validator("offset_range")
-    @classmethod
-    def _is_a_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and not 0.0 <= value[0] <= value[1] <= LARGEST_OFFSET:
-            raise ValueError(f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first")
-        return value
 
 
 class PartInsertion(InsertionTask):
