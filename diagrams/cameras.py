@@ -32,8 +32,8 @@ _RENDERER, _FOR_PEOPLE = "vtk", "vtk_for_people"
 PUBLISH_PERIOD = 1 / 50  # s, between two pictures of a browser view
 
 
-# What policies see is lit from the camera, as Drake does unless told otherwise. People see edges better where light comes
-# from above too, and a page is white.
+# What policies see is lit from the camera, as Drake does unless told otherwise. People see edges better where light
+# comes from above too, and a page is white.
 _LIGHTS = [
     LightParameter(type="directional", frame="camera", direction=[0.3, 0.2, 1.0], intensity=0.7),
     LightParameter(type="directional", frame="world", direction=[-0.2, 0.3, -1.0], intensity=0.5),

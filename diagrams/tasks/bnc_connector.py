@@ -152,7 +152,7 @@ class BncConnector(InsertionTask):
 
     def camera(self) -> Camera:
         """Looks slightly down at the jack."""
-        X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.02], distance=0.11, height=0.05)
+        X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04)
         return Camera((640, 480), np.deg2rad(30.0), X_WC)
 
     def scene(self) -> Scene:

@@ -124,5 +124,3 @@ def _first_again(values: np.ndarray) -> list[float]:
     """Numbers at the ends of control steps, the first one at time zero too."""
     rounded = [float(f"{value:.{DIGITS}g}") for value in values]
     return [rounded[0], *rounded]
-
-

@@ -16,7 +16,7 @@ import jinja2
 import numpy as np
 from pydrake.geometry import Rgba
 
-from guiderail.diagrams.scene import Scene, Viewpoint, in_plane
+from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.guidance import is_demonstrated
@@ -133,7 +133,7 @@ def write_page(html: Path, episode: Shown, *, episodes: int | None = None) -> di
         css=_css,
         legend=legend,
         seeds=[episode.seed + index for index in range(episodes)],
-        report=_report(html, episode.run),
+        report=report_beside(html, episode.run),
         run=episode.run,
         # Meshcat's own camera lives in a frame whose y is up.
         views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
@@ -144,7 +144,7 @@ def write_page(html: Path, episode: Shown, *, episodes: int | None = None) -> di
     return rows[episodes]
 
 
-def _report(html: Path, run: Path | None) -> str | None:
+def report_beside(html: Path, run: Path | None) -> str | None:
     """The way from the page to the report of its run, or of the study that the run is from, if somebody wrote one."""
     folders = [html.parent, *([] if run is None else [run, run.parent])]
     found = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)

@@ -79,7 +79,7 @@ def test_a_policy_of_a_run_on_rails_drives_the_arm_too_and_is_shown_there(tmp_pa
     assert row["success"]
     assert row["worst_violation"] <= 1e-9
 
-    monkeypatch.setattr(replay, "OTHER_PATHS", 0)
+    monkeypatch.setattr(replay, "EPISODES", 1)
     arm = {"station": "arm"}
     html = replay.default_page(folder.path, arm)
     replay.write_page(html, Shown.of_run(folder.path, arm, 1_000_003))
