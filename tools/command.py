@@ -335,8 +335,8 @@ def replay(
 ) -> None:
     """Show held-out episodes as a page that any browser opens: before learning beside after, on one clock.
 
-    It holds robots in motion, demonstrations, paths and the constraint, plots of force, violation, action and phase, and
-    needs nothing else. Before stands for the demonstration alone where guidance has one, else for random actions.
+    It holds robots in motion, demonstrations, paths and the constraint, with plots of force, violation, action and
+    phase, and needs nothing else. Before is the demonstration alone where guidance has one, else random actions.
     """
     from guiderail.tools.files import check_picture
     from guiderail.tools.viewing.film import write_film
