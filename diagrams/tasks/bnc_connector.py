@@ -158,7 +158,7 @@ class BncConnector(InsertionTask):
     def scene(self) -> Scene:
         """The demonstrations, and the square that commands stay in."""
         to_world = in_frame(self._workcell.X_WT)
-        near = viewpoint(*to_world(np.array([[0.02, -0.028, 0.024], [0.0, 0.0, 0.014]])))
+        near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
         return Scene(
             to_world=to_world,
             demonstrations=tuple(DEMONSTRATIONS[self.options.demonstrations].load().outputs),
