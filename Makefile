@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test lint bench docs kills fuzz mutants injections newest clean
+.PHONY: demo test lint bench docs gallery kills fuzz mutants injections newest clean
 
 demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
@@ -43,6 +43,10 @@ bench: $(VENV)/.ready
 	$(BIN)/guiderail bench primitive
 	$(BIN)/guiderail bench simulation
 
+# The moving pictures are kept: they take minutes, as one of them learns.
+gallery: $(VENV)/.ready
+	$(BIN)/python docs/make_gallery.py
+
 # Nothing is fetched: pictures and the reference are made from the code, a warning and a broken link are errors.
 docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build
@@ -59,4 +63,4 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist docs/_build docs/pictures docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build dist docs/_build docs/pictures/*.svg docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache

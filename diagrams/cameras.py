@@ -11,6 +11,7 @@ from pydrake.geometry import (
     ColorRenderCamera,
     DepthRange,
     DepthRenderCamera,
+    LightParameter,
     MakeRenderEngineVtk,
     Meshcat,
     MeshcatParams,
@@ -27,8 +28,20 @@ from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from guiderail.models.errors import InputError
 
-_RENDERER = "vtk"
+_RENDERER, _FOR_PEOPLE = "vtk", "vtk_for_people"
 PUBLISH_PERIOD = 1 / 50  # s, between two pictures of a browser view
+
+
+# What policies see is lit from the camera, as Drake does unless told otherwise. People see edges better where light
+# comes from above too, and a page is white.
+_LIGHTS = [
+    LightParameter(type="directional", frame="camera", direction=[0.3, 0.2, 1.0], intensity=0.7),
+    LightParameter(type="directional", frame="world", direction=[-0.2, 0.3, -1.0], intensity=0.5),
+]
+_PARAMETERS = {
+    _RENDERER: RenderEngineVtkParams(),
+    _FOR_PEOPLE: RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=_LIGHTS),
+}
 
 
 @dataclass(frozen=True)
@@ -66,9 +79,15 @@ def look_from_front(target: np.ndarray, distance: float, height: float) -> Rigid
 
 
 def add_camera(
-    builder: DiagramBuilder, scene_graph: SceneGraph, query: OutputPort, name: str, camera: Camera
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    query: OutputPort,
+    name: str,
+    camera: Camera,
+    *,
+    for_people: bool = False,
 ) -> OutputPort:
-    """Adds a camera and returns its colour image, an `ImageRgba8U`.
+    """Adds a camera and returns its colour image, an `ImageRgba8U`; `for_people` lights it for them, and not a policy.
 
     Raises:
         InputError: if this machine lacks the library that renders without a display.
@@ -78,11 +97,12 @@ def add_camera(
     # Triton ends the process in a segmentation fault, as it would when PyTorch imports its compiler after a render.
     with suppress(ImportError):
         import_module("triton")
-    if not scene_graph.HasRenderer(_RENDERER):
-        scene_graph.AddRenderer(_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
+    renderer = _FOR_PEOPLE if for_people else _RENDERER
+    if not scene_graph.HasRenderer(renderer):
+        scene_graph.AddRenderer(renderer, MakeRenderEngineVtk(_PARAMETERS[renderer]))
     clipping = ClippingRange(0.01, 10.0)
     info = CameraInfo(*camera.size, camera.vertical_fov)
-    core = RenderCameraCore(_RENDERER, info, clipping, RigidTransform())
+    core = RenderCameraCore(renderer, info, clipping, RigidTransform())
     sensor = RgbdSensor(
         parent_id=scene_graph.world_frame_id(),
         X_PB=camera.X_WC,

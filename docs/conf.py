@@ -6,6 +6,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
+import make_gallery  # noqa: E402
 import make_pictures  # noqa: E402
 import make_reference  # noqa: E402
 from mathml import visit_block, visit_inline  # noqa: E402
@@ -37,4 +38,5 @@ def setup(app):
     app.add_html_math_renderer("mathml", (visit_inline, None), (visit_block, None))
     make_reference.make(HERE / "reference")
     make_pictures.make(HERE / "pictures")
+    make_gallery.make(HERE / "pictures")
     return {"parallel_read_safe": True}

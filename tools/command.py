@@ -332,10 +332,12 @@ def replay(
     station: Annotated[str | None, _opt("Where the policy acts: rails or arm.")] = None,
     picture: Annotated[Path | None, _opt("Also write what a camera sees of the episode: a file {pictures}.")] = None,
     policy: PolicyName = "rule",
+    episodes: Annotated[int | None, _opt("How many held-out episodes there are to pick from.  [default: 4]")] = None,
 ) -> None:
-    """Show an episode as a page that any browser opens.
+    """Show held-out episodes as a page that any browser opens: before learning beside after, on one clock.
 
-    It holds the robot in motion, the demonstrations, the executed paths and the constraint, and needs nothing else.
+    It holds robots in motion, demonstrations, paths and the constraint, with plots of force, violation, action and
+    phase, and needs nothing else. Before is the demonstration alone where guidance has one, else random actions.
     """
     from guiderail.tools.files import check_picture
     from guiderail.tools.viewing.film import write_film
@@ -347,7 +349,7 @@ def replay(
     if picture is not None:
         check_picture(picture)
         write_film(picture, episode)
-    write_page(page, episode)
+    write_page(page, episode, episodes=episodes)
     typer.echo(page)
 
 

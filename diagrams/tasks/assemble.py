@@ -348,5 +348,7 @@ def _add_picture(builder: DiagramBuilder, task: Task, station: Station) -> None:
     camera = task.camera()
     if camera is None:
         raise InputError(f"{task.name} has no camera: leave render_mode='rgb_array' out")
-    picture = add_camera(builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera)
+    picture = add_camera(
+        builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera, for_people=True
+    )
     builder.ExportOutput(picture, "rgb_image")

@@ -152,13 +152,13 @@ class BncConnector(InsertionTask):
 
     def camera(self) -> Camera:
         """Looks slightly down at the jack."""
-        X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.02], distance=0.11, height=0.05)
+        X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04)
         return Camera((640, 480), np.deg2rad(30.0), X_WC)
 
     def scene(self) -> Scene:
         """The demonstrations, and the square that commands stay in."""
         to_world = in_frame(self._workcell.X_WT)
-        near = viewpoint(*to_world(np.array([[0.025, -0.035, 0.026], [0.0, 0.0, 0.012]])))
+        near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
         return Scene(
             to_world=to_world,
             demonstrations=tuple(DEMONSTRATIONS[self.options.demonstrations].load().outputs),

@@ -110,13 +110,13 @@ class GridClamp(InsertionTask):
     def camera(self) -> Camera:
         """Looks slightly down at the holes."""
         target = np.array(self._workcell.p_WG) + [0.0, 0.0, 0.01]
-        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=0.28, height=0.10))
+        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=0.17, height=0.075))
 
     def scene(self) -> Scene:
         """The cuboid that commands stay in, as high as the clamp begins."""
         to_world, parameters = in_frame(self._workcell.X_WT), make_skill().parameters
         edges = box_edges(0.5 * parameters["width_m"], -parameters["push_m"], 0.025)
-        near = viewpoint(*to_world(np.array([[0.07, -0.1, 0.05], [0.0, 0.0, 0.008]])))
+        near = viewpoint(*to_world(np.array([[0.045, -0.065, 0.045], [0.0, 0.0, 0.008]])))
         return Scene(
             to_world=to_world,
             constraint=tuple(to_world(edge) for edge in edges),

@@ -143,5 +143,6 @@ class NarrowPassage(Task):
             to_world=in_plane,
             demonstrations=tuple(demonstrations.load().outputs),
             constraint=(edge,),
-            viewpoint=((0.4, 0.3, 0.85), (0.4, 0.48, 0.0)),
+            viewpoint=((0.4, 0.35, 0.78), (0.4, 0.48, 0.0)),
+            line_radius=0.0025,
         )

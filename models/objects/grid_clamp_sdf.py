@@ -8,6 +8,7 @@ from guiderail.models.objects.grid_clamp import MM, GridClampDimensions
 from guiderail.models.objects.sdf import ContactMaterial, at, box, collision, convex_mesh, cylinder, mesh, model, visual
 
 STEEL, ALUMINIUM, ANODIZED = "0.62 0.64 0.68 1", "0.80 0.81 0.82 1", "0.20 0.35 0.60 1"
+GLASS = "0.20 0.35 0.60 0.3"  # the body, through which pegs and holes are to be seen
 
 FRICTION = 0.2  # of pegs, holes and the table's face
 PEG = ContactMaterial(friction=FRICTION, modulus=5e8)
@@ -35,7 +36,7 @@ def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> st
     top = d.peg_length + d.body_height
     body = (at(z=d.peg_length + d.body_height / 2), box(d.shoulder_width, d.shoulder_width, d.body_height))
     contents += collision("pad", *body, pad)
-    contents += visual("body_visual", *body, ANODIZED)
+    contents += visual("body_visual", *body, GLASS)
     contents += visual("stem_visual", at(z=top + STEM_LENGTH / 2), cylinder(STEM_RADIUS, STEM_LENGTH), STEEL)
     return model("clamp", CLAMP_MASS, d.peg_length, 20.0 * MM, contents)
 

@@ -17,6 +17,7 @@ from guiderail.tools.viewing.style import new_figure, save_figure
 
 ROWS, COLUMNS = 2, 3
 MOST = 24  # frames
+PATH = "#00a33a"  # of what the robot did
 
 
 class Frames(EnvObserver):
@@ -61,7 +62,9 @@ def write_film(picture: Path, episode: Shown) -> dict[str, Any]:
 
 
 def watch(episode: Shown, moments: int) -> tuple[dict[str, Any], list[Any]]:
-    """Runs an episode; its row, and what the task's camera sees at so many moments: (time, force, image) each.
+    """Runs an episode; its row, and what the task's camera sees at so many moments: (time, force, image, path) each.
+
+    The path (n, 2) is where the robot was until then, in pixels of the image.
 
     Raises:
         InputError: if nothing can be rendered on this machine.
@@ -70,13 +73,25 @@ def watch(episode: Shown, moments: int) -> tuple[dict[str, Any], list[Any]]:
     env.reset(seed=episode.run_seed)
     frames = Frames(env)
     row = rollout(env, episode.policy(env), frames, seed=episode.seed, held_out=True)
+    path = path_in_picture(frames.base)
     env.close()
-    return row, frames.spread(moments)
+    return row, [(*seen, path[: round(seen[0] / frames.base.trace.period)]) for seen in frames.spread(moments)]
+
+
+def path_in_picture(base: Any) -> np.ndarray:
+    """Where the poses (n, O) of an environment's trace are in the image of its task's camera: (n, 2) [pixel].
+
+    None of them where a task's camera or its way to the world is not known.
+    """
+    task = base.task.declaration
+    camera = None if task is None else task.camera()
+    return np.empty((0, 2)) if camera is None else camera.project(task.scene().to_world(base.trace.measured))
 
 
 def draw_frames(axes: Iterable[Axes], frames: list[Any], letter: str = "") -> None:
-    """A moment in each of the axes, numbered where a letter is given."""
-    for number, (axis, (time, force, image)) in enumerate(zip(axes, frames, strict=True), start=1):
+    """A moment in each of the axes with the path until then, numbered where a letter is given."""
+    for number, (axis, (time, force, image, path)) in enumerate(zip(axes, frames, strict=True), start=1):
         axis.imshow(image)
+        axis.plot(*path.T, color=PATH, linewidth=1.0, scalex=False, scaley=False)
         axis.set_title(f"{letter}{number}: " * bool(letter) + f"{time:.1f} s, {force:.0f} N", fontsize=9)
         axis.set_axis_off()

@@ -1,9 +1,14 @@
-"""An episode as one self-contained page: robot, demonstrations, executed paths and the constraint, in any browser."""
+"""Episodes as one self-contained page: before beside after, moving together, with what was measured, in any browser."""
 
 from __future__ import annotations
 
+import html as markup
+import json
 import logging
+import os
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,40 +16,40 @@ import jinja2
 import numpy as np
 from pydrake.geometry import Rgba
 
-from guiderail.diagrams.scene import Scene, Viewpoint, in_plane
+from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.guidance import is_demonstrated
 from guiderail.tools.rollouts.metrics import TOLERANCE
-from guiderail.tools.rollouts.null_policies import still
+from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
 from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.motion import Motion, state_names, violation_unit
 from guiderail.tools.viewing.shown import Shown, outcome
 
-TEMPLATE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
-CAPTION = jinja2.Template(TEMPLATE, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+TEMPLATE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
+    Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+)
 
-FRAMES_PER_SECOND = 32.0
 SEEN_THROUGH = 0.35  # opacity of everything but paths, for who asks for it
-REPETITIONS = 1000  # of the motion, before it rests
-OTHER_PATHS = 5  # held-out episodes whose paths are drawn beside the one that is shown
+EPISODES = 4  # held-out episodes to pick from
 
-GREY, BLACK, GREEN, PALE_GREEN, RED = (
+GREY, BLACK, GREEN, RED = (
     (0.55, 0.55, 0.6, 0.8),
     (0.1, 0.1, 0.1, 1.0),
     (0.1, 0.65, 0.25, 1.0),
-    (0.55, 0.85, 0.6, 1.0),
     (0.85, 0.1, 0.1, 1.0),
 )
+PALE = 0.3  # opacity of the paths of episodes that aren't picked
 
-# What each line on the page is: name, colour, words.
-LEGEND = (
-    ("demonstrations", GREY, "demonstrations"),
-    ("alone", BLACK, "the demonstration alone"),
-    ("other_episodes", PALE_GREEN, "{acting}: other held-out episodes"),
-    ("executed", GREEN, "{acting}: the episode shown"),
-    ("constraint", RED, "the constraint"),
-)
+
+@dataclass(frozen=True)
+class Side:
+    """One half of the page: who acts, and how its paths are drawn."""
+
+    name: str
+    words: str
+    colour: tuple[float, ...]
 
 
 def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
@@ -53,12 +58,23 @@ def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
     return run / name if run.is_dir() else Path(name)
 
 
-def write_page(html: Path, episode: Shown) -> dict[str, Any]:
-    """Runs an episode and writes it as a page; returns the episode's row.
+def write_page(html: Path, episode: Shown, *, episodes: int | None = None) -> dict[str, Any]:
+    """Runs episodes and writes them as a page; returns the row of the first.
+
+    Each of them is run twice, from the same conditions: by who is shown, and beside it without having learned. That is
+    the demonstration alone (an action of zero) where guidance has one, and uniform random actions where it has none.
+
+    Args:
+        html: the page.
+        episode: the first; the seeds that follow its own are the others.
+        episodes: how many to pick from, `EPISODES` unless given.
 
     Raises:
-        InputError: if the task cannot be shown.
+        InputError: if the task cannot be shown, or there is no episode to show.
     """
+    episodes = EPISODES if episodes is None else episodes
+    if episodes < 1:
+        raise InputError(f"a page shows at least one episode, not {episodes}")
     logging.getLogger("drake").setLevel(logging.WARNING)  # where Meshcat listens is of no interest to a page
     env = make_environment(episode.task, episode.environment, render_mode="human")
     base = cast(Any, env.unwrapped)
@@ -68,41 +84,83 @@ def write_page(html: Path, episode: Shown) -> dict[str, Any]:
     base.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=episode.run_seed)
 
-    declared = base.task.declaration
-    shown = Scene(to_world=in_plane) if declared is None else declared.scene()
-    lines: dict[str, list[np.ndarray]] = {"demonstrations": [shown.to_world(d) for d in shown.demonstrations]}
-    lines["constraint"] = list(shown.constraint)
-
-    def path(act: Act, index: int) -> tuple[np.ndarray, dict[str, Any]]:
-        row = rollout(env, act, seed=episode.seed + index, held_out=True)
-        return shown.to_world(base.trace.measured.copy()), row
-
-    if is_demonstrated(episode.environment.get("guidance")):
-        lines["alone"] = [path(still(env), 0)[0]]
-    policy = episode.policy(env)
-    lines["other_episodes"] = [path(policy, index)[0] for index in range(1, OTHER_PATHS + 1)]
-    meshcat.StartRecording(frames_per_second=FRAMES_PER_SECOND)
-    executed, row = path(policy, 0)
-    meshcat.StopRecording()
-    meshcat.get_mutable_recording().set_repetitions(REPETITIONS)
-    meshcat.PublishRecording()
-    lines["executed"] = [executed]
-
-    for name, colour, _ in LEGEND:
-        radius = shown.line_radius * (2.0 if name in ("executed", "constraint") else 1.0)
-        for index, points in enumerate(lines.get(name, [])):
+    task = base.task.declaration
+    scene = Scene(to_world=in_plane) if task is None else task.scene()
+    demonstrated = is_demonstrated(episode.environment.get("guidance"))
+    before: Act = still(env) if demonstrated else NullPolicy(white, env, episode.seed)
+    sides = {
+        Side("before", "before: the demonstration alone" if demonstrated else "before: random actions", BLACK): before,
+        Side("after", episode.acting, GREEN): episode.policy(env),
+    }
+    motion = Motion(env)
+    rows, shown = [], []
+    for side, act in sides.items():
+        told = []
+        for index in range(episodes):
+            row = rollout(env, act, motion, seed=episode.seed + index, held_out=True)
+            rows.append(row)
+            told.append(motion.shown() | {"outcome": outcome(row), "numbers": _numbers(row)})
+            path = scene.to_world(base.trace.measured.copy())
+            _draw(meshcat, f"/guiderail/{side.name}/{index}", path, 2.0 * scene.line_radius, side.colour)
+        shown.append({"name": side.name, "colour": _css(side.colour), "rgba": side.colour, "episodes": told})
+    for name, lines, radius, colour in (
+        ("demonstrations", [scene.to_world(d) for d in scene.demonstrations], scene.line_radius, GREY),
+        ("constraint", scene.constraint, 2.0 * scene.line_radius, RED),
+    ):
+        for index, points in enumerate(lines):
             _draw(meshcat, f"/guiderail/{name}/{index}", points, radius, colour)
     for ornament in ("/Grid", "/Axes"):
         meshcat.SetProperty(ornament, "visible", False)
-    views = dict(shown.arm_views) if episode.environment.get("station") == "arm" else {}
-    camera = next(iter(views.values()), shown.viewpoint)
+    views = dict(scene.arm_views) if episode.environment.get("station") == "arm" else {}
+    camera = next(iter(views.values()), scene.viewpoint)
     if camera is not None:
         meshcat.SetCameraPose(*(np.array(point) for point in camera))
+    unit, scale = violation_unit(None if task is None else task.constraints(), base.trace.measured.shape[1])
+    data = {
+        "sides": shown,
+        "violation": {"unit": unit, "scale": scale},
+        "states": [] if task is None else list(state_names(task)),
+        "pale": PALE,
+        "seen_through": SEEN_THROUGH,
+    }
     page = meshcat.StaticHtml()
     env.close()
-    drawn = {name for name, paths in lines.items() if paths}
-    write_atomically(html, _with_caption(page, episode, row, drawn, views).encode())
-    return row
+    legend = [(_css(GREY), "demonstrations")] * bool(scene.demonstrations)
+    legend += [(_css(RED), "the constraint")] * bool(len(scene.constraint))
+    caption = TEMPLATE.render(
+        heading=episode.heading,
+        sides=sides,
+        css=_css,
+        legend=legend,
+        seeds=[episode.seed + index for index in range(episodes)],
+        report=report_beside(html, episode.run),
+        run=episode.run,
+        # Meshcat's own camera lives in a frame whose y is up.
+        views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
+        # Nothing in it ends a script, whatever a body is called.
+        data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
+    )
+    write_atomically(html, _whole(page, episode.heading, caption).encode())
+    return rows[episodes]
+
+
+def report_beside(html: Path, run: Path | None) -> str | None:
+    """The way from the page to the report of its run, or of the study that the run is from, if somebody wrote one."""
+    folders = [html.parent, *([] if run is None else [run, run.parent])]
+    found = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)
+    return None if found is None else Path(os.path.relpath(found, html.parent)).as_posix()
+
+
+def _numbers(row: Mapping[str, Any]) -> str:
+    violations = (
+        f"{name} {'none' if row[key] <= TOLERANCE else format(row[key], '.1e')}"
+        for name, key in (("commanded", "worst_violation"), ("measured", "worst_measured_violation"))
+    )
+    return f"return {row['return']:.1f}; violations: {', '.join(violations)}"
+
+
+def _css(colour: tuple[float, ...]) -> str:
+    return f"rgb({','.join(str(round(255 * c)) for c in colour[:3])})"
 
 
 def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, colour: tuple[float, ...]) -> None:
@@ -126,25 +184,9 @@ def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray,
     return (points[:, None] + radius * ring).reshape(-1, 3), faces
 
 
-def _with_caption(
-    page: str, episode: Shown, row: dict[str, Any], drawn: set[str], views: Mapping[str, Viewpoint]
-) -> str:
-    """The page with a legend over it: what it shows, the numbers of the episode shown, and where to look from."""
-    violations = (
-        f"{name} {'none' if row[key] <= TOLERANCE else format(row[key], '.1e')}"
-        for name, key in (("commanded", "worst_violation"), ("measured", "worst_measured_violation"))
-    )
-    caption = CAPTION.render(
-        heading=episode.heading,
-        legend=[
-            (",".join(str(round(255 * c)) for c in colour[:3]), words.format(acting=episode.acting))
-            for name, colour, words in LEGEND
-            if name in drawn
-        ],
-        numbers=f"{outcome(row)}, return {row['return']:.1f}, violations: {', '.join(violations)}",
-        # Meshcat's own camera lives in a frame whose y is up.
-        views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
-        seen_through=SEEN_THROUGH,
-    )
-    head, body, tail = page.rpartition("</body>")
-    return f"{head}{caption}{body}{tail}" if body else page + caption
+def _whole(page: str, title: str, caption: str) -> str:
+    """Meshcat's page with ours around it: fit for a phone, and with its name."""
+    head = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    page = re.sub(r"<title>.*?</title>", lambda _: f"{head}\n<title>{markup.escape(title)}</title>", page, count=1)
+    start, body, tail = page.rpartition("</body>")
+    return f"{start}{caption}{body}{tail}" if body else page + caption

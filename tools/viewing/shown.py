@@ -26,6 +26,7 @@ class Shown:
     title: str  # what to say beside task and guidance
     run_seed: int = 0  # decides what is hidden and constant in a run
     seed: int = HELD_OUT_SEED  # of the episode
+    run: Path | None = None  # the folder that it is from
 
     @classmethod
     def of_run(cls, run: Path, environment: Mapping[str, Any] | None = None, seed: int = HELD_OUT_SEED) -> Shown:
@@ -44,6 +45,7 @@ class Shown:
             title=config.learner.algorithm.upper(),
             run_seed=config.seed,
             seed=seed,
+            run=folder.path,
         )
 
     @property

@@ -1,0 +1,267 @@
+"""Makes the moving pictures of the gallery: `python docs/make_gallery.py`, or some of them by name.
+
+Each shows episodes side by side, on one clock, and says in its last frame how they ended. What they came to is also in
+`pictures/gallery.json`, by which a test sees whether the pictures are stale.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+from pydrake.systems.framework import Context, EventStatus
+
+from guiderail.models.policy import Policy
+from guiderail.tools.learning.configure import run
+from guiderail.tools.rollouts.metrics import TOLERANCE
+from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
+from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.studies.scripted import untrained
+from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.film import path_in_picture
+from guiderail.tools.viewing.passage import draw_world
+
+HERE = Path(__file__).parent
+FOLDER = HERE / "pictures"
+FONT = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
+GAP = 12  # between panels
+FRAMES = 45  # of a picture, beside the one it rests on
+REST = 2000  # ms, at the end
+GREEN, DARK, RED = (0, 150, 60), (28, 31, 36), (179, 38, 30)
+SCALE = 2  # lines are drawn so much larger first, as nothing here smooths them
+LEARNING_EPISODES = 32  # as many as `make demo`
+
+
+@dataclass
+class Panel:
+    """An episode in a picture: who acts in what, and after it was run, what was seen of it."""
+
+    title: str
+    task: str
+    environment: dict[str, Any]
+    act: Callable[[Any], Act]
+    seed: int = 1_000_000
+    colour: tuple[int, int, int] = GREEN
+    says: Callable[[dict[str, Any]], str] | None = None
+    row: dict[str, Any] = field(default_factory=dict)
+    times: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    force: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    path: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    images: dict[int, Image.Image] = field(default_factory=dict)
+
+    def ending(self) -> str:
+        """How it ended, in a few words."""
+        words = str(self.row["termination"]).replace("_", " ")
+        force = f", {self.row['peak_force']:.0f} N at most" if self.row["peak_force"] > 0 else ""
+        return self.says(self.row) if self.says else f"{words}{force}"
+
+
+def run_panel(panel: Panel, size: tuple[int, int], every: int | None) -> None:
+    """Runs the episode; a camera looks at every so many control steps, or a plane is drawn once where that is None."""
+    env = make_environment(panel.task, panel.environment, render_mode=None if every is None else "rgb_array")
+    base: Any = env.unwrapped
+    env.reset(seed=0)
+    act, period = panel.act(env), base.task.control_period
+    seen: dict[int, Image.Image] = {}
+
+    def look(context: Context) -> EventStatus:
+        step = round(context.get_time() / period)
+        if every is not None and abs(context.get_time() - step * period) < 1e-6 and step % every == 0:
+            seen[step] = _fitted(env.render(), size)
+        return EventStatus.DidNothing()
+
+    if every is not None:
+        base.simulator.set_monitor(look)
+    panel.row = rollout(env, act, seed=panel.seed, held_out=True)
+    panel.times = period * np.arange(len(base.trace) + 1)
+    panel.force = np.append(0.0, base.trace.force)
+    if every is None:
+        image, to_pixels = _plane(size)
+        seen[0], panel.path = image, to_pixels(base.trace.measured)
+    else:
+        seen[len(base.trace)] = _fitted(picture := env.render(), size)
+        panel.path = path_in_picture(base) * SCALE * size[0] / picture.shape[1]
+    panel.images = seen
+    env.close()
+
+
+def _fitted(image: Any, size: tuple[int, int]) -> Image.Image:
+    return Image.fromarray(np.asarray(image)[..., :3]).resize((SCALE * size[0], SCALE * size[1]), Image.LANCZOS)
+
+
+def _plane(size: tuple[int, int]) -> tuple[Image.Image, Callable[[np.ndarray], np.ndarray]]:
+    """The narrow passage from above, and what takes points (n, 2) to pixels of it."""
+    dpi = 100
+    figure = Figure(figsize=(SCALE * size[0] / dpi, SCALE * size[1] / dpi), dpi=dpi)
+    canvas = FigureCanvasAgg(figure)
+    axis = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    draw_world(axis)
+    axis.set_axis_off()
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    height = SCALE * size[1]
+    return image, lambda points: axis.transData.transform(points) * [1, -1] + [0, height]
+
+
+def compose(panels: Sequence[Panel], size: tuple[int, int], times: np.ndarray) -> list[Image.Image]:
+    """Frames with the panels side by side, each with its title, its path so far, time and force."""
+    font, line = ImageFont.truetype(FONT, SCALE * 11), SCALE * 18
+    frames = []
+    for number, time in enumerate(times):
+        frame = Image.new("RGB", (SCALE * ((size[0] + GAP) * len(panels) - GAP), SCALE * size[1] + 3 * line), "white")
+        draw = ImageDraw.Draw(frame)
+        for i, panel in enumerate(panels):
+            left = SCALE * (size[0] + GAP) * i
+            step = min(round(time / (panel.times[1] - panel.times[0])), len(panel.times) - 1)
+            image = panel.images[max(n for n in panel.images if n <= step)].copy()
+            path, ink = panel.path[:step], ImageDraw.Draw(image)
+            if len(path) > 1:
+                ink.line([tuple(p) for p in path], fill=panel.colour, width=SCALE * 2, joint="curve")
+            if len(path) and len(panel.images) == 1:
+                (x, y), r = path[-1], SCALE * 4
+                ink.ellipse((x - r, y - r, x + r, y + r), fill=(25, 90, 200))
+            frame.paste(image, (left, line))
+            draw.text((left, 2 * SCALE), panel.title, fill=DARK, font=font)
+            over = number == len(times) - 1 or step == len(panel.times) - 1
+            force = f"   {panel.force[step]:.0f} N" if panel.row["peak_force"] > 0 else ""
+            words = f"{panel.times[step]:.1f} s{force}" + (f"\n{panel.ending()}" if over else "")
+            failed = over and not panel.row["success"]
+            foot = SCALE * size[1] + line + 3 * SCALE
+            draw.text((left, foot), words, fill=RED if failed else DARK, font=font)
+        frames.append(frame.resize((frame.width // SCALE, frame.height // SCALE), Image.LANCZOS))
+    return frames
+
+
+def save(path: Path, frames: Sequence[Image.Image], seconds: float) -> None:
+    """A WebP that moves, and rests at its end before it begins anew."""
+    each = round(1000 * seconds / (len(frames) - 1))
+    durations = [each] * (len(frames) - 1) + [REST]
+    options = {"save_all": True, "append_images": frames[1:], "duration": durations, "loop": 0}
+    frames[0].save(path, quality=55, method=4, **options)
+
+
+def _white(seed: int) -> Callable[[Any], Act]:
+    return lambda env: NullPolicy(white, env, seed)
+
+
+def _jerk(row: dict[str, Any]) -> str:
+    return f"mean jerk of the command {row['jerk_commanded_linear']:.0f} m/s³"
+
+
+def _worst(row: dict[str, Any]) -> str:
+    outside = row["worst_violation"]
+    return "no command outside" if outside <= TOLERANCE else f"{1000 * outside:.0f} mm into the forbidden zone"
+
+
+def _obstacle(row: dict[str, Any]) -> str:
+    return f"goal reached, obstacle cost {abs(row['reward_obstacle_cost']):.1f}"
+
+
+def _learned(env: Any) -> Act:
+    """What the demo learns: a run of `LEARNING_EPISODES` episodes, made here."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "run"
+        given = {"guidance": "skgrl"}
+        run("NarrowPassage", out, environment=given, preset="steady", episodes=LEARNING_EPISODES, seed=0)
+        return Policy.load(out)
+
+
+def _right(env: Any) -> Act:
+    return NullPolicy(lambda rng, size: lambda observation: np.array([1.0, 0.0]), env)
+
+
+PASSAGE, SQUARE = (240, 350), (320, 240)
+
+# Of each picture: its panels, their size in pixels, and how many control steps apart a camera looks (None: a plane).
+PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None]] = {
+    "passage_methods": (
+        lambda: [
+            Panel("KGRL, white actions", "NarrowPassage", {"guidance": "kgrl", "hold": 10}, _white(1), says=_jerk),
+            Panel("sKGRL, the same actions", "NarrowPassage", {"guidance": "skgrl", "hold": 10}, _white(1), says=_jerk),
+        ],
+        PASSAGE,
+        None,
+    ),
+    "passage_constraint": (
+        lambda: [
+            Panel("residual, always to the right", "NarrowPassage", {"guidance": "residual"}, _right, says=_worst),
+            Panel("KGRL, always to the right", "NarrowPassage", {"guidance": "kgrl"}, _right, says=_worst),
+        ],
+        PASSAGE,
+        None,
+    ),
+    "passage_learned": (
+        lambda: [
+            Panel("before: demonstration alone", "NarrowPassage", {"guidance": "skgrl"}, still, says=_obstacle),
+            Panel(
+                f"after {LEARNING_EPISODES} episodes, sKGRL",
+                "NarrowPassage",
+                {"guidance": "skgrl"},
+                _learned,
+                says=_obstacle,
+            ),
+        ],
+        PASSAGE,
+        None,
+    ),
+    "connector": (
+        lambda: [
+            Panel("the demonstration alone", "BncConnector", {"guidance": "kgrl"}, still),
+            Panel("KGRL, a rule by hand", "BncConnector", {"guidance": "kgrl"}, untrained("BncConnector", "rule")),
+        ],
+        SQUARE,
+        8,
+    ),
+    "clamp": (
+        lambda: [
+            Panel("straight down", "GridClamp", {"seconds": 5.0}, untrained("GridClamp", "straight_descent")),
+            Panel("a rule that searches", "GridClamp", {"seconds": 5.0}, untrained("GridClamp", "rule")),
+        ],
+        SQUARE,
+        3,
+    ),
+    "pouring": (
+        lambda: [
+            Panel("random inputs", "Pouring", {"time_limit": 6.0}, _white(1)),
+            Panel("a person's inputs", "Pouring", {"time_limit": 6.0}, untrained("Pouring", "rule")),
+        ],
+        SQUARE,
+        6,
+    ),
+}
+
+
+def draw(name: str) -> tuple[list[Panel], list[Image.Image], float]:
+    """Runs the episodes of a picture; its panels, its frames, and how long they last [s]."""
+    panels_of, size, every = PICTURES[name]
+    panels = panels_of()
+    for panel in panels:
+        run_panel(panel, size, every)
+    end = max(panel.times[-1] for panel in panels)
+    return panels, compose(panels, size, np.linspace(0.0, end, FRAMES)), end
+
+
+def make(folder: Path, names: Sequence[str] = ()) -> None:
+    """Makes the pictures of these names, and those that are missing where none is named."""
+    folder.mkdir(exist_ok=True)
+    log = folder / "gallery.json"
+    told = json.loads(log.read_text(encoding="utf-8")) if log.is_file() else {}
+    for name in names or [name for name in PICTURES if not (folder / f"{name}.webp").is_file()]:
+        panels, frames, seconds = draw(name)
+        save(folder / f"{name}.webp", frames, seconds)
+        told[name] = {panel.title: panel.ending() for panel in panels}
+        log.write_text(json.dumps(dict(sorted(told.items())), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    make(FOLDER, sys.argv[1:] or list(PICTURES))
