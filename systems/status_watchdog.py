@@ -19,11 +19,12 @@ from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 
 # Entries of the state besides the last readable status itself.
-_CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT, _ASTRAY_AT, _KNOWN_TIME, _KNOWN_OFFSET = range(10)
+_CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT, _DOUBTED_AT, _KNOWN_TIME, _KNOWN_OFFSET = range(10)
 _SOUND = (Fault.NONE, Fault.LATE)  # what is no fault of the status itself
-# After these the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of long ago
-# drives an arm. Only a status that keeps to the clock as it was known before is known to be fresh.
-_OUT_OF_TIME = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE)
+# After the first three the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of
+# long ago drives an arm. So does damping by the inertia of another posture. Only a status that agrees with what was
+# known before is as good as any.
+_DOUBTFUL = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE, Fault.POSITION_JUMP)
 _FRESH = 0.5  # of the greatest age: speeds no older than that are damped without swinging
 _FORGOTTEN = (0.0, np.nan, 0.0, 0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, np.nan, 0.0)
 
@@ -48,9 +49,9 @@ class StatusWatchdog(LeafSystem):
     after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
     when the first status comes, slowly after that, and anew after a fault or a silence: then the next status is judged
     by the one that was at fault, if its numbers were sound. Where the clock on the wall is told, this program's own
-    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump of a clock
-    nothing is believed before the settling time is over, but what keeps to the clock as it was before: a single status
-    from elsewhere blinds nobody.
+    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump, of a clock
+    or a position, nothing is believed before the settling time is over, but what agrees with the clock and the
+    positions as they were before: a single status from elsewhere blinds nobody.
 
     .. pydrake_system::
 
@@ -147,9 +148,9 @@ class StatusWatchdog(LeafSystem):
         memory, values = self._memory_of(context), context.get_discrete_state(self._last).value()
         last = Heard(float(memory[_TIME]), float(memory[_OFFSET]), values)
         believed = context.get_discrete_state(self._believed).value().copy()
-        now, is_known = self._now(context), not np.isfinite(memory[_ASTRAY_AT])
+        now, is_known = self._now(context), not np.isfinite(memory[_DOUBTED_AT])
         known = Heard(float(memory[_KNOWN_TIME]), float(memory[_KNOWN_OFFSET]), believed)
-        if status is not None and not is_known and self._keeps_to(known, status, now):
+        if status is not None and not is_known and self._agrees(status, known, now):
             last, is_known = known, True
         fault = judge_status(status, last, now, self._limits)
         if not fault and now - memory[_CLOCK] > self._limits.max_gap:
@@ -162,10 +163,10 @@ class StatusWatchdog(LeafSystem):
         is_believed = is_new and fault in _SOUND and is_known
         return _Verdict(fault, is_new, is_believed, newest if is_believed else believed, last.offset)
 
-    def _keeps_to(self, known: Heard, status: JointStatus, now: float) -> bool:
-        """Whether a status is fresh by a clock that was known."""
-        age = now - (status.time + known.offset)
-        return status.time > known.time and -self._limits.max_lead <= age <= _FRESH * self._limits.max_age
+    def _agrees(self, status: JointStatus, known: Heard, now: float) -> bool:
+        """Whether a status is sound and fresh by what was known."""
+        is_fresh = status.time > known.time and now - (status.time + known.offset) <= _FRESH * self._limits.max_age
+        return is_fresh and judge_status(status, known, now, self._limits) == Fault.NONE
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._memory, _FORGOTTEN)
@@ -195,10 +196,10 @@ class StatusWatchdog(LeafSystem):
             memory[_FAULT], memory[_FAULT_AT] = verdict.fault, now
         elif memory[_CLOCK] - memory[_FAULT_AT] > self._limits.settling:
             memory[_FAULT] = Fault.NONE
-        if verdict.fault in _OUT_OF_TIME:
-            memory[_ASTRAY_AT] = now
-        elif memory[_CLOCK] - memory[_ASTRAY_AT] > self._limits.settling:
-            memory[_ASTRAY_AT] = np.nan
+        if verdict.fault in _DOUBTFUL:
+            memory[_DOUBTED_AT] = now
+        elif memory[_CLOCK] - memory[_DOUBTED_AT] > self._limits.settling:
+            memory[_DOUBTED_AT] = np.nan
         discrete_state.set_value(self._memory, memory)
         return EventStatus.Succeeded()
 

@@ -13,13 +13,14 @@ from pydrake.lcm import DrakeLcm, DrakeLcmInterface, Subscriber
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from guiderail.diagrams.stations.driver import STATUS_PERIOD, Driver
+from guiderail.diagrams.stations.driver import MICROSECOND, STATUS_PERIOD, Driver
 from guiderail.models.errors import InputError
 
 TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
 REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
 URGENCY = 20  # of a process that a robot waits for, among those that the system serves first
-HEAD = 16  # bytes of a message: its type, and the time that a status or a command begins with
+HEAD_FORMAT = ">8sq"  # of a message: its type, and the time [µs] that a status or a command begins with
+HEAD = struct.calcsize(HEAD_FORMAT)
 BIN = 1e-4  # [s] of a histogram
 
 
@@ -46,6 +47,7 @@ class NewMessages:
     Attributes:
         count: of different messages.
         repeats: of those that were sent again.
+        last: the head of the last one, by which they are told apart.
     """
 
     def __init__(self, lcm: DrakeLcmInterface, channel: str):
@@ -55,12 +57,12 @@ class NewMessages:
             channel: its channel.
         """
         self.count = self.repeats = 0
-        self._last = b""
+        self.last = b""
         lcm.Subscribe(channel, self._hear)
 
     def _hear(self, message: bytes) -> None:
-        if message[:HEAD] != self._last:
-            self._last, self.count = message[:HEAD], self.count + 1
+        if message[:HEAD] != self.last:
+            self.last, self.count = message[:HEAD], self.count + 1
         else:
             self.repeats += 1
 
@@ -153,7 +155,8 @@ class RealTime:
 class StepByStep:
     """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
 
-    After each it says so, for `serve`, which waits for it.
+    After each it says which status that was, for `serve`, which waits for this word and for no other: one that comes
+    twice, because a status was sent again before it was answered, moves nobody.
     """
 
     def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str, period: float = STATUS_PERIOD):
@@ -166,14 +169,13 @@ class StepByStep:
         """
         self._lcm, self._patience, self._answers, self._period = lcm, patience, channel + TAKEN, period
         self._statuses = NewMessages(lcm, channel)
-        self._taken = self._said = 0
+        self._taken = b""
         self._is_silent = False
 
     def begin(self) -> None:
         """Called when a simulator was initialized, with the newest status: asks for the next."""
         self._lcm.HandleSubscriptions(0)
-        self._taken = self._statuses.count
-        self._say()
+        self._take()
 
     def advance(self, simulator: Simulator, station: Clocked, steps: int) -> None:
         """Advances by so many statuses; nobody needs the time on the wall."""
@@ -182,26 +184,25 @@ class StepByStep:
             # A robot that has fallen silent is not waited for again and again.
             patience = self._period if self._is_silent else self._patience
             end = time.monotonic() + patience
-            while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
+            while self._statuses.last == self._taken and (left := end - time.monotonic()) > 0.0:
                 repeats = self._statuses.repeats
                 self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
-                if self._statuses.repeats > repeats:
-                    self._say()  # a robot that asks again waits for a word that was lost, or was for two statuses
-            self._is_silent = self._statuses.count == self._taken
-            self._taken = self._statuses.count
+                if self._statuses.last == self._taken and self._statuses.repeats > repeats:
+                    self._take()  # a robot that asks again may wait for a word that was lost
+            self._is_silent = self._statuses.last == self._taken
             simulator.AdvanceTo(start + (step + 1) * self._period)
-            self._say()
+            self._take()
 
-    def _say(self) -> None:
-        self._said += 1
-        self._lcm.Publish(self._answers, struct.pack(">q", self._said))
+    def _take(self) -> None:
+        self._taken = self._statuses.last
+        self._lcm.Publish(self._answers, self._taken)
 
 
 def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, patience: float) -> float:
     """Runs a simulated arm for another process: one step, then it waits until its status was answered.
 
     So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
-    has taken the status in; where that never came, it is a command.
+    has taken this very status in; where no word ever came, it is a command.
 
     Args:
         simulator: of the arm, initialized.
@@ -215,18 +216,21 @@ def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, p
     """
     commands = Subscriber(lcm, driver.command_channel, driver.command_type)
     words = NewMessages(lcm, driver.status_channel + TAKEN)
-
-    def answers() -> int:
-        return words.count or commands.count
-
     steps, repeats = 0, max(1, round(patience / REPEAT))
+
+    def is_answered() -> bool:
+        if not words.count:
+            return commands.count > commanded
+        said = struct.unpack(HEAD_FORMAT, words.last)[1] if len(words.last) == HEAD else -1
+        return abs(said * MICROSECOND - steps * driver.period) < 0.5 * driver.period
+
     while steps * driver.period < seconds:
-        answered = answers()
+        commanded = commands.count
         for _ in range(repeats if steps else 10 * repeats):
             # A command comes before the word that belongs to it.
-            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and answers() == answered:
+            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and not is_answered():
                 pass
-            if answers() > answered:
+            if is_answered():
                 break
             # A datagram may be lost, and before its first answer the other side may not have been listening.
             simulator.get_system().ForcedPublish(simulator.get_context())

@@ -295,3 +295,20 @@ def test_another_clock_is_not_believed_before_it_has_settled_whatever_else_goes_
         watched.check(set_back())
     assert watched.fault == Fault.NONE
     np.testing.assert_allclose(watched.state[2:], 0.15)
+
+
+def test_a_position_that_has_jumped_and_stays_is_not_believed_before_it_has_settled():
+    """Its inertia is that of another posture, and damping by it may drive the arm."""
+    watched = Watched().settle()
+
+    def slipped():
+        return replace(watched.sound(), positions=watched.sound().positions + [2.5, 0.0])
+
+    for _ in range(round(0.9 * LIMITS.settling / PERIOD)):
+        watched.check(slipped())
+        assert watched.state[0] < 1.0
+        assert watched.fault == Fault.POSITION_JUMP
+    for _ in range(round(0.2 * LIMITS.settling / PERIOD)):
+        watched.check(slipped())
+    assert watched.fault == Fault.NONE
+    assert watched.state[0] > 2.5
