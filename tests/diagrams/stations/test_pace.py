@@ -106,7 +106,7 @@ def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
         earlier = dict.fromkeys(heard)
         lcm.Publish(IIWA_DRIVER.status_channel + TAKEN, list(earlier)[-2 if heard.count(heard[-1]) < 3 else -1])
 
-    heard.append(b"\xff" * HEAD)
+    heard.append(b"\x7f" * HEAD)
     lcm.Subscribe(IIWA_DRIVER.status_channel, answer)
     simulator.Initialize()
     assert serve(simulator, lcm, IIWA_DRIVER, 4 * STATUS_PERIOD, 5.0) == 4 * STATUS_PERIOD
