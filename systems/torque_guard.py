@@ -84,7 +84,7 @@ class TorqueGuard(LeafSystem):
     a is the authority, which grows from 0 to 1 in the ramp time. f is 1 for a new status, and 0 for one that is two
     periods old: what was wanted of an arm that isn't seen would drive it ever faster. τ_damping (`damping_torque`)
     takes away all joints' speed with the decay time; where no status comes any more, what was seen last is taken away
-    once.
+    once, and with it what the arm was given since: a period of what was wanted is more than standstill allows.
 
     A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
     is called. At first it waits until the status is sound, and takes over by itself. What is sent is always finite and
@@ -150,6 +150,7 @@ class TorqueGuard(LeafSystem):
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._holding_port = self.DeclareVectorInputPort("holding", 1)
         self._memory = self.DeclareDiscreteState(4)
+        self._given = self.DeclareDiscreteState(num_joints)  # momentum since the last status [Nms]
 
         memory, fault = {self.discrete_state_ticket(self._memory)}, {self._status_fault_port.ticket()}
         measured = {
@@ -178,7 +179,8 @@ class TorqueGuard(LeafSystem):
             self._calc_safe_torque,
             prerequisites_of_calc=found
             | memory
-            | {self._torque_port.ticket(), self._state_port.ticket(), self._status_age_port.ticket()},
+            | {self._torque_port.ticket(), self._state_port.ticket(), self._status_age_port.ticket()}
+            | {self.discrete_state_ticket(self._given)},
         )
         self._fault_port = self.DeclareVectorOutputPort(
             "fault", 1, self._calc_fault, prerequisites_of_calc=found | memory
@@ -308,12 +310,19 @@ class TorqueGuard(LeafSystem):
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._memory, [Phase.WAITING, Fault.NONE, 0.0, 0.0])
+        discrete_state.set_value(self._given, np.zeros(self._num_joints))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         phase, fault, phase_time, authority = self._memory_of(context)
         phase_time += self._period
         found = self._found.Eval(context)
+        given = self._given_until_now(context)
+        if phase in (Phase.RAMPING, Phase.RUNNING) and not found:
+            push = self._safe_torque_port.Eval(context)
+            push = push + self._freshness(context) * self._external_torque_port.Eval(context)
+            given = given + self._period * push
+        discrete_state.set_value(self._given, given)
         if phase == Phase.WAITING:
             if not found:
                 phase, phase_time = Phase.RAMPING, 0.0
@@ -334,8 +343,7 @@ class TorqueGuard(LeafSystem):
         is_active = phase in (Phase.RAMPING, Phase.RUNNING)
         torque = np.zeros(self._num_joints)
         if is_active and not self._found.Eval(context):
-            freshness = np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0)
-            torque = authority * freshness * self._torque_port.Eval(context)
+            torque = authority * self._freshness(context) * self._torque_port.Eval(context)
             if authority < 1.0:
                 torque = torque + (1.0 - authority) * self._damping_torque(context, np.inf)
         elif is_active:
@@ -343,6 +351,14 @@ class TorqueGuard(LeafSystem):
         elif phase == Phase.DAMPING:
             torque = self._damping_torque(context, phase_time + self._period)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
+
+    def _freshness(self, context: Context) -> float:
+        return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))
+
+    def _given_until_now(self, context: Context) -> np.ndarray:
+        """What the arm was given since the last status, (n,) [Nms]: nothing where that one is new."""
+        is_new = self._status_age_port.Eval(context)[0] == 0.0
+        return np.zeros(self._num_joints) if is_new else context.get_discrete_state(self._given).value().copy()
 
     def _damping_torque(self, context: Context, damped: float) -> np.ndarray:
         """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s].
@@ -355,6 +371,8 @@ class TorqueGuard(LeafSystem):
             return np.zeros(self._num_joints)
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = self._state_port.Eval(context)[self._num_joints :]
+        if np.isfinite(damped):
+            v = v + np.linalg.solve(M, self._given_until_now(context))
         damped = min(age, damped)
         return damping_torque(M, v, self._limits.decay_time, period=self._period, damped=damped)
 
