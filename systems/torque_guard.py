@@ -87,8 +87,10 @@ class TorqueGuard(LeafSystem):
     once, and with it what the arm was given since: a period of what was wanted is more than standstill allows.
 
     A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
-    is called. At first it waits until the status is sound, and takes over by itself. What is sent is always finite and
-    within the torque limits. Where a robot stays silent nothing is sent to it any more, nor right after it is back.
+    is called. At first it waits until the status is sound, and takes over by itself. A robot that comes back with
+    another clock after a silence was started anew, and what it had of speed is gone: it is left without torque. What is
+    sent is always finite and within the torque limits. Where a robot stays silent nothing is sent to it any more, nor
+    right after it is back.
 
     .. pydrake_system::
 
@@ -179,6 +181,7 @@ class TorqueGuard(LeafSystem):
             self._calc_safe_torque,
             prerequisites_of_calc=found
             | memory
+            | fault
             | {self._torque_port.ticket(), self._state_port.ticket(), self._status_age_port.ticket()}
             | {self.discrete_state_ticket(self._given)},
         )
@@ -333,7 +336,7 @@ class TorqueGuard(LeafSystem):
                 authority = min(authority + self._period / self._limits.ramp_time, 1.0)
                 if phase == Phase.RAMPING and authority == 1.0:
                     phase, phase_time = Phase.RUNNING, 0.0
-        elif phase == Phase.DAMPING and phase_time >= self._limits.damping_time:
+        elif phase == Phase.DAMPING and (phase_time >= self._limits.damping_time or self._is_started_anew(context)):
             phase, phase_time = Phase.OFF, 0.0
         discrete_state.set_value(self._memory, [phase, fault, phase_time, authority])
         return EventStatus.Succeeded()
@@ -348,9 +351,14 @@ class TorqueGuard(LeafSystem):
                 torque = torque + (1.0 - authority) * self._damping_torque(context, np.inf)
         elif is_active:
             torque = self._damping_torque(context, 0.0)
-        elif phase == Phase.DAMPING:
+        elif phase == Phase.DAMPING and not self._is_started_anew(context):
             torque = self._damping_torque(context, phase_time + self._period)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
+
+    def _is_started_anew(self, context: Context) -> bool:
+        """Whether a robot for whose silence the arm is stopped speaks again, by another clock."""
+        status_fault = self._status_fault_port.Eval(context)[0]
+        return bool(self._memory_of(context)[_FAULT] == Fault.STALE and status_fault == Fault.OUT_OF_ORDER)
 
     def _freshness(self, context: Context) -> float:
         return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))

@@ -190,6 +190,17 @@ def test_damping_takes_away_exactly_what_the_arm_had_and_was_given_since(plant, 
     np.testing.assert_allclose(taken, -0.1 * momentum - given, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.parametrize(("first", "then", "has_torque"), [(2, 3, False), (3, 3, True), (2, 2, True)])
+def test_a_robot_that_was_started_anew_is_not_driven_by_the_speed_that_it_had(plant, first, then, has_torque):
+    """Silence, and then another clock; a clock that jumps without it is the same robot, which is damped."""
+    guarded = Guarded(plant)
+    for status_fault in (first, first, then):
+        guarded.set(status_fault=[float(status_fault)])
+        guarded.go(PERIOD)
+    assert guarded["safe_torque"].any() == has_torque
+    assert guarded.phase == (Phase.DAMPING if has_torque else Phase.OFF)
+
+
 def test_what_is_wanted_of_an_arm_that_is_not_seen_fades(plant):
     guarded = Guarded(plant)
     sent = []
