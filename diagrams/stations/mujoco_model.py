@@ -73,8 +73,6 @@ def mujoco_model(
     option.impratio = contact.friction_ratio
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations, option.tolerance = 100, 1e-10
-    # The engine's own collider gives edges that lie exactly along each other a neighbouring face's normal.
-    option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
     option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # [m]: these contacts are a micrometre deep
 
     # The tool comes first, so that its joints do.

@@ -12,6 +12,8 @@ from guiderail.models.objects.surfaces import Box, Hull, Spring, Surface, ring_h
 BEAD_STIFFNESS = 7e3  # [N/m]
 BEAD_CORE = 2.0 * MM  # radius from which its sides go outwards
 BEAD_GAP = 0.4 * MM  # between two sides and their corner: each meets its own side of the lip, and none the next one's
+# How far a side's crest stands out in its middle: what meets along an edge, a collider gives any normal in between.
+BEAD_CROWN = 0.01 * MM
 LIP_BACK = 2.0 * MM  # how thick the lip is, into the table
 
 
@@ -89,6 +91,7 @@ def bead_hulls(dimensions: GridClampDimensions) -> list[tuple[np.ndarray, tuple[
     for middle in 2.0 * np.pi * (np.arange(NUM_SIDES) + 1) / NUM_SIDES:
         outward, along = np.array([[np.cos(middle), np.sin(middle)], [-np.sin(middle), np.cos(middle)]])
         ends = [np.outer(radius, outward) + sign * np.outer(half_width, along) for sign in (-1.0, 1.0)]
-        vertices = np.concatenate([np.column_stack([end, height]) for end in ends])
+        crown = np.append((d.bead_radius + BEAD_CROWN) * outward, 0.0)
+        vertices = np.concatenate([*(np.column_stack([end, height]) for end in ends), crown[None]])
         sides.append((vertices, (float(outward[0]), float(outward[1]), 0.0)))
     return sides
