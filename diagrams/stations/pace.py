@@ -15,6 +15,7 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.stations.driver import MICROSECOND, STATUS_PERIOD, Driver
 from guiderail.models.errors import InputError
+from guiderail.models.joint_status import MISSED
 
 TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
 REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
@@ -242,9 +243,17 @@ def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, p
 
 
 def serve_in_real_time(
-    simulator: Simulator, driver: Driver, seconds: float, attend: Callable[[], None], rate: float = 1.0
+    simulator: Simulator,
+    driver: Driver,
+    seconds: float,
+    attend: Callable[[], None],
+    rate: float = 1.0,
+    say: Callable[[str], None] = print,
 ) -> None:
     """Runs a simulated arm by the wall's clock, as a robot does, which waits for nobody.
+
+    An arm in contact takes a machine longer than one in the air. Where it falls so far behind its own clock that
+    whoever drives it must take its statuses for old ones, it says so: that is no fault of theirs.
 
     Args:
         simulator: of the arm, initialized.
@@ -252,8 +261,17 @@ def serve_in_real_time(
         seconds: to run.
         attend: called after every status: for a deputy.
         rate: of its clock to the wall's.
+        say: what a person is told, once.
     """
     simulator.set_target_realtime_rate(rate)
+    started, has_said = time.monotonic(), False
     for step in range(1, round(seconds / driver.period) + 1):
         simulator.AdvanceTo(step * driver.period)
         attend()
+        behind = (time.monotonic() - started) * rate - step * driver.period
+        if behind > MISSED * driver.period and not has_said:
+            say(
+                f"this machine is too slow, or too busy, for a simulated robot whose clock goes at {rate:g} of the "
+                f"wall's: it is {behind:.2f} s behind; give a smaller --rate, or --lockstep"
+            )
+            has_said = True

@@ -9,8 +9,18 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.driver import STATUS_PERIOD
 from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa
-from guiderail.diagrams.stations.pace import HEAD, TAKEN, Gaps, NewMessages, RealTime, StepByStep, serve
+from guiderail.diagrams.stations.pace import (
+    HEAD,
+    TAKEN,
+    Gaps,
+    NewMessages,
+    RealTime,
+    StepByStep,
+    serve,
+    serve_in_real_time,
+)
 from guiderail.models.errors import InputError
+from guiderail.models.joint_status import MISSED
 
 
 class Told:
@@ -112,3 +122,21 @@ def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
     assert serve(simulator, lcm, IIWA_DRIVER, 4 * STATUS_PERIOD, 5.0) == 4 * STATUS_PERIOD
     heard = heard[1:]
     assert [heard.count(head) for head in dict.fromkeys(heard)][:4] == [3] * 4
+
+
+@pytest.mark.parametrize(("periods", "says"), [(MISSED - 1, False), (MISSED + 1, True)])
+def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch, periods, says):
+    said, wall = [], [0.0]
+    monkeypatch.setattr("guiderail.diagrams.stations.pace.time.monotonic", lambda: wall[0])
+
+    def attend():
+        attended.append(True)
+        wall[0] = (periods + len(attended)) * STATUS_PERIOD
+
+    attended = []
+    simulator = Simulator(ConstantVectorSource([0.0]))
+    serve_in_real_time(simulator, IIWA_DRIVER, 3 * STATUS_PERIOD, attend, 1.0, said.append)
+    assert len(attended) == 3
+    assert bool(said) == says
+    assert len(said) <= 1
+    assert all("give a smaller --rate" in words for words in said)
