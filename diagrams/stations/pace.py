@@ -156,8 +156,9 @@ class RealTime:
 class StepByStep:
     """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
 
-    After each it says which status that was, for `serve`, which waits for this word and for no other: one that comes
-    twice, because a status was sent again before it was answered, moves nobody.
+    Before each it says which status it had last, for `serve`, which waits for this word and for no other: one that
+    comes twice, because a status was sent again before it was answered, moves nobody. So a robot stands still while
+    whoever drives it does anything else, and what comes of a run does not depend on how long that takes.
     """
 
     def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str, period: float = STATUS_PERIOD):
@@ -174,9 +175,9 @@ class StepByStep:
         self._is_silent = False
 
     def begin(self) -> None:
-        """Called when a simulator was initialized, with the newest status: asks for the next."""
+        """Called when a simulator was initialized, with the newest status."""
         self._lcm.HandleSubscriptions(0)
-        self._take()
+        self._taken = self._statuses.last
 
     def advance(self, simulator: Simulator, station: Clocked, steps: int) -> None:
         """Advances by so many statuses; nobody needs the time on the wall."""
@@ -184,18 +185,19 @@ class StepByStep:
         for step in range(steps):
             # A robot that has fallen silent is not waited for again and again.
             patience = self._period if self._is_silent else self._patience
+            self._ask()
             end = time.monotonic() + patience
             while self._statuses.last == self._taken and (left := end - time.monotonic()) > 0.0:
                 repeats = self._statuses.repeats
                 self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
                 if self._statuses.last == self._taken and self._statuses.repeats > repeats:
-                    self._take()  # a robot that asks again may wait for a word that was lost
+                    self._ask()  # a robot that asks again may wait for a word that was lost
             self._is_silent = self._statuses.last == self._taken
+            self._taken = self._statuses.last
             simulator.AdvanceTo(start + (step + 1) * self._period)
-            self._take()
 
-    def _take(self) -> None:
-        self._taken = self._statuses.last
+    def _ask(self) -> None:
+        """For the status after the one that was taken last."""
         self._lcm.Publish(self._answers, self._taken)
 
 
