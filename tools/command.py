@@ -220,6 +220,7 @@ def train(
         resume=resume,
         imports=(*folders, *(imports or ())),
         ledger=ledger,
+        demonstrator=_rule,
     )
     _print(summary, as_json)
 
@@ -950,6 +951,13 @@ def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dic
     else:
         chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
     return {name: untrained(config.task, name, config.seed) for name in chosen}
+
+
+def _rule(task: str) -> Any:
+    """The rule written by hand for a task, which demonstrates it to a learner."""
+    from guiderail.tools.studies.scripted import untrained
+
+    return untrained(task, "rule")
 
 
 def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int) -> Any:

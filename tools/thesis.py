@@ -149,6 +149,11 @@ _ADDITIONS: tuple[tuple[str, Callable[[Preset], bool], str], ...] = (
         "the first {constant_episodes} episodes repeat one action each",
     ),
     ("ez_greedy", lambda p: p.ez_greedy > 0, "exploring takes temporally extended actions (εz-greedy)"),
+    (
+        "demonstration_episodes",
+        lambda p: p.demonstration_episodes > 0,
+        "a rule written by hand acts in the first {demonstration_episodes} episodes, which are learned from",
+    ),
     ("n_steps", lambda p: p.n_steps > 1, "returns are of {n_steps} decisions"),
 )
 _COMPARED = ("learning_rate", "soft_update", "train_every", "gradient_steps", "entropy", "units", "buffer_size")

@@ -28,16 +28,25 @@ def lab(tmp_path_factory):
     borrowed = [sysconfig.get_path("purelib"), *site.getsitepackages(), *(p for p in sys.path if p.endswith("src"))]
     Path(purelib, "borrowed.pth").write_text("\n".join(dict.fromkeys(borrowed)) + "\n")
 
+    variables = os.environ | {"OMP_NUM_THREADS": "1", "DRAKE_ALLOW_NETWORK": "meshcat:lcm"}
+    variables.pop("PYTHONPATH", None)
+    served = subprocess.Popen(
+        [str(environment / "bin" / "python"), str(Path(__file__).with_name("served.py"))],
+        cwd=folder, env=variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert served.stdout.readline() == "ready\n"
+
     def run(*arguments, code=0):
-        command = [str(environment / "bin" / "python"), *arguments]
-        variables = os.environ | {"OMP_NUM_THREADS": "1", "DRAKE_ALLOW_NETWORK": "meshcat:lcm"}
-        variables.pop("PYTHONPATH", None)
-        result = subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True)
-        assert result.returncode == code, result.stdout + result.stderr
-        return result.stdout if code == 0 else result.stderr
+        served.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder)}) + "\n")
+        served.stdin.flush()
+        result = json.loads(served.stdout.readline())
+        assert result["returncode"] == code, result["stdout"] + result["stderr"]
+        return result["stdout"] if code == 0 else result["stderr"]
 
     run.folder = folder
-    return run
+    yield run
+    served.stdin.close()
+    served.wait()
 
 
 def guiderail(lab, *arguments, code=0):

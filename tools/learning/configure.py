@@ -1,10 +1,11 @@
 """`guiderail train`: what was typed becomes a checked configuration, and a run becomes a folder with its pictures."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pandas as pd
 
 from guiderail.models.errors import InputError
@@ -13,6 +14,7 @@ from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.progress import EpisodeProgress
+from guiderail.tools.rollouts.rollout import Act
 from guiderail.tools.tasks import check_environment, import_modules
 
 # What a finished run says about itself.
@@ -63,10 +65,12 @@ def run(
     resume: bool = False,
     imports: Sequence[str] = (),
     ledger: bool | None = None,
+    demonstrator: Callable[[str], Callable[[gymnasium.Env], Act]] | None = None,
 ) -> dict[str, Any]:
     """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
 
-    A run that goes on keeps its configuration; only more episodes may be asked for.
+    A run that goes on keeps its configuration; only more episodes may be asked for. `demonstrator` finds who acts in
+    the learner's `demonstration_episodes` by the task's name, and raises an InputError where nobody does.
 
     Returns:
         What happened, in a few numbers.
@@ -86,8 +90,9 @@ def run(
         config = configure(task, environment, settings=settings, imports=imports, **with_defaults(task, given))
     from guiderail.tools.learning.train import train  # PyTorch takes seconds: what is wrong was refused by now
 
+    shows = demonstrator(config.task) if demonstrator and config.learner.demonstration_episodes else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
-        rows = train(folder, config, resume=resume, report=progress.update)
+        rows = train(folder, config, resume=resume, report=progress.update, demonstrator=shows)
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
 
 

@@ -175,9 +175,10 @@ class OffPolicyLearner(Learner):
         """Begins an episode, and decides how it explores."""
         self.episodes += 1
         share = self.preset.greedy_share
-        self._constant = self._uniform() if self.episodes <= self.preset.constant_episodes else None
+        own = self.episodes - self.preset.demonstration_episodes  # in those before, somebody else acts
+        self._constant = self._uniform() if 0 < own <= self.preset.constant_episodes else None
         due = int(self.episodes * share) > int((self.episodes - 1) * share)
-        self._greedy = due and self._constant is None and self.has_begun()
+        self._greedy = due and own > 0 and self._constant is None and self.has_begun()
         self._repeats = 0
         if self.selection is not None and self._greedy:
             self.selection.begin(self.actor(), self._greedy_successes)

@@ -61,7 +61,8 @@ class Preset:
     learning_starts: Count = 100  # decisions, uniformly random, before the first training
     entropy: Entropy = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     units: Units = (256, 256)  # of the hidden layers
-    constant_episodes: Least = 0  # the first ones, in each of which one uniform action is repeated all the time
+    demonstration_episodes: Least = 0  # the first ones, in which a demonstrator acts; what it did is replayed, too
+    constant_episodes: Least = 0  # the next ones, in each of which one uniform action is repeated all the time
     ez_greedy: Share = 0.0  # how likely an exploring decision begins a temporally extended action (εz-greedy)
     ez_greedy_longest: Count = 8  # decisions that such an action lasts at most
     ez_greedy_until: Least = 0  # greedy successes in a row after which there are no more; 0 for never

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Any, cast
 
+import gymnasium
 import torch
 
 from guiderail.models.errors import InputError
@@ -12,7 +13,8 @@ from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.rollouts.ledger import Ledger
-from guiderail.tools.rollouts.rollout import Observer, rollout
+from guiderail.tools.rollouts.rollout import Act, Observer, rollout
+from guiderail.tools.rollouts.suited import suits
 from guiderail.tools.tables import table_text
 from guiderail.tools.tasks import make_environment
 
@@ -27,6 +29,7 @@ def train(
     *,
     resume: bool = False,
     report: Callable[[dict[str, Any]], None] | None = None,
+    demonstrator: Callable[[gymnasium.Env], Act] | None = None,
 ) -> list[dict[str, Any]]:
     """Trains a run to its last episode and writes its folder.
 
@@ -38,15 +41,27 @@ def train(
         folder: where it is written; with `resume`, where it goes on.
         config: the run. The folder's own configuration must agree with it when it goes on.
         report: called with each episode's row.
+        demonstrator: who acts, in an environment, in the learner's `demonstration_episodes`: a policy without a memory
+            of earlier episodes. Off-policy learners are taught by what others did (Vecerik et al., 2017).
 
     Returns:
         The rows of `episodes.csv`.
 
     Raises:
-        InputError: if the folder holds another run, or another process writes into it.
+        InputError: if the folder holds another run, another process writes into it, or nobody demonstrates.
     """
+    if config.learner.demonstration_episodes and demonstrator is None:
+        raise InputError(
+            f"nobody demonstrates {config.task}: it has no rule, so leave the setting demonstration_episodes out"
+        )
     torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
     env = make_environment(config.task, config.environment)
+    if config.learner.demonstration_episodes and demonstrator is not None and not suits(demonstrator, env):
+        env.close()
+        raise InputError(
+            f"who demonstrates {config.task} sees or moves other things than this environment: leave the setting "
+            "demonstration_episodes out"
+        )
     task = cast(Any, env.unwrapped).task
     decisions = config.episodes * -(-task.num_steps // config.hold)  # the most that the run can take
     make_learner = LEARNERS.get(config.learner.algorithm)
@@ -59,7 +74,7 @@ def train(
         folder.refuse_existing()
     try:
         with folder.locked():
-            return _train(folder, config, env, learner, resume, report)
+            return _train(folder, config, env, learner, resume, report, demonstrator)
     finally:
         env.close()
 
@@ -71,6 +86,7 @@ def _train(
     learner: Learner,
     resume: bool,
     report: Callable[[dict[str, Any]], None] | None,
+    demonstrator: Callable[[gymnasium.Env], Act] | None,
 ) -> list[dict[str, Any]]:
     if resume:
         rows = _resume(folder, learner, env)
@@ -81,10 +97,12 @@ def _train(
 
     ledger = Ledger(env, folder.ledger)
     watching: list[Observer] = [ledger] if config.ledger else []
+    shown = 0 if demonstrator is None else config.learner.demonstration_episodes
     spent_training, spent_saving, last_saving = 0.0, 0.0, 0.0
     for episode in range(len(rows), config.episodes):
         started = time.perf_counter()
-        row = rollout(env, learner.act, learner, *watching, index=episode)
+        act = demonstrator(env) if demonstrator is not None and episode < shown else learner.act
+        row = rollout(env, act, learner, *watching, index=episode)
         if learner.has_diverged():
             raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
         row["wall_time"] = time.perf_counter() - started

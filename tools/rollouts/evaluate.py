@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 import pandas as pd
 
 from guiderail.models.errors import InputError
@@ -22,6 +21,7 @@ from guiderail.tools.rollouts.metrics import converged_after, summary
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.rollouts.suited import suits
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import make_environment
 from guiderail.tools.thesis import differences
@@ -195,10 +195,6 @@ class _NotSuitedError(Exception):
 
 def _suited(policy: Callable[[gymnasium.Env], Act], env: gymnasium.Env) -> Act:
     """What acts, if its observations and actions are the environment's."""
-    try:
-        found = np.shape(policy(env)(np.zeros(env.observation_space.shape or (), np.float32)))
-    except (IndexError, ValueError):
-        found = None
-    if found != env.action_space.shape:
+    if not suits(policy, env):
         raise _NotSuitedError
     return policy(env)

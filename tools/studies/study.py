@@ -298,7 +298,9 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
     if _is_to_train(job, mark):
         from guiderail.tools.learning.train import train
 
-        train(folder, job.config(mark), resume=(folder.path / "config.yaml").exists())
+        config = job.config(mark)
+        shows = untrained(config.task, "rule") if config.learner.demonstration_episodes else None
+        train(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=shows)
     if len(folder.episodes()) == mark and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):
             write_atomically(copy / name, (folder.path / name).read_bytes())

@@ -51,6 +51,46 @@ def ledger_bytes(folder):
     return {path.name: path.read_bytes() for path in folder.ledger.iterdir()}
 
 
+def shown(config, number):
+    return replace(config, learner=replace(config.learner, demonstration_episodes=number))
+
+
+def always_left(env):
+    return lambda observation: env.action_space.low
+
+
+def test_a_demonstrator_acts_in_the_first_episodes_and_the_learner_after(bead_config, tmp_path):
+    acted = []
+
+    def watched(env):
+        return lambda observation: acted.append(len(acted)) or env.action_space.low
+
+    rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=watched)
+    both = sum(row["steps"] for row in rows[:2])
+    assert len(acted) == 1 + both  # once before anything moves
+
+
+def test_a_run_that_was_demonstrated_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+    config = shown(bead_config, 2)
+    undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
+    train(undisturbed, config, demonstrator=always_left)
+    train(stopped, replace(config, episodes=1), demonstrator=always_left)
+    train(stopped, config, demonstrator=always_left, resume=True)
+    assert_same_run(undisturbed, stopped)
+
+
+def test_where_nobody_demonstrates_a_run_is_refused_before_it_begins(bead_config, tmp_path):
+    with pytest.raises(InputError, match="demonstration_episodes"):
+        train(RunFolder(tmp_path / "run"), shown(bead_config, 1))
+    assert not (tmp_path / "run").exists()
+
+
+def test_who_moves_other_things_demonstrates_nothing(bead_config, tmp_path):
+    with pytest.raises(InputError, match="moves other things"):
+        train(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=lambda env: lambda seen: np.zeros(7))
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
     undisturbed, killed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "killed")
     train(undisturbed, bead_config)
