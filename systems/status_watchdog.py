@@ -19,22 +19,27 @@ from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 
 # Entries of the state besides the last readable status itself.
-_CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT = range(7)
+_CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT, _DOUBTED_AT, _KNOWN_TIME, _KNOWN_OFFSET = range(10)
 _SOUND = (Fault.NONE, Fault.LATE)  # what is no fault of the status itself
-# After these the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of long ago
-# drives an arm.
-_OUT_OF_TIME = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE)
-_FORGOTTEN = (0.0, np.nan, 0.0, 0.0, 0.0, float(Fault.NO_STATUS), 0.0)
+# After the first three the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of
+# long ago drives an arm. So does damping by the inertia of another posture. Only a status that agrees with what was
+# known before is as good as any.
+_DOUBTFUL = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE, Fault.POSITION_JUMP)
+_FRESH = 0.5  # of the greatest age: speeds no older than that are damped without swinging
+_FORGOTTEN = (0.0, np.nan, 0.0, 0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, np.nan, 0.0)
 
 
 @dataclass(frozen=True)
 class _Verdict:
-    """Of the newest status: what is wrong with it, whether it is new and believed, and what is believed then, (3n,)."""
+    """Of the newest status: what is wrong with it, whether it is new and believed, what is believed then, (3n,), and by
+    which clock's offset [s] it was judged.
+    """
 
     fault: Fault
     is_new: bool
     is_believed: bool
     believed: np.ndarray
+    offset: float
 
 
 class StatusWatchdog(LeafSystem):
@@ -44,8 +49,9 @@ class StatusWatchdog(LeafSystem):
     after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
     when the first status comes, slowly after that, and anew after a fault or a silence: then the next status is judged
     by the one that was at fault, if its numbers were sound. Where the clock on the wall is told, this program's own
-    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump of a clock
-    nothing is believed before the settling time is over.
+    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump, of a clock
+    or a position, nothing is believed before the settling time is over, but what agrees with the clock and the
+    positions as they were before: a single status from elsewhere blinds nobody.
 
     .. pydrake_system::
 
@@ -142,17 +148,25 @@ class StatusWatchdog(LeafSystem):
         memory, values = self._memory_of(context), context.get_discrete_state(self._last).value()
         last = Heard(float(memory[_TIME]), float(memory[_OFFSET]), values)
         believed = context.get_discrete_state(self._believed).value().copy()
-        now = self._now(context)
+        now, is_known = self._now(context), not np.isfinite(memory[_DOUBTED_AT])
+        known = Heard(float(memory[_KNOWN_TIME]), float(memory[_KNOWN_OFFSET]), believed)
+        if status is not None and not is_known and self._agrees(status, known, now):
+            last, is_known = known, True
         fault = judge_status(status, last, now, self._limits)
         if not fault and now - memory[_CLOCK] > self._limits.max_gap:
             fault = Fault.LATE
         if status is None or fault in (Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE):
-            return _Verdict(fault, False, False, believed)
+            return _Verdict(fault, False, False, believed, last.offset)
         newest = status.values()
         is_overtaken = status.time <= last.time and not fault
-        is_new = not is_overtaken and (status.time != last.time or not np.array_equal(newest, values))
-        is_believed = is_new and fault in _SOUND and memory[_FAULT] not in _OUT_OF_TIME
-        return _Verdict(fault, is_new, is_believed, newest if is_believed else believed)
+        is_new = not is_overtaken and (status.time != last.time or not np.array_equal(newest, last.values))
+        is_believed = is_new and fault in _SOUND and is_known
+        return _Verdict(fault, is_new, is_believed, newest if is_believed else believed, last.offset)
+
+    def _agrees(self, status: JointStatus, known: Heard, now: float) -> bool:
+        """Whether a status is sound and fresh by what was known."""
+        is_fresh = status.time > known.time and now - (status.time + known.offset) <= _FRESH * self._limits.max_age
+        return is_fresh and judge_status(status, known, now, self._limits) == Fault.NONE
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._memory, _FORGOTTEN)
@@ -170,11 +184,11 @@ class StatusWatchdog(LeafSystem):
             is_late = verdict.fault == Fault.STALE and now - memory[_HEARD_AT] <= self._limits.max_age
             if is_in_step or is_late:
                 drift = self._limits.clock_drift * self._period
-                wanted = memory[_OFFSET] + np.clip(wanted - memory[_OFFSET], -drift, drift)
+                wanted = verdict.offset + np.clip(wanted - verdict.offset, -drift, drift)
             memory[_TIME], memory[_OFFSET], memory[_HEARD_AT] = status.time, wanted, now
             discrete_state.set_value(self._last, status.values())
             if verdict.is_believed:
-                memory[_BELIEVED_AT] = now
+                memory[_BELIEVED_AT], memory[_KNOWN_TIME], memory[_KNOWN_OFFSET] = now, status.time, wanted
                 discrete_state.set_value(self._believed, verdict.believed)
         # Added up instead of read, so that what is remembered can be carried over to a diagram with another clock.
         memory[_CLOCK] = now + self._period
@@ -182,6 +196,10 @@ class StatusWatchdog(LeafSystem):
             memory[_FAULT], memory[_FAULT_AT] = verdict.fault, now
         elif memory[_CLOCK] - memory[_FAULT_AT] > self._limits.settling:
             memory[_FAULT] = Fault.NONE
+        if verdict.fault in _DOUBTFUL:
+            memory[_DOUBTED_AT] = now
+        elif memory[_CLOCK] - memory[_DOUBTED_AT] > self._limits.settling:
+            memory[_DOUBTED_AT] = np.nan
         discrete_state.set_value(self._memory, memory)
         return EventStatus.Succeeded()
 

@@ -84,11 +84,13 @@ class TorqueGuard(LeafSystem):
     a is the authority, which grows from 0 to 1 in the ramp time. f is 1 for a new status, and 0 for one that is two
     periods old: what was wanted of an arm that isn't seen would drive it ever faster. τ_damping (`damping_torque`)
     takes away all joints' speed with the decay time; where no status comes any more, what was seen last is taken away
-    once.
+    once, and with it what the arm was given since: a period of what was wanted is more than standstill allows.
 
     A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
-    is called. At first it waits until the status is sound, and takes over by itself. What is sent is always finite and
-    within the torque limits. Where a robot stays silent nothing is sent to it any more, nor right after it is back.
+    is called. At first it waits until the status is sound, and takes over by itself. A robot that comes back with
+    another clock after a silence was started anew, and what it had of speed is gone: it is left without torque. What is
+    sent is always finite and within the torque limits. Where a robot stays silent nothing is sent to it any more, nor
+    right after it is back.
 
     .. pydrake_system::
 
@@ -150,6 +152,7 @@ class TorqueGuard(LeafSystem):
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._holding_port = self.DeclareVectorInputPort("holding", 1)
         self._memory = self.DeclareDiscreteState(4)
+        self._given = self.DeclareDiscreteState(num_joints)  # momentum since the last status [Nms]
 
         memory, fault = {self.discrete_state_ticket(self._memory)}, {self._status_fault_port.ticket()}
         measured = {
@@ -178,7 +181,9 @@ class TorqueGuard(LeafSystem):
             self._calc_safe_torque,
             prerequisites_of_calc=found
             | memory
-            | {self._torque_port.ticket(), self._state_port.ticket(), self._status_age_port.ticket()},
+            | fault
+            | {self._torque_port.ticket(), self._state_port.ticket(), self._status_age_port.ticket()}
+            | {self.discrete_state_ticket(self._given)},
         )
         self._fault_port = self.DeclareVectorOutputPort(
             "fault", 1, self._calc_fault, prerequisites_of_calc=found | memory
@@ -308,12 +313,19 @@ class TorqueGuard(LeafSystem):
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._memory, [Phase.WAITING, Fault.NONE, 0.0, 0.0])
+        discrete_state.set_value(self._given, np.zeros(self._num_joints))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         phase, fault, phase_time, authority = self._memory_of(context)
         phase_time += self._period
         found = self._found.Eval(context)
+        given = self._given_until_now(context)
+        if phase in (Phase.RAMPING, Phase.RUNNING) and not found:
+            push = self._safe_torque_port.Eval(context)
+            push = push + self._freshness(context) * self._external_torque_port.Eval(context)
+            given = given + self._period * push
+        discrete_state.set_value(self._given, given)
         if phase == Phase.WAITING:
             if not found:
                 phase, phase_time = Phase.RAMPING, 0.0
@@ -324,7 +336,7 @@ class TorqueGuard(LeafSystem):
                 authority = min(authority + self._period / self._limits.ramp_time, 1.0)
                 if phase == Phase.RAMPING and authority == 1.0:
                     phase, phase_time = Phase.RUNNING, 0.0
-        elif phase == Phase.DAMPING and phase_time >= self._limits.damping_time:
+        elif phase == Phase.DAMPING and (phase_time >= self._limits.damping_time or self._is_started_anew(context)):
             phase, phase_time = Phase.OFF, 0.0
         discrete_state.set_value(self._memory, [phase, fault, phase_time, authority])
         return EventStatus.Succeeded()
@@ -334,15 +346,27 @@ class TorqueGuard(LeafSystem):
         is_active = phase in (Phase.RAMPING, Phase.RUNNING)
         torque = np.zeros(self._num_joints)
         if is_active and not self._found.Eval(context):
-            freshness = np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0)
-            torque = authority * freshness * self._torque_port.Eval(context)
+            torque = authority * self._freshness(context) * self._torque_port.Eval(context)
             if authority < 1.0:
                 torque = torque + (1.0 - authority) * self._damping_torque(context, np.inf)
         elif is_active:
             torque = self._damping_torque(context, 0.0)
-        elif phase == Phase.DAMPING:
+        elif phase == Phase.DAMPING and not self._is_started_anew(context):
             torque = self._damping_torque(context, phase_time + self._period)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
+
+    def _is_started_anew(self, context: Context) -> bool:
+        """Whether a robot for whose silence the arm is stopped speaks again, by another clock."""
+        status_fault = self._status_fault_port.Eval(context)[0]
+        return bool(self._memory_of(context)[_FAULT] == Fault.STALE and status_fault == Fault.OUT_OF_ORDER)
+
+    def _freshness(self, context: Context) -> float:
+        return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))
+
+    def _given_until_now(self, context: Context) -> np.ndarray:
+        """What the arm was given since the last status, (n,) [Nms]: nothing where that one is new."""
+        is_new = self._status_age_port.Eval(context)[0] == 0.0
+        return np.zeros(self._num_joints) if is_new else context.get_discrete_state(self._given).value().copy()
 
     def _damping_torque(self, context: Context, damped: float) -> np.ndarray:
         """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s].
@@ -355,6 +379,8 @@ class TorqueGuard(LeafSystem):
             return np.zeros(self._num_joints)
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = self._state_port.Eval(context)[self._num_joints :]
+        if np.isfinite(damped):
+            v = v + np.linalg.solve(M, self._given_until_now(context))
         damped = min(age, damped)
         return damping_torque(M, v, self._limits.decay_time, period=self._period, damped=damped)
 

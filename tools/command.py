@@ -741,7 +741,7 @@ def serve_iiwa(
     """
     from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
 
-    is_done = serve(url, seconds, patience, task, rate=rate, offset=_numbers(offset), scenario=scenario)
+    is_done = serve(url, seconds, patience, task, rate=rate, offset=_numbers(offset), scenario=scenario, say=_tell)
     raise typer.Exit(0 if is_done else 1)
 
 

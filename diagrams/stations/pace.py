@@ -13,13 +13,15 @@ from pydrake.lcm import DrakeLcm, DrakeLcmInterface, Subscriber
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from guiderail.diagrams.stations.driver import STATUS_PERIOD, Driver
+from guiderail.diagrams.stations.driver import MICROSECOND, STATUS_PERIOD, Driver
 from guiderail.models.errors import InputError
+from guiderail.models.joint_status import MISSED
 
 TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
 REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
 URGENCY = 20  # of a process that a robot waits for, among those that the system serves first
-HEAD = 16  # bytes of a message: its type, and the time that a status or a command begins with
+HEAD_FORMAT = ">8sq"  # of a message: its type, and the time [µs] that a status or a command begins with
+HEAD = struct.calcsize(HEAD_FORMAT)
 BIN = 1e-4  # [s] of a histogram
 
 
@@ -46,6 +48,7 @@ class NewMessages:
     Attributes:
         count: of different messages.
         repeats: of those that were sent again.
+        last: the head of the last one, by which they are told apart.
     """
 
     def __init__(self, lcm: DrakeLcmInterface, channel: str):
@@ -55,12 +58,12 @@ class NewMessages:
             channel: its channel.
         """
         self.count = self.repeats = 0
-        self._last = b""
+        self.last = b""
         lcm.Subscribe(channel, self._hear)
 
     def _hear(self, message: bytes) -> None:
-        if message[:HEAD] != self._last:
-            self._last, self.count = message[:HEAD], self.count + 1
+        if message[:HEAD] != self.last:
+            self.last, self.count = message[:HEAD], self.count + 1
         else:
             self.repeats += 1
 
@@ -153,7 +156,9 @@ class RealTime:
 class StepByStep:
     """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
 
-    After each it says so, for `serve`, which waits for it.
+    Before each it says which status it had last, for `serve`, which waits for this word and for no other: one that
+    comes twice, because a status was sent again before it was answered, moves nobody. So a robot stands still while
+    whoever drives it does anything else, and what comes of a run does not depend on how long that takes.
     """
 
     def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str, period: float = STATUS_PERIOD):
@@ -166,14 +171,13 @@ class StepByStep:
         """
         self._lcm, self._patience, self._answers, self._period = lcm, patience, channel + TAKEN, period
         self._statuses = NewMessages(lcm, channel)
-        self._taken = self._said = 0
+        self._taken = b""
         self._is_silent = False
 
     def begin(self) -> None:
-        """Called when a simulator was initialized, with the newest status: asks for the next."""
+        """Called when a simulator was initialized, with the newest status."""
         self._lcm.HandleSubscriptions(0)
-        self._taken = self._statuses.count
-        self._say()
+        self._taken = self._statuses.last
 
     def advance(self, simulator: Simulator, station: Clocked, steps: int) -> None:
         """Advances by so many statuses; nobody needs the time on the wall."""
@@ -181,27 +185,27 @@ class StepByStep:
         for step in range(steps):
             # A robot that has fallen silent is not waited for again and again.
             patience = self._period if self._is_silent else self._patience
+            self._ask()
             end = time.monotonic() + patience
-            while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
+            while self._statuses.last == self._taken and (left := end - time.monotonic()) > 0.0:
                 repeats = self._statuses.repeats
                 self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
-                if self._statuses.repeats > repeats:
-                    self._say()  # a robot that asks again waits for a word that was lost, or was for two statuses
-            self._is_silent = self._statuses.count == self._taken
-            self._taken = self._statuses.count
+                if self._statuses.last == self._taken and self._statuses.repeats > repeats:
+                    self._ask()  # a robot that asks again may wait for a word that was lost
+            self._is_silent = self._statuses.last == self._taken
+            self._taken = self._statuses.last
             simulator.AdvanceTo(start + (step + 1) * self._period)
-            self._say()
 
-    def _say(self) -> None:
-        self._said += 1
-        self._lcm.Publish(self._answers, struct.pack(">q", self._said))
+    def _ask(self) -> None:
+        """For the status after the one that was taken last."""
+        self._lcm.Publish(self._answers, self._taken)
 
 
 def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, patience: float) -> float:
     """Runs a simulated arm for another process: one step, then it waits until its status was answered.
 
     So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
-    has taken the status in; where that never came, it is a command.
+    has taken this very status in; where no word ever came, it is a command.
 
     Args:
         simulator: of the arm, initialized.
@@ -215,18 +219,21 @@ def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, p
     """
     commands = Subscriber(lcm, driver.command_channel, driver.command_type)
     words = NewMessages(lcm, driver.status_channel + TAKEN)
-
-    def answers() -> int:
-        return words.count or commands.count
-
     steps, repeats = 0, max(1, round(patience / REPEAT))
+
+    def is_answered() -> bool:
+        if not words.count:
+            return commands.count > commanded
+        said = struct.unpack(HEAD_FORMAT, words.last)[1] if len(words.last) == HEAD else -1
+        return abs(said * MICROSECOND - steps * driver.period) < 0.5 * driver.period
+
     while steps * driver.period < seconds:
-        answered = answers()
+        commanded = commands.count
         for _ in range(repeats if steps else 10 * repeats):
             # A command comes before the word that belongs to it.
-            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and answers() == answered:
+            while lcm.HandleSubscriptions(round(1000 * REPEAT)) and not is_answered():
                 pass
-            if answers() > answered:
+            if is_answered():
                 break
             # A datagram may be lost, and before its first answer the other side may not have been listening.
             simulator.get_system().ForcedPublish(simulator.get_context())
@@ -238,9 +245,17 @@ def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, p
 
 
 def serve_in_real_time(
-    simulator: Simulator, driver: Driver, seconds: float, attend: Callable[[], None], rate: float = 1.0
+    simulator: Simulator,
+    driver: Driver,
+    seconds: float,
+    attend: Callable[[], None],
+    rate: float = 1.0,
+    say: Callable[[str], None] = print,
 ) -> None:
     """Runs a simulated arm by the wall's clock, as a robot does, which waits for nobody.
+
+    An arm in contact takes a machine longer than one in the air. Where it falls so far behind its own clock that
+    whoever drives it must take its statuses for old ones, it says so: that is no fault of theirs.
 
     Args:
         simulator: of the arm, initialized.
@@ -248,8 +263,17 @@ def serve_in_real_time(
         seconds: to run.
         attend: called after every status: for a deputy.
         rate: of its clock to the wall's.
+        say: what a person is told, once.
     """
     simulator.set_target_realtime_rate(rate)
+    started, has_said = time.monotonic(), False
     for step in range(1, round(seconds / driver.period) + 1):
         simulator.AdvanceTo(step * driver.period)
         attend()
+        behind = (time.monotonic() - started) * rate - step * driver.period
+        if behind > MISSED * driver.period and not has_said:
+            say(
+                f"this machine is too slow, or too busy, for a simulated robot whose clock goes at {rate:g} of the "
+                f"wall's: it is {behind:.2f} s behind; give a smaller --rate, or --lockstep"
+            )
+            has_said = True

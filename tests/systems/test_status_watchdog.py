@@ -258,3 +258,57 @@ def test_after_a_silence_nothing_is_believed_before_it_has_settled():
         watched.check(status)
         np.testing.assert_array_equal(watched.state, before.values()[:4])
         assert watched.age > LIMITS.max_age
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 1.0])
+def test_after_a_stray_status_what_keeps_to_the_known_clock_is_believed_at_once(seconds):
+    """Whoever damps needs the arm's speed now; the fault is reported all the same."""
+    watched = Watched().settle()
+    watched.check(replace(watched.sound(), time=watched.sound().time + seconds))
+    fault = watched.fault
+    for _ in range(3):
+        status = watched.sound()
+        assert watched.check(status) == fault
+        np.testing.assert_array_equal(watched.state, status.values()[:4])
+    late = replace(status, time=status.time + 0.25 * PERIOD, velocities=status.velocities + 0.3)
+    for _ in range(5):
+        watched.check(late)
+    np.testing.assert_array_equal(watched.state, late.values()[:4])  # fresh when it came
+    again = replace(watched.sound(), time=watched.sound().time - 0.75 * LIMITS.max_age)
+    watched.check(again)
+    np.testing.assert_array_equal(watched.state, late.values()[:4])  # too late to damp by
+
+
+@pytest.mark.parametrize("between", [Fault.MALFORMED, Fault.POSITION_JUMP], ids=lambda fault: fault.name)
+def test_another_clock_is_not_believed_before_it_has_settled_whatever_else_goes_wrong(between):
+    watched = Watched().settle()
+
+    def set_back():
+        status = watched.sound()
+        return replace(status, time=status.time - 1.0, velocities=status.velocities + 0.05)
+
+    for step in range(round(0.9 * LIMITS.settling / PERIOD)):
+        watched.check(WRONG[between](set_back()) if step == 3 else set_back())
+        np.testing.assert_array_equal(watched.state[2:], 0.1)
+        assert watched.age > 0.0
+    for _ in range(round(LIMITS.settling / PERIOD)):
+        watched.check(set_back())
+    assert watched.fault == Fault.NONE
+    np.testing.assert_allclose(watched.state[2:], 0.15)
+
+
+def test_a_position_that_has_jumped_and_stays_is_not_believed_before_it_has_settled():
+    """Its inertia is that of another posture, and damping by it may drive the arm."""
+    watched = Watched().settle()
+
+    def slipped():
+        return replace(watched.sound(), positions=watched.sound().positions + [2.5, 0.0])
+
+    for _ in range(round(0.9 * LIMITS.settling / PERIOD)):
+        watched.check(slipped())
+        assert watched.state[0] < 1.0
+        assert watched.fault == Fault.POSITION_JUMP
+    for _ in range(round(0.2 * LIMITS.settling / PERIOD)):
+        watched.check(slipped())
+    assert watched.fault == Fault.NONE
+    assert watched.state[0] > 2.5

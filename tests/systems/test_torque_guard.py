@@ -167,18 +167,38 @@ def test_never_sends_more_than_the_limits(plant):
     np.testing.assert_array_equal(guarded["safe_torque"], np.clip(np.linspace(-200.0, 200.0, n), -20.0, 20.0))
 
 
-@pytest.mark.parametrize("before", [0.0, 0.03])  # [s] for which no status had come when that was found
-def test_damping_takes_away_exactly_what_the_arm_had(plant, before):
+@pytest.mark.parametrize("before", [0, 1, 8])  # periods for which no status had come when that was found
+def test_damping_takes_away_exactly_what_the_arm_had_and_was_given_since(plant, before):
     """Where no status comes, the speed is that of the last one for ever: what is taken away in all is its momentum."""
-    guarded = Guarded(plant)
-    guarded.set(state=[*POSTURE, *(0.1 * SPEED)], status_fault=[Fault.STALE])
-    taken = np.zeros(n)
+    guarded, load = Guarded(plant), np.full(n, 0.5)
+    guarded.set(state=[*POSTURE, *(0.1 * SPEED)], external_torque=load)
+    guarded.go(PERIOD)
+    given, taken = np.zeros(n), np.zeros(n)
+    for age in range(before):
+        if age > 0:
+            guarded.set(status_age=[age * PERIOD])
+        seen = np.clip(2.0 - age, 0.0, 1.0)
+        np.testing.assert_allclose(guarded["safe_torque"], seen * WANTED)
+        given += PERIOD * seen * (WANTED + load)
+        guarded.go(PERIOD)
+    guarded.set(status_fault=[Fault.STALE])
     for step in range(round(LIMITS.damping_time / PERIOD)):
-        guarded.set(status_age=[before + step * PERIOD])
+        guarded.set(status_age=[(before + step) * PERIOD])
         taken += PERIOD * guarded["safe_torque"]
         guarded.go(PERIOD)
     momentum = -guarded.damping() * PERIOD / (1.0 - np.exp(-PERIOD / LIMITS.decay_time))
-    np.testing.assert_allclose(taken, -0.1 * momentum, rtol=1e-3)
+    np.testing.assert_allclose(taken, -0.1 * momentum - given, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize(("first", "then", "has_torque"), [(2, 3, False), (3, 3, True), (2, 2, True)])
+def test_a_robot_that_was_started_anew_is_not_driven_by_the_speed_that_it_had(plant, first, then, has_torque):
+    """Silence, and then another clock; a clock that jumps without it is the same robot, which is damped."""
+    guarded = Guarded(plant)
+    for status_fault in (first, first, then):
+        guarded.set(status_fault=[float(status_fault)])
+        guarded.go(PERIOD)
+    assert guarded["safe_torque"].any() == has_torque
+    assert guarded.phase == (Phase.DAMPING if has_torque else Phase.OFF)
 
 
 def test_what_is_wanted_of_an_arm_that_is_not_seen_fades(plant):

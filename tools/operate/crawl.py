@@ -5,6 +5,7 @@ import numpy as np
 from guiderail.models.units import DEGREE, MM
 
 CRAWL, CRAWL_TURN = 0.02, 0.1  # [m/s], [rad/s]
+BACK, BACK_TURN = 0.01, 0.5  # [m/s], [rad/s]: slower than this nobody needs to go back along a way that was gone
 NEAR, NEAR_TURN = 3.0 * MM, 2.0 * DEGREE  # of where the arm was sent, to be there
 SETTLE = 0.5  # [s] at the end
 
@@ -34,3 +35,18 @@ def is_near(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether the arm is where it was sent."""
     away, turned = distance(one, other)
     return away <= NEAR and turned <= NEAR_TURN
+
+
+def back(way: np.ndarray, period: float) -> list[np.ndarray]:
+    """A pose for each period [s], backwards along a way (n, 6) with a pose for each period, to where it began.
+
+    At the pace at which it was gone, but without the time for which the arm stood still or nearly so.
+    """
+    poses: list[np.ndarray] = []
+    for pose in way[::-1]:
+        away, turned = distance(pose, poses[-1]) if poses else (np.inf, np.inf)
+        if away >= BACK * period or turned >= BACK_TURN * period:
+            poses.append(pose.copy())
+    if len(way):
+        poses.append(way[0].copy())
+    return poses

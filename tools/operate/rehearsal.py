@@ -19,6 +19,7 @@ from guiderail.models.units import MM
 from guiderail.tools.operate.scenario import load_scenario
 
 PATIENCE = 20.0  # [s] of wall clock that a rehearsal in step waits for a status
+LONGEST = 7 * 24 * 3600.0  # [s] of the robot's clock: it is there until the rehearsal is over
 # Contact takes a simulated robot with 1 kHz longer than the wall's clock would allow, on the machines that we know.
 REHEARSAL_RATE = 0.2
 
@@ -97,7 +98,7 @@ class Other:
         if not self.rehearse:
             yield
             return
-        arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300"]
+        arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300", "--seconds", str(LONGEST)]
         arguments += [] if self.lockstep else ["--rate", str(self.rate)]
         arguments += [] if offset is None else ["--offset", ",".join(repr(float(value)) for value in offset)]
         arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]

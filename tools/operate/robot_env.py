@@ -20,7 +20,7 @@ from guiderail.models.joint_status import FAULTS, Fault
 from guiderail.models.units import MM
 from guiderail.systems.torque_guard import Phase
 from guiderail.tools.operate.checks import Check, check_robot
-from guiderail.tools.operate.crawl import crawl, distance, is_near
+from guiderail.tools.operate.crawl import back, crawl, distance, is_near
 from guiderail.tools.operate.keys import Keys
 
 PULL, GIVES_WAY, LEAST_PULL = 3.0 * MM, 1.0 * MM, 1.5  # [m] commanded, [m] followed at most, [N] felt at least
@@ -155,7 +155,7 @@ class RobotEnv(GuidedEnv):
         try:
             following, reward, terminated, truncated, info = super().step(action)
         except RobotStoppedError as stopped:
-            self._way_back.extend(self.trace.measured.copy())
+            self._way_back.extend(back(self.trace.measured, self.task.control_period)[::-1])
             self._running, self.fault = False, stopped.fault
             self._come_to_rest()
             terms = dict.fromkeys(self.task.reward_terms, 0.0)
@@ -163,7 +163,7 @@ class RobotEnv(GuidedEnv):
             info |= {"termination": "stopped", "stopped": str(stopped)}
             return self._observation, 0.0, False, True, info
         if terminated or truncated:
-            self._way_back.extend(self.trace.measured.copy())
+            self._way_back.extend(back(self.trace.measured, self.task.control_period)[::-1])
             if info["is_success"] and not self._holds():
                 info |= {"is_success": False, "termination": "did_not_hold"}
         return following, reward, terminated, truncated, info

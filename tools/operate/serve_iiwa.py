@@ -1,6 +1,6 @@
 """`guiderail serve-iiwa`: a simulated iiwa at the other end of LCM, in a process of its own."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,7 @@ def serve_iiwa(
     rate: float | None = None,
     offset: Sequence[float] | None = None,
     scenario: Path | None = None,
+    say: Callable[[str], None] = print,
 ) -> bool:
     """Serves the arm in front of a task's fixture; whether commands kept coming until the end.
 
@@ -45,6 +46,7 @@ def serve_iiwa(
         rate: it goes by the wall's clock, as a robot does, or so much slower, and waits for nobody.
         offset: (x, y) of the fixture from where it is thought to be [m].
         scenario: a file that says what stands around it; see `load_scenario`.
+        say: what a person is told.
 
     Raises:
         InputError: if the task is none.
@@ -78,5 +80,5 @@ def serve_iiwa(
     def attend() -> None:
         ears.HandleSubscriptions(0)
 
-    serve_in_real_time(simulator, driver, seconds, attend, rate)
+    serve_in_real_time(simulator, driver, seconds, attend, rate, say)
     return True

@@ -148,12 +148,7 @@ def pushing():
     return OneProcess()
 
 
-ROLLS_OUT = pytest.mark.xfail(strict=True, reason="after a status from the past 0.03 rad/s are left to roll out")
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=ROLLS_OUT) if name == "an old status" else name for name in FAULTY]
-)
+@pytest.mark.parametrize("name", FAULTY)
 def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told(pushing, name):
     """The arm is on its way; one wrong status comes, in place of the robot's."""
     both, (fault, changed) = pushing, FAULTY[name]

@@ -6,9 +6,21 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.primitives import ConstantVectorSource
 
+from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.driver import STATUS_PERIOD
-from guiderail.diagrams.stations.pace import Gaps, NewMessages, RealTime
+from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa
+from guiderail.diagrams.stations.pace import (
+    HEAD,
+    TAKEN,
+    Gaps,
+    NewMessages,
+    RealTime,
+    StepByStep,
+    serve,
+    serve_in_real_time,
+)
 from guiderail.models.errors import InputError
+from guiderail.models.joint_status import MISSED
 
 
 class Told:
@@ -72,3 +84,61 @@ def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
         lcm.Publish("STATUS", message)
         lcm.HandleSubscriptions(0)
     assert messages.count == 2
+
+
+def test_in_step_a_status_that_comes_again_is_answered_again_and_is_no_step():
+    lcm, words = DrakeLcm("memq://"), []
+    pace, simulator = StepByStep(lcm, 0.01, "STATUS"), Simulator(ConstantVectorSource([0.0]))
+    lcm.Subscribe("STATUS" + TAKEN, words.append)
+    pace.begin()
+    for number in range(3):
+        for _ in range(3):
+            lcm.Publish("STATUS", bytes([number]) * 40)
+        pace.advance(simulator, Told(), 1)
+        lcm.HandleSubscriptions(0)
+    assert simulator.get_context().get_time() == 3 * STATUS_PERIOD
+    # What is asked for is the status after this one, and not before anybody wants it.
+    assert words == [b"", *(bytes([number]) * HEAD for number in range(2))]
+    words.clear()
+    lcm.Publish("STATUS", bytes([2]) * 40)
+    pace.advance(simulator, Told(), 1)  # nobody speaks but of what is known: the word was lost, and it goes on without
+    while lcm.HandleSubscriptions(0):
+        pass
+    assert len(words) > 1
+    assert set(words) == {bytes([2]) * HEAD}
+
+
+def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
+    """Words about the one before, which was sent again meanwhile, move it no further."""
+    lcm, heard = DrakeLcm("memq://"), []
+    simulator = Simulator(SimulatedIiwa(BncWorkcell(), lcm))
+
+    def answer(message):
+        heard.append(message[:HEAD])
+        earlier = dict.fromkeys(heard)
+        lcm.Publish(IIWA_DRIVER.status_channel + TAKEN, list(earlier)[-2 if heard.count(heard[-1]) < 3 else -1])
+
+    heard.append(b"\x7f" * HEAD)
+    lcm.Subscribe(IIWA_DRIVER.status_channel, answer)
+    simulator.Initialize()
+    assert serve(simulator, lcm, IIWA_DRIVER, 4 * STATUS_PERIOD, 5.0) == 4 * STATUS_PERIOD
+    heard = heard[1:]
+    assert [heard.count(head) for head in dict.fromkeys(heard)][:4] == [3] * 4
+
+
+@pytest.mark.parametrize(("periods", "says"), [(MISSED - 1, False), (MISSED + 1, True)])
+def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch, periods, says):
+    said, wall = [], [0.0]
+    monkeypatch.setattr("guiderail.diagrams.stations.pace.time.monotonic", lambda: wall[0])
+
+    def attend():
+        attended.append(True)
+        wall[0] = (periods + len(attended)) * STATUS_PERIOD
+
+    attended = []
+    simulator = Simulator(ConstantVectorSource([0.0]))
+    serve_in_real_time(simulator, IIWA_DRIVER, 3 * STATUS_PERIOD, attend, 1.0, said.append)
+    assert len(attended) == 3
+    assert bool(said) == says
+    assert len(said) <= 1
+    assert all("give a smaller --rate" in words for words in said)
