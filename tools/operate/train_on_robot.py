@@ -73,6 +73,8 @@ def train_on_robot(
         raise InputError(f"nobody wrote down how a robot tells that {config.task} is done: learn it in a simulation")
     if declared.choice.reward in declared.simulated_rewards:
         raise InputError(f"the reward {declared.choice.reward!r} is of what a simulation alone knows: choose another")
+    if config.learner.demonstration_episodes:
+        raise InputError("nobody demonstrates on a robot: leave the setting demonstration_episodes out")
     threadpool_limits(1)
     torch.set_num_threads(1)
     station = make_station(resolved)

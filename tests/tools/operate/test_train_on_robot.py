@@ -148,3 +148,16 @@ def test_refuses_what_a_robot_cannot_tell(task, options, words, tmp_path):
         train_on_robot(
             task, tmp_path / "run", Other(rehearse=True), environment={"station": "hardware"} | options, given={}
         )
+
+
+def test_refuses_what_nobody_can_show_it(tmp_path):
+    with pytest.raises(InputError, match="demonstration_episodes"):
+        train_on_robot(
+            "BncConnector",
+            tmp_path / "run",
+            Other(rehearse=True),
+            environment={"station": "hardware", "guidance": "kgrl"},
+            given={},
+            settings={"demonstration_episodes": 1},
+        )
+    assert not (tmp_path / "run").exists()
