@@ -11,6 +11,8 @@ export OMP_NUM_THREADS ?= 1
 demo: $(VENV)/.ready
 	$(BIN)/guiderail demo
 
+# Compiled once, and not by every process that a test starts.
+test: export PYTHONDONTWRITEBYTECODE =
 test: $(VENV)/.ready lint
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
