@@ -63,11 +63,17 @@ def test_a_demonstrator_acts_in_the_first_episodes_and_the_learner_after(bead_co
     acted = []
 
     def watched(env):
-        return lambda observation: acted.append(len(acted)) or env.action_space.low
+        acted.append(0)
+
+        def act(observation):
+            acted[-1] += 1
+            return env.action_space.low
+
+        return act
 
     rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=watched)
-    both = sum(row["steps"] for row in rows[:2])
-    assert len(acted) == 1 + both  # once before anything moves
+    assert acted[1:] == [row["steps"] for row in rows[:2]]  # the first was asked before anything moved
+    assert len(rows) > 2
 
 
 def test_a_run_that_was_demonstrated_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
@@ -77,6 +83,14 @@ def test_a_run_that_was_demonstrated_goes_on_as_if_it_had_never_stopped(bead_con
     train(stopped, replace(config, episodes=1), demonstrator=always_left)
     train(stopped, config, demonstrator=always_left, resume=True)
     assert_same_run(undisturbed, stopped)
+
+
+def test_who_looks_at_what_is_not_there_demonstrates_nothing(bead_config, tmp_path):
+    def later(env):
+        return lambda seen: env.action_space.low if seen[0] < 0.5 else env.action_space.low * seen[99]
+
+    with pytest.raises(InputError, match="sees or moves other things"):
+        train(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=later)
 
 
 def test_where_nobody_demonstrates_a_run_is_refused_before_it_begins(bead_config, tmp_path):
