@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -85,10 +86,10 @@ class InsertionTask(Task):
         station.set_pose(context, self.start(rng))
         return {f"{self.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 
+    @abstractmethod
     def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Moves fixture and workpiece by their offsets; `context` is the root context."""
-        raise NotImplementedError
 
+    @abstractmethod
     def start(self, rng: np.random.Generator) -> np.ndarray:
         """The pose at which an episode starts, (6,)."""
-        raise NotImplementedError
