@@ -22,7 +22,7 @@ from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
 from guiderail.tools.tables import read_table
-from guiderail.tools.tasks import check_environment, known_tasks
+from guiderail.tools.tasks import beyond_defaults, known_tasks
 
 LEARNED = "learned"
 BESIDE = ("zero", "white", "constant")  # null policies that an evaluation for a report has beside the learned one
@@ -241,12 +241,8 @@ def command(config: RunConfig, out: str) -> str:
     words = ["guiderail", "train", config.task]
     environment = dict(config.environment)
     if config.task in known_tasks():
-        first: dict[str, Any] = {
-            key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment
-        }
-        usual = check_environment(config.task, first)
-        given = {key: value for key, value in environment.items() if usual.get(key, config) != value}
-        environment = {key: environment[key] for key in ("guidance",) if key in environment} | given
+        guidance = {key: environment[key] for key in ("guidance",) if key in environment}
+        environment = guidance | beyond_defaults(config.task, environment)
     if "guidance" in environment:
         words += ["--guidance", str(environment.pop("guidance"))]
     words += ["--algorithm", config.learner.algorithm, "--preset", config.preset]

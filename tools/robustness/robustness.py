@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from guiderail.tools.robustness.picture import draw
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, judged_once
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.rollouts.suited import as_learned
 from guiderail.tools.tables import write_table
+from guiderail.tools.tasks import changed_environment
 
 EPISODES = 30  # of each who at each place
 POLICY, DEMONSTRATION = "policy", "demonstration"
@@ -63,11 +66,11 @@ def robustness(
         raise InputError(f"robustness needs at least one episode at each place, not {episodes}")
     folder = RunFolder(run)
     config, policy = folder.config(), Policy.load(folder.path)
-    where = config.environment | dict(environment or {})
+    where = changed_environment(config.task, config.environment, environment or {})
     places, left_out = points(config.task, where, chosen_axes(axes))
     for sentence in left_out:
         tell(sentence)
-    who: dict[str, Acts] = {POLICY: lambda env: policy}
+    who: dict[str, Acts] = {POLICY: partial(as_learned, policy)}
     if is_demonstrated(where.get("guidance")):
         who[DEMONSTRATION] = still
     who |= {name: acts for name, acts in (beside or {}).items() if name != "zero" or DEMONSTRATION not in who}
