@@ -17,7 +17,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.guidance import colour, is_demonstrated, label
 from guiderail.tools.learning.presets import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, cached, evaluate_run
+from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, cached, evaluate_run, kept_file
 from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
@@ -188,6 +188,12 @@ def _judged(run: Run, episodes: int) -> pd.DataFrame:
         table, policy = read_table(file), file.stem.split("-")[0]
         if "success" not in table or (
             policy == LEARNED and not file.stem.startswith(f"{LEARNED}-{len(run.episodes)}-")
+        ):
+            continue
+        # An evaluation may have been asked for another environment or other episodes.
+        how: dict[str, Any] = {"episodes": len(table), "seed": HELD_OUT_SEED}
+        if file.parent.name == "beside" and file != kept_file(
+            file.parent, policy, run.config, run.config.environment, **how
         ):
             continue
         count = {"episodes": len(table), "successes": int(table["success"].sum())}

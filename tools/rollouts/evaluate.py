@@ -177,16 +177,23 @@ def judged_once(
     Returns:
         None if what they see or move is not this environment's.
     """
-    deciding = {key: value for key, value in how.items() if key != "words"}
-    about = [] if about is None else [about]
-    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
-    digest = hashlib.blake2b(told.encode(), digest_size=6).hexdigest()
+    file = kept_file(kept, name, config, environment, about=about, **how)
     how.setdefault("words", name)
     judged = partial(evaluate_run, config, partial(_suited, acts), environment, **how)
     try:
-        return cached(kept / f"{name}-{digest}.csv", judged)
+        return cached(file, judged)
     except _NotSuitedError:
         return None
+
+
+def kept_file(
+    kept: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
+) -> Path:
+    """The file that `judged_once` keeps its rows in; the arguments are its own. Whatever decides them is in its name."""
+    deciding = {key: value for key, value in how.items() if key != "words"}
+    about = [] if about is None else [about]
+    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
+    return kept / f"{name}-{hashlib.blake2b(told.encode(), digest_size=6).hexdigest()}.csv"
 
 
 class _NotSuitedError(Exception):
