@@ -112,7 +112,8 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     lines = [f"## {name}", "", f"`guiderail study {name} --out studies`, and the table `{name}.csv`.", ""]
     lines += [f"- Figure {number}: {THESIS[number]}." for number in FIGURES.get(name, ())]
     lines += ["", f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
-    for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
+    # A study that judges nothing has an empty column, whose cells are read as NaN.
+    for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
         told = [method, mark or "–", judged or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
     for words, methods in _differences(study).items():
@@ -123,7 +124,7 @@ def _study(name: str, rows: pd.DataFrame) -> str:
 def _numbers(group: pd.DataFrame) -> list[str]:
     """Of the seeds of a method, side by side."""
     rates, trained = group.get("success_rate", []), "training_episodes" in group
-    held_out = ", ".join("–" if pd.isna(rate) else f"{rate:.0%}" for rate in rates)
+    held_out = ", ".join("–" if pd.isna(rate) else f"{rate:.0%}" for rate in rates) or "–"
     if not trained or group["training_episodes"].isna().all():
         return [held_out, "–", "–", "–", "–"]
     converged = ", ".join("never" if pd.isna(n) else f"{n:g}" for n in group["training_converged_after"])
