@@ -67,6 +67,23 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
     return name, (str(Path(typed).resolve()),)
 
 
+def task_content(task: str) -> str:
+    """A digest of the files that a task is made of, as they are now; empty where it is made by code.
+
+    Args:
+        task: its name.
+
+    Raises:
+        InputError: if it is of a folder that is none any more.
+    """
+    folder = getattr(TASKS.get(task), "folder", None) if task in TASKS.names() else None
+    if folder is None:
+        return ""
+    from guiderail.diagrams.tasks.part_file import task_folder_digest  # Drake takes a second
+
+    return task_folder_digest(folder)
+
+
 def _import_file(path: Path) -> str:
     path = path.resolve()
     name = f"guiderail_imported_{path.stem}"

@@ -23,7 +23,7 @@ from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.rollouts.suited import as_learned, suits
 from guiderail.tools.tables import read_table, table_text
-from guiderail.tools.tasks import changed_environment, make_environment
+from guiderail.tools.tasks import changed_environment, make_environment, task_content
 from guiderail.tools.thesis import differences
 
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
@@ -191,7 +191,7 @@ def kept_file(
 ) -> Path:
     """The file that `judged_once` keeps its rows in; the arguments are its own. Whatever decides them is in its name."""
     deciding = {key: value for key, value in how.items() if key != "words"}
-    about = [] if about is None else [about]
+    about = [*([] if about is None else [about]), *filter(None, [task_content(config.task)])]
     told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
     return kept / f"{name}-{hashlib.blake2b(told.encode(), digest_size=6).hexdigest()}.csv"
 

@@ -37,7 +37,7 @@ from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
 from guiderail.tools.studies.sweep import draw_sweeps
 from guiderail.tools.tables import write_table
-from guiderail.tools.tasks import changed_environment, import_modules, make_environment
+from guiderail.tools.tasks import changed_environment, import_modules, make_environment, task_content
 
 BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
@@ -322,7 +322,7 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
     where = job.config(1).environment
     if judged is not None and "difficulty" in judged.env:
         where = changed_environment(job.study.task, where, judged.env)
-    environment = json.dumps(where, sort_keys=True, default=str)
+    environment = json.dumps(where, sort_keys=True, default=str) + task_content(job.study.task)
     return hashlib.blake2b((said + method + environment).encode(), digest_size=4).hexdigest()
 
 
