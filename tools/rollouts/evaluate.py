@@ -189,7 +189,7 @@ def judged_once(
 def kept_file(
     kept: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
 ) -> Path:
-    """The file that `judged_once` keeps its rows in; the arguments are its own. Whatever decides them is in its name."""
+    """The file that `judged_once` keeps its rows in, named by all that decides them; the arguments are its own."""
     deciding = {key: value for key, value in how.items() if key != "words"}
     about = [*([] if about is None else [about]), *filter(None, [task_content(config.task)])]
     told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)

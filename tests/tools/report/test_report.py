@@ -54,7 +54,8 @@ def test_a_study_is_one_page_that_needs_nothing_else(studied, tmp_path):
     text = text_of(page)
     assert "sKGRL" in text
     assert "16/20 80.0%" in text, "successes of all seeds together"
-    assert "9/10, 7/10" in text, "and of each"
+    assert "9/10 (59.6% to 98.2%), 7/10 (39.7% to 89.2%)" in text, "and of each"
+    assert "58.4%" not in text, "of all together there is no interval: their episodes are not independent"
     assert "nothing: zero" in text
     assert "Differs from the thesis in it has no task Bead" in text
     assert "guiderail study beads --out studies" in text
