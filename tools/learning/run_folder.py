@@ -173,6 +173,11 @@ class RunFolder:
         import_modules(config.imports)
         return config
 
+    def remove_policy(self) -> None:
+        """Removes the policy, if there is one: what learns on has another by the end."""
+        for name in ("policy.json", "policy.safetensors"):
+            (self.path / name).unlink(missing_ok=True)
+
     def write_episodes(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replaces `episodes.csv`. Numbers are written so that reading them gives the same number."""
         write_atomically(self.path / "episodes.csv", table_text(rows).encode())
