@@ -12,6 +12,7 @@ import pandas as pd
 
 from guiderail.models.errors import InputError
 from guiderail.tools.figures import FIGURES as MADE
+from guiderail.tools.figures import command_of
 from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.files import write_atomically
 from guiderail.tools.rollouts.metrics import TOLERANCE
@@ -93,9 +94,7 @@ def _figures(made: Mapping[str, Mapping[str, Any]], studies: Sequence[str]) -> s
         claims = [f"{_words(key)}: {cell(value)}" for key, value in found.items() if key not in NO_CLAIM]
         told: list[Any] = [number, words, "; ".join([*claims, *(["study " + ", ".join(beside)] if beside else [])])]
         told += [found.get("seeds"), f"{found['seconds'] / 60:.1f} min" if found else None, found.get("condition")]
-        command = found.get(
-            "command", f"guiderail reproduce {number!r}" if " " in number else f"guiderail reproduce {number}"
-        )
+        command = found.get("command", command_of(number))
         lines.append(f"| {' | '.join(cell(one or None).replace('|', '/') for one in told)} | `{command}` |")
     return "\n".join([*lines, ""])
 
