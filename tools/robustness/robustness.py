@@ -98,7 +98,7 @@ def _row(place: Point, name: str, judged: pd.DataFrame) -> dict[str, Any]:
     return {
         "axis": place.axis.name,
         "value": float(place.value),
-        "trained": float(place.axis.trained),
+        "trained": None if place.trained is None else float(place.trained),
         "words": place.axis.words,
         "who": name,
         "episodes": len(judged),

@@ -76,6 +76,16 @@ def test_every_axis_can_be_made_or_says_why_not(task):
     assert all(": " in sentence for sentence in left_out)
 
 
+def test_a_policy_that_learned_with_a_whole_range_is_judged_at_each_value_of_it():
+    arguments = check_environment("BncConnector", {"friction_factor": (0.5, 2.0), "stiffness_factor": 1.7})
+    found, _ = points("BncConnector", arguments, chosen_axes("friction,stiffness,lost"))
+    at = {(point.axis.name, point.value): point for point in found}
+    assert at["friction", 1.0].environment["friction_factor"] == (1.0, 1.0)
+    assert at["stiffness", 1.0].environment["stiffness_factor"] == 1.0
+    assert at["lost", 0.0].environment == arguments
+    assert {point.axis.name: point.trained for point in found} == {"friction": None, "stiffness": None, "lost": 0.0}
+
+
 def test_offsets_go_up_to_twice_the_trained_ones():
     (offsets,) = chosen_axes("offsets")
     found, _ = points("BncConnector", {"uncertainty": "disc"}, [offsets])
