@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -88,8 +89,15 @@ def robustness(
                 rows.append(_row(place, name, judged))
     if not rows:
         raise InputError("none of these axes can be changed here: choose others with --axes")
-    table = write_table(out / "robustness", rows).with_suffix(".csv")
-    return {"table": table, "picture": draw(out / "robustness.png", rows), "rows": rows}
+    table = write_table(out / f"{_called(axes, environment or {})}.csv", rows).with_suffix(".csv")
+    return {"table": table, "picture": draw(table.with_suffix(".png"), rows), "rows": rows}
+
+
+def _called(axes: str | None, environment: Mapping[str, Any]) -> str:
+    """The name of a table, by what was asked for: another question does not replace its answer."""
+    asked = [] if axes is None else [axis.name for axis in chosen_axes(axes)]
+    asked += [f"{key}={value}" for key, value in sorted(environment.items())]
+    return re.sub(r"[^\w.=-]+", "_", "-".join(["robustness", *asked]))
 
 
 def _row(place: Point, name: str, judged: pd.DataFrame) -> dict[str, Any]:

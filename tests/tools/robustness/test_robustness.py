@@ -38,6 +38,14 @@ def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):
     assert robustness(run, **{**how, "episodes": 2})["rows"] != first["rows"]
 
 
+def test_another_question_leaves_the_answer_to_the_first(run):
+    asked = [{}, {"axes": "wall"}, {"environment": {"hold": 2}}]
+    tables = [robustness(run, episodes=1, **one)["table"] for one in asked]
+    assert [table.name for table in tables] == ["robustness.csv", "robustness-wall.csv", "robustness-hold=2.csv"]
+    for table in tables:
+        assert all(table.with_suffix(kind).is_file() for kind in (".csv", ".md", ".png"))
+
+
 def test_a_place_where_the_policy_fails_is_named(run):
     found = robustness(run, episodes=2)
     assert -0.5 in breaks(found["rows"], "policy")["wall"]
