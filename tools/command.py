@@ -189,8 +189,8 @@ def train(
     if _is_robot(environment.get("station")):
         there = {name: environment[name] for name in ("lcm_url", "robot") if name in environment}
         there |= {"rehearse": rehearse, "lockstep": lockstep} | ({} if rate is None else {"rate": rate})
-        given = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
-        given |= {"imports": modules}
+        given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
+        given |= {"ledger": ledger, "imports": modules}
         if task is None or out is None or resume:
             raise InputError("on a robot a run begins anew: name a task and a folder, without --resume")
         from guiderail.tools.operate.rehearsal import Other
