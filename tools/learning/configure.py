@@ -48,17 +48,9 @@ def configure(
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)
     return RunConfig(
-        task,
-        as_arguments(resolved),
-        learner,
-        preset,
-        episodes,
-        seed,
-        installed_versions(),
-        tuple(imports),
-        ledger,
+        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger,
         task_content(task),
-    )
+    )  # fmt: skip
 
 
 def run(

@@ -149,8 +149,8 @@ def _is_trained(axis: Axis, resolved: Environment) -> bool:
         neutral = axis.changed(resolved, axis.trained)
     except InputError:
         return True
-    known = {option: resolved.get(option) for option in neutral}
-    return all(known[option] is None or np.allclose(known[option], value) for option, value in neutral.items())
+    known = {option: resolved[option] for option in neutral if resolved.get(option) is not None}
+    return all(np.allclose(value, neutral[option]) for option, value in known.items())
 
 
 def _checked(task: str, resolved: Environment, changed: dict[str, Any]) -> dict[str, Any]:

@@ -166,16 +166,9 @@ def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """
     table = pd.DataFrame(rows)
     own = [
-        "case",
-        "actions",
-        "seed",
-        "environment",
-        "constrained",
-        "waits",
-        *COLUMNS,
-        "not_finite",
+        "case", "actions", "seed", "environment", "constrained", "waits", *COLUMNS, "not_finite",
         "recomputed_violation",
-    ]
+    ]  # fmt: skip
     witnessed = table.columns.drop(own, errors="ignore")
     said, recomputed = (table[name].to_numpy(float) for name in ("worst_violation", "recomputed_violation"))
     constrained, bounded = table["constrained"].to_numpy() == 1, recomputed > -np.inf
