@@ -85,6 +85,12 @@ class PartInsertion(InsertionTask):
         """The folder's bounds."""
         return self.file.bounds.constraints(self.reference().num_steps)
 
+    @classmethod
+    def knows(cls) -> tuple[str, ...]:
+        """As of every task; but what is to be kept out of can't change on the way."""
+        changes = cls.file.bounds.phases is not None
+        return tuple(one for one in super().knows() if not (one == "keep_out" and changes))
+
     def keep_out(self) -> KeepOut:
         """No walls are known: what safe residual learning is projected to are the bounds alone."""
         return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)

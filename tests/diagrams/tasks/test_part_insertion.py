@@ -1,0 +1,58 @@
+"""A task folder written by hand: a plug above a plate, and what is asked of the numbers in its file."""
+
+import numpy as np
+import pytest
+import yaml
+
+from guiderail.diagrams.make import make_env, resolve
+from guiderail.models.errors import InputError
+from guiderail.models.objects.triangle_mesh import lathe
+from guiderail.models.primitives import Demonstrations
+
+PART = {"visual": "{}.obj", "mass": 0.1, "centre": [0.0, 0.0, 0.0], "gyration": 0.01, "pieces": [{"file": "{}.obj"}]}
+BY_PHASE = {
+    "lower": [[-0.002, -0.002, None, None, None, None], [-0.001, -0.001, None, None, None, None]],
+    "upper": [[0.002, 0.002, None, None, None, None], [0.001, 0.001, None, None, None, None]],
+    "phases": [0.0, 0.5],
+}
+
+
+def part(name, **changes):
+    filled = PART | {"visual": f"{name}.obj", "pieces": [{"file": f"{name}.obj", "modulus": 1e9}]}
+    return filled | changes
+
+
+def write(folder, **changes):
+    """A folder with a task; `changes` are of what its file says."""
+    folder.mkdir(exist_ok=True)
+    for name, low, high, radius in (("plug", 0.0, 0.02, 0.005), ("socket", -0.02, -0.005, 0.015)):
+        profile = [(0.0, high), (radius, high), (radius, low), (0.0, low)]
+        (folder / f"{name}.obj").write_text(lathe(profile, 6).to_obj())
+    t = np.linspace(0.0, 1.0, 51)
+    down = [np.column_stack([a * t, -a * t, 20.0 * (1.0 - t), *3 * [0.01 * a * t]]) * 1e-3 for a in (-0.2, 0, 0.2)]
+    Demonstrations(t, down).save(folder / "demonstrations.npz")
+    said = {
+        "format": "guiderail task 1",
+        "name": f"parts/{folder.name}",
+        "plug": part("plug"),
+        "socket": part("socket", pieces=[{"file": "socket.obj"}]),
+        "motion": {"travel": 0.02, "rim": 0.01},
+        "demonstrations": {"components": 3},
+    }
+    (folder / "task.yaml").write_text(yaml.safe_dump(said | changes))
+    return folder
+
+
+def test_bounds_that_change_on_the_way_hold_at_every_step(tmp_path):
+    folder = write(tmp_path / "by_phase", bounds=BY_PHASE)
+    env = make_env(str(folder), hold=10)
+    env.reset(seed=0)
+    done = False
+    while not done:
+        *_, terminated, truncated, _ = env.step(np.ones(2))
+        done = terminated or truncated
+    assert np.abs(env.trace.commanded[26:, :2]).max() <= 0.001 + 1e-9
+    assert np.abs(env.trace.commanded[:25, :2]).max() > 0.0
+    env.close()
+    with pytest.raises(InputError, match="needs walls to keep out of"):
+        resolve(str(folder), {"guidance": "safe_residual"})
