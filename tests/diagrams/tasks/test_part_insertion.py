@@ -5,6 +5,8 @@ import pytest
 import yaml
 
 from guiderail.diagrams.make import make_env, resolve
+from guiderail.diagrams.options import validated
+from guiderail.diagrams.tasks.part_file import Bounds
 from guiderail.models.errors import InputError
 from guiderail.models.objects.triangle_mesh import lathe
 from guiderail.models.primitives import Demonstrations
@@ -56,3 +58,36 @@ def test_bounds_that_change_on_the_way_hold_at_every_step(tmp_path):
     env.close()
     with pytest.raises(InputError, match="needs walls to keep out of"):
         resolve(str(folder), {"guidance": "safe_residual"})
+
+
+def with_row(changed):
+    return BY_PHASE | {"lower": [BY_PHASE["lower"][0], changed]}
+
+
+@pytest.mark.parametrize(
+    ("bounds", "says"),
+    [
+        (BY_PHASE | {"phases": [0.5, 0.0]}, "begin at 0"),
+        (BY_PHASE | {"phases": [0.0, 0.0]}, "increase"),
+        (BY_PHASE | {"phases": [0.0, 1.0]}, "below 1"),
+        (BY_PHASE | {"phases": None}, "need phases"),
+        (BY_PHASE | {"phases": [0.0]}, "a list of lower and of upper ones for each"),
+        (with_row([None, -0.001, *[None] * 4]), "in every phase or in none"),
+        (with_row([float("nan"), -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row([float("inf"), -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row([10**400, -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row([True, -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row(3), "six finite numbers"),
+        (BY_PHASE | {"lower": 3}, "tuple"),
+    ],
+)
+def test_bounds_that_mean_nothing_are_refused(bounds, says):
+    with pytest.raises(InputError, match=says):
+        validated(Bounds, bounds, "here")
+
+
+def test_a_bound_is_that_of_its_phase():
+    bounds = Bounds.model_validate(BY_PHASE)
+    constraints = bounds.constraints(11)
+    corner = np.array([0.0015, 0.0, 9.0, 9.0, 9.0, 9.0])
+    assert [constraints.violation(corner, step) <= 0.0 for step in (0, 4, 5, 10)] == [True, True, False, False]

@@ -70,7 +70,7 @@ def test_bounds_from_demonstrations_become_its_own(folder, capsys):
         call("constraints", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--into", folder)
         constraints = resolve(str(folder), {}).task.constraints()
         assert constraints.G.shape[0] > 1
-        np.testing.assert_array_equal(constraints.G[0, :2, :2], np.eye(2))
+        np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
         env = make_env(str(folder))
         env.reset(seed=0)
         env.step(env.action_space.sample())
