@@ -140,6 +140,8 @@ class RealTime:
             self._taken, now = self._statuses.count, time.monotonic()
             self.gaps.add(now - self._last)
             self._last = now
+            # What happens at an instant belongs to the clock of that instant, and Drake has left it for the next step.
+            simulator.AdvancePendingEvents()
             station.tell_time(context, now * self._rate)
             simulator.AdvanceTo(start + (step + 1) * self._period)
 
