@@ -349,7 +349,7 @@ class HardwareStation(Station):
     def has_deputy(self, context: Context) -> bool:
         """Whether somebody stands by at the robot; `context` is this station's own."""
         words = self.GetSubsystemByName("deputy_subscriber")
-        return words.get_output_port().Eval(words.GetMyContextFromRoot(context)) is not None
+        return words.get_output_port().Eval(self.GetSubsystemContext(words, context)) is not None
 
     def take_over(self, context: Context, before: Context) -> None:
         """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.
