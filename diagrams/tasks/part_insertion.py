@@ -23,7 +23,7 @@ from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
-from guiderail.diagrams.tasks.part_file import FILE_NAME, PartTaskFile, read_task_file
+from guiderail.diagrams.tasks.part_file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.task import Choice, Threshold
 from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut
@@ -217,13 +217,12 @@ def load_task_folder(folder: Path) -> type[PartInsertion]:
         InputError: if it is no task folder, or something in it makes no sense.
     """
     folder = folder.resolve()
-    text = (folder / FILE_NAME).read_text(encoding="utf-8") if (folder / FILE_NAME).is_file() else ""
-    return _task_class(folder, text)
+    return _task_class(folder, task_folder_digest(folder))
 
 
 @cache
-def _task_class(folder: Path, text: str) -> type[PartInsertion]:
-    """One class for each folder and what its file says, so that environments of it can share diagrams."""
+def _task_class(folder: Path, content: str) -> type[PartInsertion]:
+    """One class for each folder and what is in it, so that environments of it can share diagrams."""
     file = read_task_file(folder)
     defaults = {
         "guidance": "skgrl",

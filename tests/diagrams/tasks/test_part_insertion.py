@@ -7,6 +7,7 @@ import yaml
 from guiderail.diagrams.make import make_env, resolve
 from guiderail.diagrams.options import validated
 from guiderail.diagrams.tasks.part_file import Bounds
+from guiderail.diagrams.tasks.part_insertion import load_task_folder
 from guiderail.models.errors import InputError
 from guiderail.models.objects.triangle_mesh import lathe
 from guiderail.models.primitives import Demonstrations
@@ -91,3 +92,18 @@ def test_a_bound_is_that_of_its_phase():
     constraints = bounds.constraints(11)
     corner = np.array([0.0015, 0.0, 9.0, 9.0, 9.0, 9.0])
     assert [constraints.violation(corner, step) <= 0.0 for step in (0, 4, 5, 10)] == [True, True, False, False]
+
+
+def test_a_folder_is_the_same_task_until_a_file_of_it_changes(tmp_path):
+    folder = write(tmp_path / "changed")
+    tasks = [load_task_folder(folder)]
+    for name in ("task.yaml", "demonstrations.npz", "plug.obj", "socket.obj"):
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(content)
+        assert load_task_folder(folder) is tasks[-1]
+        if name == "demonstrations.npz":
+            Demonstrations(np.linspace(0.0, 1.0, 51), 2 * [np.zeros((51, 6))]).save(folder / name)
+        else:
+            (folder / name).write_bytes(content.replace(b"0.02", b"0.03"))
+        tasks.append(load_task_folder(folder))
+    assert len(set(tasks)) == 5
