@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -31,6 +31,7 @@ from guiderail.models.parts.model_files import part_sdf
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.models.units import DEGREE, MM
+from guiderail.models.writing import write_atomically
 from guiderail.systems.contact_lever import ContactLever
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
@@ -74,6 +75,10 @@ class PartInsertion(InsertionTask):
 
     def world(self) -> PartWorkcell:
         """The socket in the world, the plug in the tool."""
+        return self._workcell
+
+    @cached_property
+    def _workcell(self) -> PartWorkcell:
         return workcell(self.folder, self.file)
 
     def reference(self) -> ReferenceTrajectory:
@@ -170,7 +175,11 @@ class PartInsertion(InsertionTask):
 
 
 def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
-    """What a task folder is about, its SDF files written beside its meshes."""
+    """What a task folder is about, its SDF files written beside its meshes.
+
+    Raises:
+        InputError: if they can't be written.
+    """
     for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
         text = part_sdf(
             name,
@@ -183,7 +192,7 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         )
         path = folder / f"{name}.sdf"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
+            write_atomically(path, text.encode())  # other processes read it too
     return PartWorkcell(
         str(folder / f"{PLUG}.sdf"),
         str(folder / f"{SOCKET}.sdf"),

@@ -107,3 +107,14 @@ def test_a_folder_is_the_same_task_until_a_file_of_it_changes(tmp_path):
             (folder / name).write_bytes(content.replace(b"0.02", b"0.03"))
         tasks.append(load_task_folder(folder))
     assert len(set(tasks)) == 5
+
+
+def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp_path):
+    folder = write(tmp_path / "written")
+    task = resolve(str(folder), {}).task
+    assert task.world() is task.world()
+    assert sorted(path.name for path in folder.glob("*.sdf*")) == ["plug.sdf", "socket.sdf"]
+    (folder / "plug.sdf").unlink()
+    (folder / "plug.sdf").mkdir()
+    with pytest.raises(InputError, match="plug.sdf cannot be written"):
+        resolve(str(folder), {}).task.world()
