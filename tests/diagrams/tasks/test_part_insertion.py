@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import yaml
+from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.make import make_env, resolve
 from guiderail.diagrams.options import validated
@@ -118,3 +119,11 @@ def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp
     (folder / "plug.sdf").mkdir()
     with pytest.raises(InputError, match="plug.sdf cannot be written"):
         resolve(str(folder), {}).task.world()
+
+
+def test_a_parts_mass_is_where_its_file_says(tmp_path):
+    centre = [0.001, -0.002, 0.003]
+    folder = write(tmp_path / "centred", plug=part("plug", centre=centre))
+    plant = MultibodyPlant(0.0)
+    plug = resolve(str(folder), {}).task.world().add_workpiece(plant, plant.world_frame())
+    np.testing.assert_allclose(plug.default_com(), centre)
