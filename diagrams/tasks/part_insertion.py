@@ -145,11 +145,11 @@ class PartInsertion(InsertionTask):
         world.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
-        """Where the demonstrations start, or somewhere beside it."""
+        """Where the demonstrations start, or somewhere beside it, inside the bounds."""
         start = self.reference().means[0].copy()
         if self.options.start_beside > 0.0:
             start[:2] += in_ring(rng, 0.0, self.options.start_beside)
-        return start
+        return self.constraints().nearest(start)
 
     def camera(self) -> Camera:
         """Looks slightly down at the socket."""

@@ -127,3 +127,12 @@ def test_a_parts_mass_is_where_its_file_says(tmp_path):
     plant = MultibodyPlant(0.0)
     plug = resolve(str(folder), {}).task.world().add_workpiece(plant, plant.world_frame())
     np.testing.assert_allclose(plug.default_com(), centre)
+
+
+def test_it_starts_inside_its_bounds(tmp_path):
+    bounds = {"lower": [*[None] * 3, *[-0.01] * 3], "upper": [0.0001, None, 0.015, *[0.01] * 3]}
+    task = resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_beside": 0.002}).task
+    for seed in range(5):
+        start = task.start(np.random.default_rng(seed))
+        assert task.constraints().violation(start) <= 1e-9
+        assert start[2] == pytest.approx(0.015)
