@@ -159,10 +159,11 @@ class BncConnector(InsertionTask):
         """The demonstrations, and the square that commands stay in."""
         to_world = in_frame(self._workcell.X_WT)
         near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
+        bound = self.options.bound
         return Scene(
             to_world=to_world,
             demonstrations=tuple(DEMONSTRATIONS[self.options.demonstrations].load().outputs),
-            constraint=tuple(to_world(edge) for edge in box_edges(self.options.bound, 0.0, 0.015)),
+            constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
             line_radius=0.0001,

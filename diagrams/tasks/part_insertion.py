@@ -158,16 +158,16 @@ class PartInsertion(InsertionTask):
         return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=6 * size, height=3 * size))
 
     def scene(self) -> Scene:
-        """The demonstrations, and the box that commands stay in."""
+        """The demonstrations, and the box that commands stay in, in each phase."""
         to_world, size = in_frame(self.world().X_WT), self.file.motion.travel
         near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
-        _, upper = self.file.bounds.arrays()
-        bound = float(np.atleast_2d(upper)[:, :2].min())
-        edges = box_edges(bound, 0.0, size) if np.isfinite(bound) else []
+        lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())
+        lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
+        boxes = [corners for corners in zip(lower, upper, strict=True) if np.isfinite(corners).all()]
         return Scene(
             to_world=to_world,
             demonstrations=tuple(Demonstrations.load(self.folder / self.file.demonstrations.file).outputs),
-            constraint=tuple(to_world(edge) for edge in edges),
+            constraint=tuple(to_world(edge) for corners in boxes for edge in box_edges(*corners)),
             viewpoint=near,
             arm_views={"the parts": near, "the arm": ARM_VIEW},
             line_radius=0.0001,

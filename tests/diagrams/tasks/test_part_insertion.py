@@ -136,3 +136,16 @@ def test_it_starts_inside_its_bounds(tmp_path):
         start = task.start(np.random.default_rng(seed))
         assert task.constraints().violation(start) <= 1e-9
         assert start[2] == pytest.approx(0.015)
+
+
+def test_what_is_drawn_is_the_box_of_each_phase(tmp_path):
+    lower, upper = [[-0.001, -0.003], [0.0, -0.003]], [[0.002, 0.001], [0.0005, 0.001]]
+    free = [None] * 4
+    bounds = {"lower": [[*row, *free] for row in lower], "upper": [[*row, *free] for row in upper]}
+    task = resolve(str(write(tmp_path / "drawn", bounds=bounds | {"phases": [0.0, 0.5]})), {}).task
+    edges = np.array(task.scene().constraint) - task.file.place
+    for number, box in enumerate(np.split(edges, 2)):
+        np.testing.assert_allclose(box.min(axis=(0, 1)), [*lower[number], 0.0], atol=1e-12)
+        np.testing.assert_allclose(box.max(axis=(0, 1)), [*upper[number], 0.02], atol=1e-12)
+    task = resolve(str(write(tmp_path / "open", bounds={"lower": [0.0, *5 * [None]], "upper": 6 * [0.1]})), {}).task
+    assert task.scene().constraint == ()
