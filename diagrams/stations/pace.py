@@ -114,10 +114,10 @@ class RealTime:
             lcm: the bus.
             channel: of the statuses.
             period: in which they come [s].
-            rate: of the robot's clock to the wall's, positive: less than 1 where a simulated robot is slow.
+            rate: of the robot's clock to the wall's, positive, up to 1: less where a simulated robot is slow.
 
         Raises:
-            InputError: if the rate is not positive.
+            InputError: if the rate is not positive, or above 1.
         """
         if not 0.0 < rate <= 1.0:
             raise InputError(f"a robot's clock goes as the wall's or slower, at a rate up to 1, not {rate}")

@@ -114,6 +114,7 @@ def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp
     folder = write(tmp_path / "written")
     task = resolve(str(folder), {}).task
     assert task.world() is task.world()
+    assert "from task.yaml; change the dimensions there" in (folder / "plug.sdf").read_text()
     assert sorted(path.name for path in folder.glob("*.sdf*")) == ["plug.sdf", "socket.sdf"]
     (folder / "plug.sdf").unlink()
     (folder / "plug.sdf").mkdir()
