@@ -201,6 +201,16 @@ def test_a_robot_that_was_started_anew_is_not_driven_by_the_speed_that_it_had(pl
     assert guarded.phase == (Phase.DAMPING if has_torque else Phase.OFF)
 
 
+@pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (0.2, False)])
+def test_a_speed_of_long_ago_is_not_damped(plant, age, has_torque):
+    """Whoever was held up himself: somebody else may have stopped the arm meanwhile."""
+    guarded = Guarded(plant)
+    guarded.set(status_age=[age], status_fault=[Fault.STALE])
+    for _ in range(3):
+        assert guarded["safe_torque"].any() == has_torque
+        guarded.go(PERIOD)
+
+
 def test_what_is_wanted_of_an_arm_that_is_not_seen_fades(plant):
     guarded = Guarded(plant)
     sent = []
