@@ -226,7 +226,9 @@ def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, p
     def is_answered() -> bool:
         if not words.count:
             return commands.count > commanded
-        said = struct.unpack(HEAD_FORMAT, words.last)[1] if len(words.last) == HEAD else -1
+        if len(words.last) != HEAD:
+            return False
+        said = struct.unpack(HEAD_FORMAT, words.last)[1]
         return abs(said * MICROSECOND - steps * driver.period) < 0.5 * driver.period
 
     while steps * driver.period < seconds:

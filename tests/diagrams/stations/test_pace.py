@@ -146,6 +146,14 @@ def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
     assert [heard.count(head) for head in dict.fromkeys(heard)][:4] == [3] * 4
 
 
+def test_a_word_that_is_none_answers_nothing():
+    lcm = DrakeLcm("memq://")
+    simulator = Simulator(SimulatedIiwa(BncWorkcell(), lcm))
+    lcm.Subscribe(IIWA_DRIVER.status_channel, lambda message: lcm.Publish(IIWA_DRIVER.status_channel + TAKEN, b"yes"))
+    simulator.Initialize()
+    assert serve(simulator, lcm, IIWA_DRIVER, 2 * STATUS_PERIOD, 0.01) == 0.0
+
+
 @pytest.mark.parametrize(("periods", "says"), [(MISSED - 1, False), (MISSED + 1, True)])
 def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch, periods, says):
     said, wall = [], [0.0]
