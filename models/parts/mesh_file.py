@@ -77,7 +77,8 @@ def load_part(path: Path, unit: str) -> Part:
         unit: one of `UNITS`, of the file's numbers.
 
     Raises:
-        InputError: if the file can't be read, or is not watertight, hollow, inside out or of a size that no arm inserts.
+        InputError: if the file can't be read, or is not watertight, is hollow, inside out or of a size that no arm
+            inserts.
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
@@ -136,8 +137,8 @@ def _check_body(path: Path, body: Any, bodies: Sequence[Any]) -> None:
         )
     if body.volume <= 0.0 and any(_encloses(other, body) for other in bodies):
         raise InputError(
-            f"{path.name} has a closed cavity, around {body.bounds.mean(axis=0).round(3).tolist()}: fill it where it was "
-            "drawn, as nothing touches there, and export it again"
+            f"{path.name} has a closed cavity, around {body.bounds.mean(axis=0).round(3).tolist()}: fill it where it "
+            "was drawn, as nothing touches there, and export it again"
         )
     if body.volume <= 0.0:
         raise InputError(

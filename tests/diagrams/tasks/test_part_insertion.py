@@ -118,7 +118,7 @@ def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp
     assert sorted(path.name for path in folder.glob("*.sdf*")) == ["plug.sdf", "socket.sdf"]
     (folder / "plug.sdf").unlink()
     (folder / "plug.sdf").mkdir()
-    with pytest.raises(InputError, match="plug.sdf cannot be written"):
+    with pytest.raises(InputError, match=r"plug\.sdf cannot be written"):
         resolve(str(folder), {}).task.world()
 
 
