@@ -13,6 +13,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.options import Number, Numbers, Options, validated
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE, REPEATED
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.units import DEGREE, MM
@@ -135,10 +136,7 @@ class Shown(Options):
     file: str = Field("demonstrations.npz", description=".npz or .csv, poses in the target frame")
     components: int | None = Field(None, ge=1, description="of their mixture; by information criterion unless given")
     floor: Numbers = Field(
-        (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE),
-        min_length=6,
-        max_length=6,
-        description="standard deviation that a hand has anyway [m], [rad]",
+        REPEATED, min_length=6, max_length=6, description="standard deviation that a hand has anyway [m], [rad]"
     )
 
 
@@ -157,7 +155,7 @@ class PartTaskFile(Options):
     offset_range: Numbers | None = Field(
         None, min_length=2, max_length=2, description="distance of the socket from its place [m], the task's own"
     )
-    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
     demonstrations: Shown = Shown.model_validate({})
     explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")

@@ -26,6 +26,7 @@ from guiderail.diagrams.tasks.offsets import in_ring
 from guiderail.diagrams.tasks.part_file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.task import Choice, Threshold
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE, COMMAND_SCALE, LEAST_FORCE, LEVER_SCALE, RHO
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.parts.model_files import part_sdf
 from guiderail.models.pose_coordinates import POSE_SIZE
@@ -37,17 +38,14 @@ from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
 COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
-RHO = 1e-11  # ρ [m², rad²], as the connector's
-LEAST_FORCE = 0.5  # [N] with which the plug stands on something
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
-LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 
 
 class PartOptions(HiddenPlace):
     """Of a task of two meshes."""
 
     start_beside: Number = Field(0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]")
-    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
 
 
 class PartInsertion(InsertionTask):
