@@ -31,13 +31,13 @@ def lab(tmp_path_factory):
     variables = os.environ | {"OMP_NUM_THREADS": "1", "DRAKE_ALLOW_NETWORK": "meshcat:lcm"}
     variables.pop("PYTHONPATH", None)
     served = subprocess.Popen(
-        [str(environment / "bin" / "python"), str(Path(__file__).with_name("served.py"))],
+        [str(environment / "bin" / "python"), str(Path(__file__).parents[1] / "served.py")],
         cwd=folder, env=variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert served.stdout.readline() == "ready\n"
 
     def run(*arguments, code=0):
-        served.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder)}) + "\n")
+        served.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder), "environment": {}}) + "\n")
         served.stdin.flush()
         result = json.loads(served.stdout.readline())
         assert result["returncode"] == code, result["stdout"] + result["stderr"]
@@ -123,7 +123,7 @@ judged_on:
   - {name: held_out, episodes: 3}
 """
     )
-    guiderail(lab, "study", "study.yaml", "--out", "study", "--json")
+    guiderail(lab, "study", "study.yaml", "--processes", "1", "--out", "study", "--json")
     assert list((lab.folder / "study").glob("*.csv"))
 
 

@@ -174,13 +174,18 @@ def test_help_names_the_choices(capsys):
         assert all(word in out for word in words), command
 
 
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["train", "--help"], ["study", "--help"], ["list", "tasks"], ["--version"]]
-)
-def test_help_needs_neither_pytorch_nor_drake(arguments):
-    code = f"import sys; from guiderail.tools.command import main\ntry: main({arguments})\nexcept SystemExit: pass\n"
-    check = code + "assert not {'torch', 'pydrake', 'stable_baselines3', 'matplotlib'} & set(sys.modules)"
-    result = subprocess.run([sys.executable, "-c", check], capture_output=True, text=True)
+def test_help_needs_neither_pytorch_nor_drake():
+    code = """
+import sys
+from guiderail.tools.command import main
+for words in ("--version", "--help", "train --help", "study --help", "list tasks"):
+    try:
+        main(words.split())
+    except SystemExit:
+        pass
+    assert not {'torch', 'pydrake', 'stable_baselines3', 'matplotlib'} & set(sys.modules), words
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
 
 

@@ -1,8 +1,10 @@
 from guiderail.tools import demo
+from guiderail.tools.viewing import replay
 
 
 def test_the_demo_says_what_it_left_and_replaces_itself(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "HELD_OUT", 1)
+    monkeypatch.setattr(replay, "EPISODES", 1)
     out = tmp_path / "demo"
     demo.run_demo(out, episodes=2, seed=0)
     said = capsys.readouterr().out

@@ -11,6 +11,7 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ class Job:
         given |= {"imports": study.imports, "settings": settings, "seed": self.seed}
         return configure(study.task, environment, episodes=max(episodes, 1), **given)
 
-    @property
+    @cached_property
     def folder(self) -> RunFolder:
         """Where its run is, and what was evaluated of it."""
         config = self.config(self.marks[-1])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from guiderail.models.errors import InputError
@@ -57,6 +57,7 @@ def check(problem, found, expected, constraints):
     assert found.constrained == bool(found.multipliers.any())
 
 
+@settings(max_examples=settings().max_examples // 2)  # each takes a tenth of a second
 @given(SEEDS)
 def test_a_window_under_several_actions_is_equation_4_18(seed):
     problem = random_problem(seed, box=bool(seed % 2))
@@ -139,6 +140,7 @@ def test_where_demonstrations_say_nothing_the_motion_goes_through_the_actions():
     assert np.abs(moved).max() < 1e-3
 
 
+@settings(max_examples=settings().max_examples // 2)  # each takes a tenth of a second
 @given(SEEDS)
 def test_the_whole_motion_keeps_the_constraints_everywhere(seed):
     """Whatever is asked for, anywhere: bounds that differ from step to step, and actions beyond any reason."""
