@@ -47,7 +47,7 @@ class Shell:
     def __init__(self) -> None:
         context = multiprocessing.get_context("fork")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=self._serve, args=(theirs,), daemon=True)
+        self._process = context.Process(target=self._serve, args=(theirs, self._connection), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -61,7 +61,8 @@ class Shell:
             raise RuntimeError(wrong)
 
     @staticmethod
-    def _serve(connection) -> None:
+    def _serve(connection, others) -> None:
+        others.close()  # so that the end of the page is the end of this
         try:
             folder, text = connection.recv()
         except EOFError:  # the page ended before

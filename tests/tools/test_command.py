@@ -8,7 +8,6 @@ import guiderail
 from guiderail.models.objects import bnc_connector, grid_clamp
 from guiderail.tools.command import app, main
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import train
 from guiderail.tools.tasks import as_value
 
 
@@ -21,9 +20,8 @@ def call(capsys, *arguments):
 
 
 @pytest.fixture
-def trained(bead_config, tmp_path):
-    train(RunFolder(tmp_path / "run"), bead_config)
-    return tmp_path / "run"
+def trained(bead_run):
+    return bead_run
 
 
 @pytest.mark.parametrize(
