@@ -99,13 +99,13 @@ def test_a_wrong_option_gets_a_sentence(lab):
 
 def test_it_is_trained_resumed_and_evaluated(lab, trained):
     guiderail(lab, "train", "--resume", "--episodes", "8", "--out", "run")
-    found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "5", "--json"))
-    assert found["episodes"] == 5
+    found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
+    assert found["episodes"] == 2
     assert found["worst_violation"] <= 1e-9
 
 
 def test_it_is_replayed(lab, trained):
-    guiderail(lab, "replay", "run", "--html", "page.html")
+    guiderail(lab, "replay", "run", "--episodes", "1", "--html", "page.html")
     assert "peglab/Slot" in (lab.folder / "page.html").read_text()
 
 

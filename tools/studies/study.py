@@ -302,10 +302,11 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
         config = job.config(mark)
         shows = untrained(config.task, "rule") if config.learner.demonstration_episodes else None
         train(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=shows)
-    if len(folder.episodes()) == mark and not (copy / "policy.json").exists():
+    rows = folder.episodes()
+    if len(rows) == mark and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):
             write_atomically(copy / name, (folder.path / name).read_bytes())
-    return folder.episodes()
+    return rows
 
 
 def _policy_folder(job: Job, mark: int) -> Path:
