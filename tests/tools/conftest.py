@@ -10,6 +10,16 @@ import bead
 bead.register()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def plain_pictures():
+    """Labels get no room of their own: nobody looks, and it is half of what a picture takes."""
+    from guiderail.tools.viewing import style
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "LAYOUT", None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def bead_config():
     """A run of a second: tiny networks that learn from the second episode on."""
