@@ -177,12 +177,10 @@ def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
     assert gained == pytest.approx(ALIGNMENT_REWARD * nearer / MM, abs=0.5)
 
 
-def test_the_same_policy_drives_rails_and_arm():
-    """One rule object, both stations; the arm is slower to follow, and locks too."""
-    for station in ("rails", "arm"):
-        env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", station=station)
-        _, info, _, _ = play(env, reactive_rule, seed=4, options={"offset": (0.0009, -0.0008)})
-        assert info["is_success"], station
+def test_the_policy_of_the_rails_drives_the_arm_too():
+    """The arm is slower to follow, and locks too."""
+    env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", station="arm")
+    assert play(env, reactive_rule, seed=4, options={"offset": (0.0009, -0.0008)})[1]["is_success"]
 
 
 def test_a_push_moves_the_robot(kgrl):
