@@ -57,7 +57,6 @@ def check(problem, found, expected, constraints):
     assert found.constrained == bool(found.multipliers.any())
 
 
-@settings(max_examples=settings().max_examples // 2)  # each takes a tenth of a second
 @given(SEEDS)
 def test_a_window_under_several_actions_is_equation_4_18(seed):
     problem = random_problem(seed, box=bool(seed % 2))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from guiderail.models.errors import InputError
@@ -82,7 +82,6 @@ def test_a_window_that_contradicts_itself_gives_no_command(solver):
     assert np.abs(p.predict(20, np.zeros(2)).output).max() < 1e-9
 
 
-@settings(max_examples=settings().max_examples // 2)  # each takes a tenth of a second
 @given(SEEDS)
 def test_windows_between_planes_solve_problem_4_5(seed):
     """As the textbook has it, multipliers of both sides included; feasible, complementary, and none negative."""
