@@ -155,7 +155,7 @@ def test_a_residual_collides_gets_stuck_and_violates_but_never_tunnels():
     env = make("residual", kappa=3.0)
     lower, upper = WORLD.walls
     endings, collisions, violation = set(), 0, -np.inf
-    for policy in adversaries():
+    for policy in islice(adversaries(), 0, None, 2):
         _, _, infos = play(env, policy)
         endings.add(infos[-1]["termination"])
         collisions += infos[-1]["ledger"]["collisions"]
