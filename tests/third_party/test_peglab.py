@@ -57,7 +57,7 @@ def guiderail(lab, *arguments, code=0):
 @pytest.fixture(scope="module")
 def trained(lab):
     guiderail(
-        lab, "train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "6",
+        lab, "train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "3",
         "--env", "width=0.16", "--out", "run",
     )  # fmt: skip
     return lab.folder / "run"
@@ -98,7 +98,7 @@ def test_a_wrong_option_gets_a_sentence(lab):
 
 
 def test_it_is_trained_resumed_and_evaluated(lab, trained):
-    guiderail(lab, "train", "--resume", "--episodes", "8", "--out", "run")
+    guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run")
     found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
     assert found["episodes"] == 2
     assert found["worst_violation"] <= 1e-9
