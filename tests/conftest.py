@@ -4,7 +4,7 @@ import gc
 
 import pytest
 from hypothesis import HealthCheck, settings
-from served import Forks
+from served import Forks, begin_forkserver
 
 CALM = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
@@ -25,8 +25,11 @@ FORKS = pytest.StashKey[Forks]()
 
 def pytest_collection_finish(session):
     """Before the first test this process has imported everything, and made nothing."""
-    if any("forks" in getattr(item, "fixturenames", ()) for item in session.items):
+    used = {name for item in session.items for name in getattr(item, "fixturenames", ())}
+    if "forks" in used:
         session.config.stash[FORKS] = Forks()
+    if "forkserver" in used:
+        begin_forkserver()
 
 
 def pytest_unconfigure(config):
@@ -38,3 +41,8 @@ def pytest_unconfigure(config):
 def forks(request):
     """Runs programs in forks of this process as it was then: importing costs more than most of them."""
     return request.config.stash[FORKS]
+
+
+@pytest.fixture
+def forkserver():
+    """Processes of multiprocessing's "forkserver" are forks of this process as it was then, too."""

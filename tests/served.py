@@ -6,6 +6,7 @@ follows, or a file and what follows), the `folder` to run in, and what of the `e
 environment that another one made.
 """
 
+import contextlib
 import json
 import os
 import runpy
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import traceback
+from multiprocessing import forkserver, resource_tracker, util
 from typing import TextIO
 
 # What takes long, and knows nothing of tasks: others' packages, and none of guiderail's registries.
@@ -49,6 +51,31 @@ class Forks:
         """Ends the server."""
         self._asked.close(), self._answered.close()
         os.waitpid(self._server, 0)
+
+
+def begin_forkserver() -> None:
+    """Begins the standard library's server of forks as a fork of this process, where it would be a new interpreter."""
+
+    def begin(path: bytes, arguments: list[str], kept: list[int]) -> int:
+        if number := os.fork():
+            return number
+        # It is to end with its parent, which alone may hold the other end of a pipe for that.
+        pipe = os.fstat(kept[-1])
+        for descriptor in set(range(3, 1024)) - set(kept):
+            with contextlib.suppress(OSError):
+                if os.path.samestat(os.fstat(descriptor), pipe):
+                    os.close(descriptor)
+        try:
+            exec(arguments[arguments.index("-c") + 1], {})
+        finally:  # it ends by an exception: nobody is left who asks
+            os._exit(0)
+
+    resource_tracker.ensure_running()
+    usual, util.spawnv_passfds = util.spawnv_passfds, begin
+    try:
+        forkserver.ensure_running()
+    finally:
+        util.spawnv_passfds = usual
 
 
 def child(arguments: list[str], folder: str, environment: dict[str, str], out: int, err: int) -> None:

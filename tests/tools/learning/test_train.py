@@ -138,7 +138,7 @@ def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
     assert extended.config() == bead_config
 
 
-def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path, forkserver):
     """Whatever was not learned yet when it stopped is learned then."""
     plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
     config = replace(plain, learner=replace(plain.learner, pipelined=True))
