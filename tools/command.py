@@ -13,6 +13,7 @@ import typer
 import typer.core
 
 from guiderail.models.errors import InputError, RunsFailedError
+from guiderail.models.insertion import COLLISION_FORCE
 from guiderail.models.registry import did_you_mean
 
 # Tools are imported where they are called: PyTorch and Drake take seconds, and `guiderail --help` should not.
@@ -640,7 +641,7 @@ def onboard(
     axis: Annotated[str, _opt("Which way the plug comes out: +x, -x, +y, -y, +z or -z.")] = "+z",
     centre: Annotated[str | None, _opt("x,y,z of a point on the axis.  [default: the plug's centre of mass]")] = None,
     turn: Annotated[float, _opt("By how many degrees the plug turns at the bottom; it is drawn turned.")] = 0.0,
-    force_limit: Annotated[float, _opt("More than that ends an episode [N].")] = 35.0,
+    force_limit: Annotated[float, _opt("More than that ends an episode [N].")] = COLLISION_FORCE,
     friction: Annotated[float, _opt("Of all surfaces.")] = 0.2,
     scenario: Annotated[list[Path] | None, _opt("Drake model directives of what else stands there.")] = None,
     as_json: Json = False,
