@@ -26,10 +26,11 @@ FORKS = pytest.StashKey[Forks]()
 def pytest_collection_finish(session):
     """Before the first test this process has imported everything, and made nothing."""
     used = {name for item in session.items for name in getattr(item, "fixturenames", ())}
-    if "forks" in used:
-        session.config.stash[FORKS] = Forks()
+    # In this order: a server that is begun later holds what the earlier one is asked by, and ends first.
     if "forkserver" in used:
         begin_forkserver()
+    if "forks" in used:
+        session.config.stash[FORKS] = Forks()
 
 
 def pytest_unconfigure(config):
