@@ -1,10 +1,7 @@
 """Every block of every tutorial runs as it stands, and prints what the page says."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,11 +12,10 @@ SCREENS = 130  # lines: two screens
 
 
 @pytest.fixture(scope="module")
-def found():
-    """What is wrong with each page, all run in one process: importing costs more than most of them."""
-    environment = os.environ | {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
-    program = [sys.executable, str(Path(__file__).with_name("run_pages.py")), *map(str, PAGES)]
-    finished = subprocess.run(program, env=environment, capture_output=True, text=True)
+def found(forks):
+    """What is wrong with each page."""
+    environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
+    finished = forks.run(Path(__file__).with_name("run_pages.py"), *PAGES, **environment)
     assert finished.returncode == 0, finished.stderr
     return json.loads(finished.stdout.splitlines()[-1])
 
@@ -35,11 +31,10 @@ def test_a_tutorial_is_short_and_in_the_contents(page):
     assert f"tutorials/{page.stem}\n" in (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
 
 
-def test_a_page_that_says_something_else_is_found(tmp_path):
+def test_a_page_that_says_something_else_is_found(forks, tmp_path):
     page = tmp_path / "wrong.md"
     page.write_text("```python\nprint(1 + 1)\n```\n\n```text\n3\n```\n", encoding="utf-8")
-    program = [sys.executable, str(Path(__file__).with_name("run_pages.py")), str(page)]
-    finished = subprocess.run(program, capture_output=True, text=True)
+    finished = forks.run(Path(__file__).with_name("run_pages.py"), page)
     assert "it prints" in json.loads(finished.stdout)["wrong"]
 
 

@@ -11,7 +11,7 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ class Job:
         given |= {"imports": study.imports, "settings": settings, "seed": self.seed}
         return configure(study.task, environment, episodes=max(episodes, 1), **given)
 
-    @property
+    @cached_property
     def folder(self) -> RunFolder:
         """Where its run is, and what was evaluated of it."""
         config = self.config(self.marks[-1])
@@ -304,10 +304,11 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
         config = job.config(mark)
         shows = untrained(config.task, "rule") if config.learner.demonstration_episodes else None
         train(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=shows)
-    if len(folder.episodes()) == mark and not (copy / "policy.json").exists():
+    rows = folder.episodes()
+    if len(rows) == mark and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):
             write_atomically(copy / name, (folder.path / name).read_bytes())
-    return folder.episodes()
+    return rows
 
 
 def _policy_folder(job: Job, mark: int) -> Path:

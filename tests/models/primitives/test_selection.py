@@ -29,7 +29,7 @@ PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 # All six take a minute: `letters.py` beside this file writes them down.
 @pytest.mark.parametrize(("letter", "page"), [("e", PAGES[0]), ("N", PAGES[1])])
 def test_a_letter_stays_within_what_was_shown(letter, page):
-    shown = write(letter, **page)
+    shown = write(letter, count=4, steps=120, **page)
     selection = fit(shown)
     primitive = selection.primitive()
     assert selection.stays

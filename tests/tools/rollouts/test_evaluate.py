@@ -5,8 +5,6 @@ import pandas as pd
 import pytest
 
 from guiderail.models.errors import InputError
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import train
 from guiderail.tools.rollouts.evaluate import COMPARED, cached, evaluate, evaluate_policy
 from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
 from guiderail.tools.tasks import make_environment
@@ -38,33 +36,31 @@ def test_what_is_known_is_not_evaluated_again(tmp_path):
     assert len(asked) == 1
 
 
-def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_config, tmp_path, capsys):
-    train(RunFolder(tmp_path / "run"), bead_config)
-    result = evaluate(tmp_path / "run", episodes=3)
+def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_run, capsys):
+    result = evaluate(bead_run, episodes=3)
     said = capsys.readouterr().err
     assert "held-out episodes 3/3" in said
     assert "demonstration alone 3/3" in said
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
-    elsewhere = evaluate(tmp_path / "run", episodes=3, environment={"wall": -0.5})
+    elsewhere = evaluate(bead_run, episodes=3, environment={"wall": -0.5})
     assert elsewhere["success_rate"] == elsewhere["demonstration_success_rate"] == 0.0
     assert elsewhere["mean_return"] != result["mean_return"]
 
 
-def test_what_learned_nothing_meets_the_same_episodes_once(bead_config, tmp_path, capsys):
-    train(RunFolder(tmp_path / "run"), bead_config)
+def test_what_learned_nothing_meets_the_same_episodes_once(bead_run, capsys):
     policies = {
         "zero": still,
         "white": partial(NullPolicy, white),
         "other": lambda env: lambda observation: np.zeros(7),
     }
-    first = evaluate(tmp_path / "run", episodes=3, beside=policies)
+    first = evaluate(bead_run, episodes=3, beside=policies)
     assert first["beside"] == ["demonstration", "zero", "white"]
     for name in COMPARED:
         assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
     assert first["white_mean_return"] != first["zero_mean_return"]
     assert "white 3/3" in capsys.readouterr().err
-    again = evaluate(tmp_path / "run", episodes=3, beside=policies)
+    again = evaluate(bead_run, episodes=3, beside=policies)
     assert "white" not in capsys.readouterr().err
     assert again == first
-    assert evaluate(tmp_path / "run", episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
+    assert evaluate(bead_run, episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
