@@ -943,9 +943,10 @@ def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dic
     from guiderail.tools.guidance import is_demonstrated
     from guiderail.tools.learning.run_folder import RunFolder
     from guiderail.tools.studies.scripted import RULES, untrained
+    from guiderail.tools.tasks import environment_with
 
     config = RunFolder(run).config()
-    where = config.environment | dict(environment)
+    where = environment_with(config.environment, environment)
     if names is None:
         zero = [] if is_demonstrated(where.get("guidance")) else ["zero"]
         rule = ["rule"] if config.task in RULES and where.get("observation") != "image" else []

@@ -13,7 +13,9 @@ from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
+from guiderail.diagrams.options import Options
 from guiderail.diagrams.register import register_envs
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_task_folder
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
@@ -112,6 +114,21 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             raise InputError(f"{task}'s {name} cannot be {brief(value)}: give a value such as {options[name]!r}")
     given = {name: arguments.get(name, default) for name, default in options.items()}
     return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
+
+
+def environment_with(environment: Mapping[str, Any], others: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The arguments of an environment with others in their place.
+
+    Where these name another station, what only the old one has is left out.
+    """
+    others = dict(others or {})
+    old, new = environment.get("station"), others.get("station", environment.get("station"))
+    names = STATIONS.names() if new != old else []
+    gone: set[str] = set()
+    if old in names and new in names:
+        own, there = ((STATIONS.get(name).options or Options).model_fields for name in (str(old), str(new)))
+        gone = {*own} - {*there}
+    return {name: value for name, value in environment.items() if name not in gone} | others
 
 
 def _is_like(value: Any, default: Any) -> bool:

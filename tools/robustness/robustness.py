@@ -21,6 +21,7 @@ from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, judged_once
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.rollout import Act
 from guiderail.tools.tables import write_table
+from guiderail.tools.tasks import environment_with
 
 EPISODES = 30  # of each who at each place
 POLICY, DEMONSTRATION = "policy", "demonstration"
@@ -63,7 +64,7 @@ def robustness(
         raise InputError(f"robustness needs at least one episode at each place, not {episodes}")
     folder = RunFolder(run)
     config, policy = folder.config(), Policy.load(folder.path)
-    where = config.environment | dict(environment or {})
+    where = environment_with(config.environment, environment)
     places, left_out = points(config.task, where, chosen_axes(axes))
     for sentence in left_out:
         tell(sentence)

@@ -23,7 +23,7 @@ from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.rollouts.suited import suits
 from guiderail.tools.tables import read_table, table_text
-from guiderail.tools.tasks import make_environment
+from guiderail.tools.tasks import environment_with, make_environment
 from guiderail.tools.thesis import differences
 
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
@@ -126,7 +126,7 @@ def evaluate(
     """
     folder = RunFolder(run)
     config, policy, trained = folder.config(), Policy.load(folder.path), folder.episodes()
-    where = config.environment | dict(environment or {})
+    where = environment_with(config.environment, environment)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
     rows = evaluate_run(config, lambda env: policy, where, words="held-out episodes", **how)
     alone = pd.DataFrame()

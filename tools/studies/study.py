@@ -22,6 +22,7 @@ from rich.console import Console
 from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.models.policy import Policy
 from guiderail.tools.files import write_atomically
+from guiderail.tools.learning import older
 from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.rollouts.evaluate import cached, evaluate_run
@@ -35,7 +36,7 @@ from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
 from guiderail.tools.studies.sweep import draw_sweeps
 from guiderail.tools.tables import write_table
-from guiderail.tools.tasks import import_modules, make_environment
+from guiderail.tools.tasks import environment_with, import_modules, make_environment
 
 BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
@@ -224,7 +225,9 @@ def _check(job: Job) -> None:
         untrained(job.study.task, policy)
     for judged in job.study.judgements:
         extra = {**judged.env, **{name: low for name, (low, _) in judged.sampled.items()}}
-        configure(job.study.task, config.environment | extra, episodes=1)
+        configure(job.study.task, environment_with(config.environment, extra), episodes=1)
+    for mark, judged in itertools.product(job.marks, job.study.judgements):
+        _refuse_other_rows(job, _evaluated_file(job, mark, judged), judged)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
         for mark in job.marks:
@@ -316,13 +319,40 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
     method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
     said = "" if judged is None else judged.model_dump_json(exclude={"name", "file"})
     # As resolved: what a difficulty stands for may change, and what was evaluated before is then another task.
-    environment = json.dumps(job.config(1).environment, sort_keys=True, default=str)
-    return hashlib.blake2b((said + method + environment).encode(), digest_size=4).hexdigest()
+    environment = json.dumps(older.options(job.config(1).environment), sort_keys=True, default=str)
+    told = said + method + environment + older.task(job.study.task)
+    if "{seed}" not in job.study.folder:
+        told += f"seed {job.seed}"
+    return hashlib.blake2b(told.encode(), digest_size=4).hexdigest()
 
 
 def _evaluated(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
     """Rows of held-out episodes, from the file where they are known already."""
-    return cached(_evaluated_file(job, mark, judged), lambda: _evaluate(job, mark, judged))
+    file = _evaluated_file(job, mark, judged)
+    _refuse_other_rows(job, file, judged)
+
+    def evaluated() -> pd.DataFrame:
+        rows = _evaluate(job, mark, judged)
+        if "{digest}" not in judged.file:
+            write_atomically(_says_of_what(file), _digest(job, judged).encode())
+        return rows
+
+    return cached(file, evaluated)
+
+
+def _says_of_what(file: Path) -> Path:
+    """What stands beside a table of episodes whose name doesn't say which they are."""
+    return file.with_name(f".{file.name}.digest")
+
+
+def _refuse_other_rows(job: Job, file: Path, judged: JudgedOn) -> None:
+    """Another study's rows of the same name are not taken for these."""
+    says = _says_of_what(file)
+    if "{digest}" not in judged.file and says.exists() and says.read_text() != _digest(job, judged):
+        raise InputError(
+            f"{file} holds episodes of another study, or of other settings: name another folder with --out, or write "
+            "{digest} into the file's name"
+        )
 
 
 def _evaluated_file(job: Job, mark: int, judged: JudgedOn) -> Path:
@@ -332,7 +362,7 @@ def _evaluated_file(job: Job, mark: int, judged: JudgedOn) -> Path:
 
 def _evaluate(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
     config, policy = job.config(mark), _policy(job, mark)
-    environment = as_arguments(config.environment | judged.env)
+    environment = as_arguments(environment_with(config.environment, judged.env))
     every, tables = judged.every if judged.sampled else judged.episodes, []
     for done in range(0, judged.episodes, every):
         rng, number = np.random.default_rng([judged.first_seed, done]), min(every, judged.episodes - done)

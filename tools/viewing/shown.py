@@ -13,6 +13,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
 from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.tasks import environment_with
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Shown:
         config, policy = folder.config(), Policy.load(folder.path)
         return cls(
             task=config.task,
-            environment=config.environment | dict(environment or {}),
+            environment=environment_with(config.environment, environment),
             policy=lambda env: policy,
             acting="after learning",
             title=config.learner.algorithm.upper(),

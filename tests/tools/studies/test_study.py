@@ -5,8 +5,10 @@ import pandas as pd
 import pytest
 import yaml
 
+from guiderail.diagrams.make import resolve
 from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.tools.command import main
+from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import evaluate_policy
 from guiderail.tools.rollouts.metrics import STATISTICS
@@ -140,6 +142,37 @@ def test_other_episodes_of_the_same_name_are_not_taken_for_these(tmp_path):
     assert near["mean_return"].gt(far["mean_return"]).all()
     other = run(study(methods={"nothing": {"policy": "constant"}}), tmp_path)
     assert not other["mean_return"].isin(near["mean_return"]).any()
+
+
+def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
+    """By the seed where a folder's name doesn't say it, by the task, and by a sentence where a file's name is given."""
+    (tmp_path / "pearl.py").write_text(
+        "import bead, gymnasium\n"
+        "if 'guiderail/Twin-v0' not in gymnasium.registry:\n"
+        "    gymnasium.register('guiderail/Twin-v0', entry_point=bead.Bead)\n"
+    )
+    white = {"methods": {"anything": {"policy": "white"}}, "folder": "{method}", "seeds": [5]}
+    out = tmp_path / "out"
+    for changed in ({}, {"seeds": [6]}, {"task": "Twin", "imports": [str(tmp_path / "pearl.py")]}):
+        run(study(**(white | changed)), out)
+    assert len(list((out / "anything").glob("held_out-0-*.csv"))) == 3
+    named = {"judged on": [{"episodes": 3, "file": "held_out.csv"}]}
+    run(study(**white, **named), out)
+    before = written(out)
+    run(study(**white, **named), out)
+    assert written(out) == before
+    for changed in ({"env": {"wall": -0.5}}, {"seeds": [6]}, {"judged on": [{"episodes": 4, "file": "held_out.csv"}]}):
+        with pytest.raises(InputError, match="episodes of another study"):
+            run(study(**(white | named | changed)), out)
+    assert written(out) == before
+
+
+def test_results_that_are_older_than_an_option_are_of_its_default():
+    assert older.options({"wall": 1.0, "impedance_control": "joint"}) == {"wall": 1.0}
+    assert older.options({"impedance_control": "cartesian"}) == {"impedance_control": "cartesian"}
+    for name, value in older.OPTIONS.items():
+        options = [resolve(task, {}).values for task in older.TASKS]
+        assert [one[name] for one in options if name in one].count(value) == sum(name in one for one in options) > 0
 
 
 def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_path):
