@@ -235,18 +235,20 @@ def evaluate(
         str | None,
         _opt("Who else meets the same episodes, or none.  [default: zero, white and constant actions, and the rule]"),
     ] = None,
+    fresh: Annotated[bool, _opt("Draw anew in every episode what is hidden in the run.", "--fresh")] = False,
     as_json: Json = False,
 ) -> None:
     """Evaluate a run's policy on what training never met, beside policies that learned nothing.
 
     It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
-    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again.
+    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again. To be a policy
+    for the offset that a run hides, or with --fresh for any, are two claims: which of them, is printed first.
     """
     from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 
     environment = _environment(env)
     others = _beside(run, environment, beside)
-    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others)
+    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others, fresh=fresh)
     for name in others:
         if name not in found["beside"]:
             _say(f"{name} is left out: it sees or moves other things than this environment")

@@ -26,7 +26,6 @@ from guiderail.diagrams.tasks.pouring_template import SPARSE_INPUT_SPEED, frames
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Task, Threshold
 from guiderail.models.errors import InputError
-from guiderail.models.objects.vessels import Ball
 from guiderail.models.pose_coordinates import transform_to_pose
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
@@ -61,7 +60,11 @@ class Pouring(Task):
     def __init__(self, options: PouringOptions, choice: Choice):
         super().__init__(options, choice)
         options.check()
-        self._config = PouringConfig(mug=vessel_or_refuse(options.mug_inner_diameter, options.mug_depth, Ball()))
+        self._config = PouringConfig(
+            mug=vessel_or_refuse(options.mug_inner_diameter, options.mug_depth, options.ball),
+            ball=options.ball,
+            num_balls=options.balls,
+        )
         self.num_steps = round(options.time_limit / self._config.control_period)
         speed = self._input_speed()
         self._skill = make_skill(self._config, speed)
@@ -102,7 +105,7 @@ class Pouring(Task):
 
     def conditions(self) -> list[Condition]:
         """Poured, spilled, or touched."""
-        return conditions(self._config)
+        return conditions(self._config, self.options.needed)
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any

@@ -16,7 +16,7 @@ SETTINGS = {
 VALUES = {"proving": "selection", "row": "greedy_successes"}
 ARRAYS = {"proving/proven/": "selection/selected/", "proving/": "selection/"}
 # Options of an environment that results are older than, and what they are where nobody asks for them.
-OPTIONS: Mapping[str, Any] = {"impedance_control": "joint"}
+OPTIONS: Mapping[str, Any] = {"impedance_control": "joint", "balls": 2, "balls_in": None, "ball_diameter": 0.04}
 # Tasks whose results don't say which task they are of.
 TASKS = ("NarrowPassage", "BncConnector", "GridClamp", "Pouring")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,10 @@ from guiderail.tools.studies.board import Board
 from guiderail.tools.studies.declaration import LEARNED, JudgedOn, Ratio, Study
 from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
-from guiderail.tools.studies.sweep import draw_sweeps
+from guiderail.tools.studies.sweep import broken, draw_sweeps
 from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import environment_with, import_modules, make_environment
+from guiderail.tools.thesis import differences
 
 BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
@@ -161,6 +162,7 @@ def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict
     result["table"] = str(write_table(out / study.name, rows.drop(columns="folder")))
     if study.sweeps:
         result["picture"] = str(draw_sweeps(study, rows, out / f"{study.name}.png"))
+        result |= broken(study, rows)
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
         after = f" after {mark} episodes" if mark else ""
         if judged:
@@ -169,7 +171,19 @@ def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict
             result[f"{method}{after}, converged after, each seed"] = each(group, "training_converged_after")
     for one in study.ratios:
         result |= ratio(rows, one)
+    for words, methods in differing(study).items():
+        result[f"{', '.join(methods)}: differs from the thesis in"] = words
     return result
+
+
+def differing(study: Study, methods: Sequence[str] | None = None) -> dict[str, list[str]]:
+    """In what methods differ from the thesis, all of them unless given; those that do in the same are told together."""
+    told: dict[str, list[str]] = {}
+    for method in study.methods if methods is None else methods:
+        job = Job(study, method, study.seeds[0], Path())
+        words = differences(job.config(job.marks[-1]), learns=job.learns)
+        told.setdefault("; ".join(words), []).append(method)
+    return told
 
 
 def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:

@@ -15,7 +15,8 @@ from guiderail.tools.rollouts.metrics import STATISTICS
 from guiderail.tools.rollouts.null_policies import always
 from guiderail.tools.studies.declaration import JudgedOn, Smoothness, Study, load_study, shipped_studies
 from guiderail.tools.studies.engines.engine import make_engine
-from guiderail.tools.studies.study import Job, _check, each, ratio, run_study, study_command
+from guiderail.tools.studies.study import Job, _check, differing, each, ratio, run_study, study_command
+from guiderail.tools.studies.sweep import AT_ONCE, NEVER, breaking_point
 from guiderail.tools.tables import read_table
 from guiderail.tools.tasks import make_environment
 
@@ -167,6 +168,24 @@ def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
     assert written(out) == before
 
 
+def test_a_study_says_in_what_its_methods_differ_from_the_thesis():
+    told = differing(load_study("connector_hard"))
+    (learned,) = (words for words, methods in told.items() if "kgrl" in methods)
+    (nulls,) = (words for words, methods in told.items() if "white" in methods)
+    assert "reward aligned (thesis: sparse)" in learned
+    assert "difficulty 'hard', which is ours" in learned
+    assert "difficulty 'hard', which is ours" in nulls
+    assert "checkpoint selection" in learned
+    assert "checkpoint selection" not in nulls
+
+
+def test_where_a_method_breaks_lies_on_a_line_between_two_values():
+    assert breaking_point([1.0, 2.0, 3.0], [1.0, 1.0, 0.8]) == pytest.approx(2.5)
+    assert breaking_point([30.0, 20.0, 10.0], [1.0, 0.9, 0.0]) == pytest.approx(20.0)
+    assert breaking_point([1.0, 2.0], [0.89, 1.0]) == AT_ONCE
+    assert breaking_point([1.0, 2.0], [1.0, 0.9]) == NEVER
+
+
 def test_results_that_are_older_than_an_option_are_of_its_default():
     assert older.options({"wall": 1.0, "impedance_control": "joint"}) == {"wall": 1.0}
     assert older.options({"impedance_control": "cartesian"}) == {"impedance_control": "cartesian"}
@@ -230,6 +249,7 @@ def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
     said = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
     assert result["learner after 2 episodes, held out, success of each seed"] == said
     assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
+    assert result["learner: differs from the thesis in"] == "it has no task Bead"
     err = capsys.readouterr().err
     assert "1/2 learner, seed 5: held out" in err
     assert "2/2 learner, seed 6: held out" in err
@@ -344,5 +364,6 @@ def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
     assert rows["judged_on"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
     assert rows[rows["judged_on"] == "wall [m] -0.5"]["success_rate"].eq(0).all()
     assert found["picture"] == str(tmp_path / "beads.png")
+    assert found["nothing, below 90% at wall [m]"] == "from the easiest on"
     assert (tmp_path / "beads.png").stat().st_size > 10_000
     assert run_study(one, tmp_path, make_engine(processes=1))["judged_on"].tolist() == rows["judged_on"].tolist()
