@@ -4,7 +4,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -254,10 +254,7 @@ def evaluate(
             _say(f"{name} is left out: it sees or moves other things than this environment")
     differs = [] if as_json else found.pop("differs_from_thesis")
     _print(found, as_json)
-    if differs:
-        typer.echo("differs from the thesis in")
-    for words in differs:
-        typer.echo(f"  · {words}")
+    _print_differences(differs)
 
 
 @command("robustness runs/connector --env station=mujoco --episodes 50")
@@ -511,7 +508,10 @@ def study(
     from guiderail.tools.studies.study import study_command
 
     found = study_command(chosen, out, running)
+    differs = {} if as_json else found.pop("differs_from_thesis", {})
     _print(found, as_json)
+    for methods, words in differs.items():
+        _print_differences(words, f" ({methods})")
     if "failed" in found:
         raise RunsFailedError(found["failed"], None)
 
@@ -977,6 +977,14 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
 
     arguments = check_environment(shown, environment)
     return showing.Shown(shown, arguments, untrained(shown, policy), policy, policy, seed=seed)
+
+
+def _print_differences(differs: Sequence[str], of: str = "") -> None:
+    """In what something differs from the thesis, line by line."""
+    if differs:
+        typer.echo(f"differs from the thesis in{of}")
+    for words in differs:
+        typer.echo(f"  · {words}")
 
 
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:

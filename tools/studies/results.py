@@ -16,7 +16,7 @@ from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.files import write_atomically
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.studies.declaration import LEARNED, Study, load_study, shipped_studies
-from guiderail.tools.studies.study import differing
+from guiderail.tools.studies.study import differences_of
 from guiderail.tools.tables import cell, read_table, table_text
 
 # The figures of the thesis that a study stands beside.
@@ -114,8 +114,10 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
         told = [method, mark or "–", judged or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
-    learned = [method for method, one in study.methods.items() if one.policy == LEARNED]
-    for words, methods in differing(study, learned).items():
+    told: dict[str, list[str]] = {}
+    for method in (method for method, one in study.methods.items() if one.policy == LEARNED):
+        told.setdefault("; ".join(differences_of(study, method)), []).append(method)
+    for words, methods in told.items():
         lines += ["", f"Differs from the thesis in ({', '.join(methods)}): {words}."]
     return "\n".join([*lines, ""])
 

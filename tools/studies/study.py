@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,6 +150,8 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
 def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict[str, Any]:
     """Runs a study, writes `<name>.csv` and `.md`, and says what the rows come to, each seed by itself.
 
+    `differs_from_thesis` says in what, by the methods that do.
+
     Where runs failed, the table has the others, and `failed` says what became of these.
     """
     result: dict[str, Any] = {}
@@ -171,19 +173,29 @@ def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict
             result[f"{method}{after}, converged after, each seed"] = each(group, "training_converged_after")
     for one in study.ratios:
         result |= ratio(rows, one)
-    for words, methods in differing(study).items():
-        result[f"{', '.join(methods)}: differs from the thesis in"] = words
+    result["differs_from_thesis"] = differing(study)
     return result
 
 
-def differing(study: Study, methods: Sequence[str] | None = None) -> dict[str, list[str]]:
-    """In what methods differ from the thesis, all of them unless given; those that do in the same are told together."""
-    told: dict[str, list[str]] = {}
-    for method in study.methods if methods is None else methods:
-        job = Job(study, method, study.seeds[0], Path())
-        words = differences(job.config(job.marks[-1]), learns=job.learns)
-        told.setdefault("; ".join(words), []).append(method)
-    return told
+ALL = "all methods"
+
+
+def differing(study: Study) -> dict[str, list[str]]:
+    """In what methods differ from the thesis: first all of them, then those that differ in the same things besides."""
+    told = {method: differences_of(study, method) for method in study.methods}
+    first, *others = told.values()
+    common = [words for words in first if all(words in other for other in others)]
+    own: dict[tuple[str, ...], list[str]] = {}
+    for method, words in told.items():
+        own.setdefault(tuple(one for one in words if one not in common), []).append(method)
+    found = {ALL: common} if common else {}
+    return found | {", ".join(methods): list(words) for words, methods in own.items() if words}
+
+
+def differences_of(study: Study, method: str) -> list[str]:
+    """In what a method differs from the thesis, in words; without a learner's settings where nobody learns."""
+    job = Job(study, method, study.seeds[0], Path())
+    return differences(job.config(job.marks[-1]), learns=job.learns)
 
 
 def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:

@@ -15,7 +15,7 @@ from guiderail.tools.rollouts.metrics import STATISTICS
 from guiderail.tools.rollouts.null_policies import always
 from guiderail.tools.studies.declaration import JudgedOn, Smoothness, Study, load_study, shipped_studies
 from guiderail.tools.studies.engines.engine import make_engine
-from guiderail.tools.studies.study import Job, _check, differing, each, ratio, run_study, study_command
+from guiderail.tools.studies.study import Job, _check, differences_of, differing, each, ratio, run_study, study_command
 from guiderail.tools.studies.sweep import AT_ONCE, NEVER, breaking_point
 from guiderail.tools.tables import read_table
 from guiderail.tools.tasks import make_environment
@@ -169,14 +169,16 @@ def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
 
 
 def test_a_study_says_in_what_its_methods_differ_from_the_thesis():
-    told = differing(load_study("connector_hard"))
-    (learned,) = (words for words, methods in told.items() if "kgrl" in methods)
-    (nulls,) = (words for words, methods in told.items() if "white" in methods)
-    assert "reward aligned (thesis: sparse)" in learned
-    assert "difficulty 'hard', which is ours" in learned
-    assert "difficulty 'hard', which is ours" in nulls
-    assert "checkpoint selection" in learned
-    assert "checkpoint selection" not in nulls
+    study = load_study("connector_hard").only(["kgrl", "skgrl", "white", "rule"])
+    told = differing(study)
+    assert "reward aligned (thesis: sparse)" in told["all methods"]
+    assert any(words.startswith("difficulty 'hard', which is ours") for words in told["all methods"])
+    assert any("checkpoint selection" in words for words in told["kgrl"])
+    assert any("ρ" in words for words in told["skgrl"])
+    assert not any("checkpoint selection" in words for words in differences_of(study, "white"))
+    for method in study.methods:
+        own = [words for methods, words in told.items() if method in (methods, *methods.split(", "))]
+        assert sorted(told["all methods"] + sum(own, [])) == sorted(differences_of(study, method))
 
 
 def test_where_a_method_breaks_lies_on_a_line_between_two_values():
@@ -249,7 +251,7 @@ def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
     said = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
     assert result["learner after 2 episodes, held out, success of each seed"] == said
     assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
-    assert result["learner: differs from the thesis in"] == "it has no task Bead"
+    assert result["differs_from_thesis"] == {"all methods": ["it has no task Bead"]}
     err = capsys.readouterr().err
     assert "1/2 learner, seed 5: held out" in err
     assert "2/2 learner, seed 6: held out" in err
