@@ -70,7 +70,6 @@ class Pouring(Task):
         self._skill = make_skill(self._config, speed)
         if options.aim:
             self._skill = make_aimed_skill(self._config, speed, options.aim_speed, options.pour_speed)
-        self._error: Drawn | None = None
 
     def _input_speed(self) -> float:
         if self.options.input_speed is not None:
@@ -85,8 +84,8 @@ class Pouring(Task):
         """Where the mug is believed to be, from where it is, if that is to be seen."""
         if not self.options.aim:
             return {}
-        self._error = Drawn(builder, "mug_error", 2)
-        return {"mug_error": self._error.port}
+        self.drawn["mug_error"] = Drawn(builder, "mug_error", 2)
+        return {"mug_error": self.drawn["mug_error"].port}
 
     def template(self) -> Template:
         """Of figure 2.2 and table 3.3, or the one that can be aimed."""
@@ -130,8 +129,8 @@ class Pouring(Task):
         station.set_mug(context, RigidTransform([*p_TMug, 0.0]))
         if isinstance(guidance, Guidance):
             guidance.set_frames(context, frames)
-        if self._error is not None:
-            self._error.set(context, error)
+        if self.options.aim:
+            self.drawn["mug_error"].set(context, error)
         # Turned as the template wants it, whether or not that guides: all kinds of guidance start alike.
         X_TP = self._skill.project(self._skill.initial_state, RigidTransform(believed @ p_MP), frames)
         station.set_pose(context, transform_to_pose(X_TP))
