@@ -17,14 +17,15 @@ from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.files import write_atomically
 from guiderail.tools.guidance import is_demonstrated
+from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.rollouts.metrics import converged_after, summary
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act, rollout
-from guiderail.tools.rollouts.suited import suits
+from guiderail.tools.rollouts.suited import as_learned, suits
 from guiderail.tools.tables import read_table, table_text
-from guiderail.tools.tasks import environment_with, make_environment
+from guiderail.tools.tasks import changed_environment, make_environment, task_content
 from guiderail.tools.thesis import differences
 
 CALIBRATION = "calibration"  # the uncertainty under which a run hides an offset of its own
@@ -127,16 +128,17 @@ def evaluate(
         environment do, in words.
 
     Raises:
-        InputError: if there is no trained run, a number is out of range, or nothing is hidden that could be drawn anew.
+        InputError: if there is no trained run, a number is out of range, its policy sees or moves other things, or
+            nothing is hidden that could be drawn anew.
     """
     folder = RunFolder(run)
     config, policy, trained = folder.config(), Policy.load(folder.path), folder.episodes()
-    where = environment_with(config.environment, environment)
+    where = changed_environment(config.task, config.environment, environment or {})
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
     claimed = claim(config.task, where, fresh)
     if fresh:
         how["options"] = {"new_run": True}
-    rows = evaluate_run(config, lambda env: policy, where, words="held-out episodes", **how)
+    rows = evaluate_run(config, partial(as_learned, policy), where, words="held-out episodes", **how)
     alone = pd.DataFrame()
     if is_demonstrated(where.get("guidance")):
         alone = evaluate_run(config, still, where, words="demonstration alone", **how)
@@ -207,16 +209,25 @@ def judged_once(
     Returns:
         None if what they see or move is not this environment's.
     """
-    deciding = {key: value for key, value in how.items() if key != "words"}
-    about = [] if about is None else [about]
-    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
-    digest = hashlib.blake2b(told.encode(), digest_size=6).hexdigest()
+    file = kept_file(kept, name, config, environment, about=about, **how)
     how.setdefault("words", name)
     judged = partial(evaluate_run, config, partial(_suited, acts), environment, **how)
     try:
-        return cached(kept / f"{name}-{digest}.csv", judged)
+        return cached(file, judged)
     except _NotSuitedError:
         return None
+
+
+def kept_file(
+    kept: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
+) -> Path:
+    """The file that `judged_once` keeps its rows in, named by all that decides them; the arguments are its own."""
+    deciding = {key: value for key, value in how.items() if key != "words"}
+    about = [*([] if about is None else [about]), *filter(None, [task_content(config.task)])]
+    told = json.dumps(
+        [older.options(environment), deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str
+    )
+    return kept / f"{name}-{hashlib.blake2b(told.encode(), digest_size=6).hexdigest()}.csv"
 
 
 class _NotSuitedError(Exception):
