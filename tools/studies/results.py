@@ -114,10 +114,10 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
         told = [method, mark or "–", judged or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
-    told: dict[str, list[str]] = {}
+    differing: dict[str, list[str]] = {}
     for method in (method for method, one in study.methods.items() if one.policy == LEARNED):
-        told.setdefault("; ".join(differences_of(study, method)), []).append(method)
-    for words, methods in told.items():
+        differing.setdefault("; ".join(differences_of(study, method)), []).append(method)
+    for words, methods in differing.items():
         lines += ["", f"Differs from the thesis in ({', '.join(methods)}): {words}."]
     return "\n".join([*lines, ""])
 
