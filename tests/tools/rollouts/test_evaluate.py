@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.errors import InputError
-from guiderail.tools.rollouts.evaluate import COMPARED, cached, evaluate, evaluate_policy
+from guiderail.tools.rollouts.evaluate import COMPARED, cached, claim, evaluate, evaluate_policy
 from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
 from guiderail.tools.tasks import make_environment
 
@@ -64,3 +64,22 @@ def test_what_learned_nothing_meets_the_same_episodes_once(bead_run, capsys):
     assert "white" not in capsys.readouterr().err
     assert again == first
     assert evaluate(bead_run, episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
+
+
+
+def test_a_policy_for_one_offset_and_one_for_any_are_two_claims(bead_run):
+    one = claim("BncConnector", {"uncertainty": "calibration"}, fresh=False)
+    for_any = claim("BncConnector", {"uncertainty": "calibration"}, fresh=True)
+    assert "the one offset that is hidden in this run" in one
+    assert for_any == claim("GridClamp", {"uncertainty": "disc"}, fresh=False) != one
+    assert evaluate(bead_run, episodes=1)["claim"] == "a policy for starts that training never drew"
+    with pytest.raises(InputError, match="hides nothing that could be drawn anew: leave --fresh out"):
+        evaluate(bead_run, episodes=1, fresh=True)
+
+
+def test_what_is_hidden_in_a_run_is_drawn_anew_only_where_that_is_asked_for():
+    env = make_environment("BncConnector", {"uncertainty": "calibration"})
+    env.reset(seed=3)
+    for options, places in (({}, 1), ({"new_run": True}, 3)):
+        drawn = [env.reset(seed=seed, options={"held_out": True} | options)[1]["jack_offset"] for seed in (7, 8, 9)]
+        assert len({tuple(offset) for offset in drawn}) == places
