@@ -43,7 +43,7 @@ html_math_renderer = "mathml"
 html_copy_source = html_show_sourcelink = html_show_copyright = html_show_sphinx = False
 
 
-# What a notebook's process shows: drawings whose words stay words and that are the same file each time. It keeps nothing.
+# What a notebook shows: drawings whose words stay words, the same file each time.
 KERNEL = """
 c.InlineBackend.figure_formats = {"svg"}
 c.InlineBackend.print_figure_kwargs = {"bbox_inches": None}

@@ -1,7 +1,7 @@
 """Writes the README's table of results from the tables of finished studies: `python docs/make_readme_table.py`.
 
-`guiderail results STUDIES --out docs/results` leaves those tables. A study that is not there is left out, and so is a task
-without any; whatever seeds are there are told.
+`guiderail results STUDIES --out docs/results` leaves those tables. A study that is not there is left out, and so is a
+task without any; whatever seeds are there are told.
 """
 
 from __future__ import annotations
