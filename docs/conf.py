@@ -9,7 +9,6 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-import make_gallery  # noqa: E402
 import make_reference  # noqa: E402
 from mathml import visit_block, visit_inline  # noqa: E402
 
@@ -85,5 +84,4 @@ def setup(app):
     app.add_html_math_renderer("mathml", (visit_inline, None), (visit_block, None))
     app.connect("env-get-outdated", stale_notebooks)
     make_reference.make(HERE / "reference")
-    make_gallery.make(HERE / "pictures")
     return {"parallel_read_safe": True}
