@@ -44,6 +44,7 @@ html_copy_source = html_show_sourcelink = html_show_copyright = html_show_sphinx
 
 # What a notebook shows: drawings whose words stay words, the same file each time.
 KERNEL = """
+c.InteractiveShellApp.matplotlib = "inline"
 c.InlineBackend.figure_formats = {"svg"}
 c.InlineBackend.print_figure_kwargs = {"bbox_inches": None}
 c.InlineBackend.rc = {

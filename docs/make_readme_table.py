@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 README, RESULTS = HERE.parent / "README.md", HERE / "results"
 BEGIN, END = "<!-- Written by docs/make_readme_table.py -->", "<!-- End of what it wrote -->"
 COLUMNS = (
-    "task", "method", "training episodes, seeds", "success held out [%], each seed of 100", "converged after",
+    "task", "method", "training episodes (seeds)", "success held out [%], each seed of 100", "converged after",
     "commands beyond the bound", "peak force held out (in training) [N]",
 )  # fmt: skip
 NULLS = ("demonstrations alone", "white noise", "best constant action", "rule written by hand")
@@ -133,7 +133,7 @@ def numbers(seeds: pd.DataFrame) -> tuple[str, ...]:
     converged = _each(seeds["training_converged_after"])
     parts = [_safety(seeds, prefix) for prefix in (("", "training_") if held_out else ("training_",))]
     forces = _forces(parts) if held_out else f"({_forces(parts)})"
-    return f"{episodes}, {_span(seeds['seed'])}", success, converged, _beyond(parts), forces
+    return f"{episodes} ({_span(seeds['seed'])})", success, converged, _beyond(parts), forces
 
 
 SAFETY = ("worst_violation", "violating_episodes", "peak_force")
@@ -167,7 +167,7 @@ def _beyond(parts: Sequence[pd.DataFrame]) -> str:
     if worst <= TOLERANCE:
         return "never"
     episodes = sum(int(part["violating_episodes"].sum()) for part in parts)
-    return f"{episodes} episodes, {1000 * worst:.2f} mm at most"
+    return f"in {episodes} episodes, {1000 * worst:.2f} mm at most"
 
 
 def _forces(parts: Sequence[pd.DataFrame]) -> str:

@@ -64,7 +64,14 @@ def test_each_seed_is_told_after_its_last_episode_with_the_worst_that_it_did(mak
         + "residual,8,60,fresh,100,1.0,0,0,-0.1,0,14.5,60,0.8,,0.0,0,20.0\n"
     )
     (row,) = rows(maker.table(tmp_path))
-    assert row[1:] == ["residual RL", "60, 7, 8", "98, 100", "15, never", "8 episodes, 0.40 mm at most", "14.5 (31.0)"]
+    assert row[1:] == [
+        "residual RL",
+        "60 (7, 8)",
+        "98, 100",
+        "15, never",
+        "in 8 episodes, 0.40 mm at most",
+        "14.5 (31.0)",
+    ]
 
 
 def test_what_was_never_judged_is_said_to_be_of_training(maker, tmp_path):
@@ -74,7 +81,7 @@ def test_what_was_never_judged_is_said_to_be_of_training(maker, tmp_path):
         "kgrl,0,60,,60,1.0,0,-0.01,0,0.0\nkgrl,1,60,,60,0.5,3,1e-12,0,0.0\nkgrl,2,60,,60,0.25,,0,0,3.0\n"
     )
     (row,) = rows(maker.table(tmp_path))
-    assert row[1:] == ["KGRL", "60, 0–2", "100, 50, 25 in training", "0, 3, never", "never", "(3.0)"]
+    assert row[1:] == ["KGRL", "60 (0–2)", "100, 50, 25 in training", "0, 3, never", "never", "(3.0)"]
 
 
 def test_a_readme_without_a_place_for_it_is_refused(maker):
