@@ -138,6 +138,29 @@ def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
     assert extended.config() == bead_config
 
 
+def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+    """Whatever was not learned yet when it stopped is learned then."""
+    plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
+    config = replace(plain, learner=replace(plain.learner, pipelined=True))
+    undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
+    rows = train(undisturbed, config)
+
+    class Stop(Exception):
+        pass
+
+    def stop(row):
+        if row["episode"] == 4:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(stopped, config, report=stop)
+    train(stopped, config, resume=True)
+    assert_same_run(undisturbed, stopped)
+    # Another run than one that learns between its episodes: what is known is an episode older.
+    train(RunFolder(tmp_path / "other"), plain)
+    assert without_clock(rows) != without_clock(RunFolder(tmp_path / "other").episodes())
+
+
 def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     holds = "import sys; from guiderail.tools.learning.run_folder import RunFolder\n"
