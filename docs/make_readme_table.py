@@ -144,7 +144,7 @@ def _safety(seeds: pd.DataFrame, prefix: str) -> pd.DataFrame:
 
 
 def _each(values: pd.Series) -> str:
-    return ", ".join("never" if pd.isna(value) else f"{value:.0f}" for value in values)
+    return ", ".join("never" if pd.isna(value) else f"{value:.3g}" for value in values)
 
 
 def _span(seeds: pd.Series) -> str:
