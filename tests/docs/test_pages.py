@@ -84,6 +84,12 @@ def test_every_command_task_and_kind_is_there(reference):
     assert all(f"| `{metric.name}` |" in reference["metrics"] for metric in (*COLUMNS, *STATISTICS.values()))
 
 
+def test_every_field_of_a_template_says_what_it_is(reference):
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \| .* \|$", reference["templates"], re.MULTILINE)
+    assert len(rows) > 50
+    assert not [name for name, _, words in rows if not words.strip()]
+
+
 def test_the_reference_names_no_place_of_this_machine(reference):
     for name, page in reference.items():
         assert str(ROOT) not in page, name
