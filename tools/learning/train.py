@@ -92,6 +92,8 @@ def _train(
     if resume:
         rows = _resume(folder, learner, env)
         folder.write_config(config)
+        if len(rows) < config.episodes:
+            folder.remove_policy()  # killed from here on, it has one of fewer episodes than its table
     else:
         rows = []
         folder.create(config)
