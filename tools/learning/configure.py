@@ -87,7 +87,8 @@ def run(
         raise InputError("what should be learned? name a task, such as guiderail train NarrowPassage --out RUN")
     else:
         folder.refuse_existing()
-        config = configure(task, environment, settings=settings, imports=imports, **with_defaults(task, given))
+        given["settings"] = settings
+        config = configure(task, environment, imports=imports, **with_defaults(task, given))
     from guiderail.tools.learning.train import train  # PyTorch takes seconds: what is wrong was refused by now
 
     shows = demonstrator(config.task) if demonstrator and config.learner.demonstration_episodes else None
@@ -101,10 +102,12 @@ def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
 
     Args:
         task: its name.
-        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them.
+        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them, with
+            single settings of it replaced.
     """
     learner = {} if given.keys() & {"algorithm", "preset"} else own_defaults(task)
-    return {**learner, **given}
+    settings = {**learner.get("settings", {}), **(given.get("settings") or {})}
+    return {**learner, **given} | ({"settings": settings} if settings else {})
 
 
 def finish(out: Path) -> dict[str, str]:
