@@ -159,9 +159,7 @@ class PartTaskFile(Options):
     tolerance: Tolerance = Tolerance.model_validate({})
     bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
     force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
-    time_step: Number | None = Field(
-        None, gt=0, description="of the simulation [s], half a control period unless given"
-    )
+    time_step: Number | None = Field(None, gt=0, description="of the simulation [s]; its own unless given")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
     demonstrations: Shown = Shown.model_validate({})
     explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")

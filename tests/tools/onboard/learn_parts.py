@@ -1,4 +1,4 @@
-"""The six parts that nobody tuned for: drawn, onboarded and learned by the commands alone, and judged on held-out places.
+"""The six parts that nobody tuned for: drawn, onboarded and learned by the commands alone, and judged.
 
 `python tests/tools/onboard/learn_parts.py --out FOLDER [--parts square_peg,dovetail] [--episodes 60] [--judged 100]
 [--seed 0] [--processes 2]`; `--episodes 0` onboards alone. What is finished in the folder is used again, and a run that
