@@ -155,6 +155,9 @@ def train(
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
     ] = None,
+    with_person: Annotated[
+        bool, _opt("Somebody watches in the browser, pushes, stops, and says what was a success.", "--with-person")
+    ] = False,
     lcm_url: LcmUrl = "",
     robot: WhichRobot = "iiwa14",
     rehearse: Rehearse = False,
@@ -176,7 +179,7 @@ def train(
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     words |= {"uncertainty": uncertainty, "station": station}
     environment = {k: v for k, v in words.items() if v is not None} | _environment(env)
-    if folders and task is not None and not resume:
+    if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.recording.followed import leaves_demonstrations
 
         if (sentence := leaves_demonstrations(task, environment)) is not None:
@@ -187,8 +190,11 @@ def train(
     ):
         there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
         given = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
-        if task is None or out is None or resume:
-            raise InputError("on a robot a run begins anew: name a task and a folder, without --resume")
+        if task is None or out is None or resume or with_person:
+            raise InputError(
+                "on a robot a run begins anew and nobody pushes through a page: name a task and a folder, without "
+                "--resume and --with-person"
+            )
         from guiderail.tools.operate.rehearsal import Other
         from guiderail.tools.operate.train_on_robot import train_on_robot
 
@@ -220,6 +226,7 @@ def train(
         resume=resume,
         imports=(*folders, *(imports or ())),
         ledger=ledger,
+        person=_person if with_person else None,
         demonstrator=_rule,
     )
     _print(summary, as_json)
@@ -953,6 +960,15 @@ def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dic
     else:
         chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
     return {name: untrained(config.task, name, config.seed) for name in chosen}
+
+
+def _person() -> Any:
+    """Whoever opens the page; nothing goes on before."""
+    from guiderail.tools.operate.page_person import PagePerson
+
+    person = PagePerson(_tell)
+    person.wait()
+    return person
 
 
 def _rule(task: str) -> Any:

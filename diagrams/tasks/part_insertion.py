@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -25,9 +25,9 @@ from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
+from guiderail.diagrams.tasks.own_demonstrations import reference_of_file
 from guiderail.diagrams.tasks.part_file import FILE_NAME, PartTaskFile, read_task_file
 from guiderail.diagrams.tasks.task import Choice, Threshold
-from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.parts.model_files import part_sdf
 from guiderail.models.parts.sides import SIDES
@@ -82,8 +82,8 @@ class PartInsertion(InsertionTask):
 
     def reference(self) -> ReferenceTrajectory:
         """Of the folder's demonstrations."""
-        path = self.folder / self.file.demonstrations.file
-        return _reference(path, path.stat().st_mtime_ns, self.file.demonstrations)
+        shown = self.file.demonstrations
+        return reference_of_file(self.folder / shown.file, shown.components, shown.floor)
 
     def constraints(self) -> LinearConstraints:
         """The folder's bounds."""
@@ -203,23 +203,6 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         file.stiction_tolerance,
         tuple(str(folder / name) for name in file.scenario),
     )
-
-
-@cache
-def _reference(path: Path, changed: int, shown: Any) -> ReferenceTrajectory:
-    """What the demonstrations have in common, on the control period's clock; fitted once a process and version."""
-    demonstrations = Demonstrations.load(path)
-    if demonstrations.num_outputs != POSE_SIZE:
-        raise InputError(
-            f"{path} has {demonstrations.num_outputs} outputs: a task of parts needs the six of a pose, "
-            "[x y z Rz Ry Rx] in the target frame"
-        )
-    duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
-    num_steps = round(duration / CONTROL_PERIOD) + 1
-    fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=shown.components, num_steps=num_steps, floor=np.array(shown.floor)
-    )
-    return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
 
 
 def load_task_folder(folder: Path) -> type[PartInsertion]:

@@ -41,6 +41,7 @@ class RunConfig:
     versions: dict[str, str] = field(default_factory=dict)  # that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
     ledger: bool = True  # whether every control step is written down
+    with_person: bool = False  # whether a person watches; what was corrected is in the environment's via_points
 
     @property
     def hold(self) -> int:

@@ -93,7 +93,7 @@ class Teaching:
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", make_station(resolved))
         builder.ExportInput(self.station.get_desired_pose_input_port(), "desired_pose")
-        self.meshcat = add_meshcat(builder, self.station.GetOutputPort("query"))[0] if meshcat is None else meshcat
+        self.meshcat = add_meshcat(builder, self.station.GetOutputPort("query")) if meshcat is None else meshcat
         self.simulator = Simulator(builder.Build())
         self.kept: list[tuple[np.ndarray, np.ndarray]] = []
         self.succeeded: list[bool | None] = []
