@@ -207,9 +207,9 @@ def _make(
     for file in scenario:
         shutil.copy(file, folder / file.name)
     numbers = {"name": name, "force_limit": force_limit, "friction": friction, "scenario": scenario, "path": path}
-    numbers["sides"], numbers["rim_sides"] = sides(*parts, path)
-    alike = len(numbers["sides"]), len(numbers["rim_sides"])
-    say(f"the parts look the same from {alike[0]} of 7 other sides, and the rim nearly so from {alike[1]} more")
+    same, near = sides(*parts, path)
+    numbers |= {"sides": same, "rim_sides": near}
+    say(f"the parts look the same from {len(same)} of 7 other sides, and the rim nearly so from {len(near)} more")
     contact, push, aligned = _choose_contact(folder, parts, numbers, clearance, snapping, say)
     file = _task_file(parts, contact, push, numbers)
     off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in BESIDE]

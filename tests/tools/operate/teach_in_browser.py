@@ -20,7 +20,7 @@ import websockets
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD as PERIOD
 from guiderail.models.objects.bnc_motion import RIM, SEARCH_PUSH, SEAT_COMMAND
-from guiderail.tools.operate.teach import Teaching
+from guiderail.tools.operate.teach import SLIDERS, Teaching
 from guiderail.tools.tasks import task_named
 
 PORT = 9333
@@ -65,38 +65,39 @@ class Person:
         while self.session.steps * PERIOD < until:
             await asyncio.sleep(0.02)
 
+    async def bring(self, output, to):
+        """Presses keys until a slider on the page says that an output of the command is to be there [m, rad]."""
+        *_, step, lower, higher, unit = list(SLIDERS.values())[output]
+        for _ in range(5):
+            said = self.session.start[output] + self.session.wanted[output]
+            left = round((to - said) / (step * unit))
+            if left == 0:
+                return
+            await self.press(higher if left > 0 else lower, abs(left))
+            await self.look(0.3)
+
     async def wander(self, seconds):
         """Searches the rim: half a millimetre here, half a millimetre there, and back at last."""
-        x = y = 0
         until = self.session.steps * PERIOD + seconds
         while self.session.steps * PERIOD < until:
-            wanted = self.random.integers(-3, 4, size=2)
-            await self.press("KeyD" if wanted[0] > x else "KeyA", abs(wanted[0] - x))
-            await self.press("KeyW" if wanted[1] > y else "KeyS", abs(wanted[1] - y))
-            x, y = wanted
-            await self.look(0.15)
-        await self.press("KeyA" if x > 0 else "KeyD", abs(x))
-        await self.press("KeyS" if y > 0 else "KeyW", abs(y))
-
-    async def lower(self, to):
-        """Presses down until the command is to be at a height [m]."""
-        await self.press("KeyF", round((self.height - to) / 0.5e-3))
-        self.height = to
+            for output, there in enumerate(self.random.integers(-3, 4, size=2)):
+                await self.bring(output, 0.5e-3 * there)
+        await self.bring(0, 0.0)
+        await self.bring(1, 0.0)
 
     async def demonstrate(self, motion):
         """One demonstration of an insertion: to the rim, a search on it, in, a turn where there is one, and at rest."""
-        self.height = float(self.session.start[2])
         await self.look(0.3)
-        await self.lower(motion.rim - motion.press)
-        await self.look(0.6)
+        await self.bring(2, motion.rim - motion.press)
+        await self.look(0.3)
         await self.wander(1.5)
-        await self.lower(-motion.push)
-        await self.look(1.2)
+        await self.bring(2, -motion.push)
+        await self.look(0.9)
         if motion.turn:
-            await self.press("KeyE" if motion.turn > 0 else "KeyQ", round(abs(motion.turn) / 2.0))
-            await self.lower(-motion.push - 2e-3)
-            await self.look(1.0)
-        await self.press("KeyR", round((0.0 - self.height) / 0.5e-3))
+            await self.bring(3, self.session.start[3] + np.deg2rad(motion.turn))
+            await self.bring(2, -motion.push - 2e-3)
+            await self.look(0.9)
+        await self.bring(2, 0.0)
         await self.look(0.6)
         await self.press("Enter")
 
@@ -119,7 +120,7 @@ def known(session):
     return Insertion(file.motion.rim, file.motion.press, file.motion.push, file.motion.turn)
 
 
-async def person(url, session, picture):
+async def person(url, session, connected, picture):
     target = next(
         tab for tab in json.load(urllib.request.urlopen(f"http://localhost:{PORT}/json")) if tab["type"] == "page"
     )
@@ -127,9 +128,10 @@ async def person(url, session, picture):
         page = Page(socket)
         await page.call("Page.enable")
         await page.call("Page.navigate", url=url)
-        while session.meshcat.GetNumActiveConnections() == 0:
+        while not connected.is_set():
             await asyncio.sleep(0.2)
         await asyncio.sleep(2.0)
+        await page.press("KeyM")  # slow motion: keys take their time
         for number in range(COUNT):
             kept = len(session.kept)
             whoever = Person(page, session, number)
@@ -173,9 +175,13 @@ def main(task, out, picture=None):
             except OSError:
                 threading.Event().wait(0.5)
         session.begin()
-        at_page = person(session.meshcat.web_url(), session, None if picture is None else Path(picture))
+        connected = threading.Event()
+        at_page = person(session.meshcat.web_url(), session, connected, None if picture is None else Path(picture))
         hands = threading.Thread(target=asyncio.run, args=(at_page,))
         hands.start()
+        while session.meshcat.GetNumActiveConnections() == 0:  # Meshcat answers the thread that made it, no other
+            threading.Event().wait(0.1)
+        connected.set()
         session.run(print, most_steps=100_000)
         hands.join()
         print(json.dumps(session.learned()))
