@@ -14,6 +14,7 @@ from guiderail.diagrams.cameras import open_meshcat
 from guiderail.diagrams.view import View
 from guiderail.models.errors import InputError
 from guiderail.tools.learning.person import Person
+from guiderail.tools.operate.teach import look_at
 
 SAYS = {
     "success (Enter)": ("Enter", "success"),
@@ -42,6 +43,7 @@ class PagePerson(Person):
         self._say, self._sliders = say, list[str]()
         self._clicks: dict[str, int] = {}
         self._view: View | None = None
+        self._looks = False
         for name, (key, _) in SAYS.items():
             self.meshcat.AddButton(name, key)
         self.meshcat.AddButton(LET_GO, LET_GO_KEY)
@@ -60,6 +62,9 @@ class PagePerson(Person):
         self._name_sliders(base)
         if base.task.query is not None:
             self._view = View(base.task.query, self.meshcat)
+            if not self._looks and base.task.declaration is not None:
+                look_at(self.meshcat, base.task.declaration)
+                self._looks = True  # from where the person moves it to, from now on
             base.simulator.set_monitor(self._view.follow)
             base.simulator.set_target_realtime_rate(1.0)
         self._let_go()
