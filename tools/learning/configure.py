@@ -16,7 +16,7 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_argumen
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act
-from guiderail.tools.tasks import check_environment, import_modules
+from guiderail.tools.tasks import check_environment, import_modules, task_content
 
 # What a finished run says about itself.
 SUMMARY = (
@@ -50,17 +50,9 @@ def configure(
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)
     return RunConfig(
-        task,
-        as_arguments(resolved),
-        learner,
-        preset,
-        episodes,
-        seed,
-        installed_versions(),
-        tuple(imports),
-        ledger,
-        with_person,
-    )
+        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger,
+        task_content(task), with_person,
+    )  # fmt: skip
 
 
 def run(
@@ -148,6 +140,7 @@ def _continued(
 ) -> RunConfig:
     """The configuration of the run that goes on; refuses what would make it another run."""
     config = folder.config()
+    config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
     stored |= {"ledger": config.ledger, "with_person": config.with_person} | config.environment
     wanted = {**environment, **given} | ({} if task is None else {"task": task})
