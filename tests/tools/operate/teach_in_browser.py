@@ -65,6 +65,14 @@ class Person:
         while self.session.steps * PERIOD < until:
             await asyncio.sleep(0.02)
 
+    async def settle(self):
+        """Waits until the page has taken all keys in: a slow one does so seconds later."""
+        seen = None
+        while not np.array_equal(seen, self.session.wanted):
+            seen = self.session.wanted.copy()
+            await asyncio.sleep(0.4)
+            await self.look(0.1)
+
     async def bring(self, output, to):
         """Presses keys until a slider on the page says that an output of the command is to be there [m, rad]."""
         *_, step, lower, higher, unit = list(SLIDERS.values())[output]
@@ -74,7 +82,7 @@ class Person:
             if left == 0:
                 return
             await self.press(higher if left > 0 else lower, abs(left))
-            await self.look(0.3)
+            await self.settle()
 
     async def wander(self, seconds):
         """Searches the rim: half a millimetre here, half a millimetre there, and back at last."""
