@@ -73,7 +73,7 @@ def test_bounds_from_demonstrations_become_its_own(folder, capsys):
         constraints = resolve(str(folder), {}).task.constraints()
         assert constraints.G.shape[0] > 1
         np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
-        env = make_env(str(folder))
+        env = make_env(str(folder), horizon=4)
         env.reset(seed=0)
         env.step(env.action_space.sample())
         env.close()
