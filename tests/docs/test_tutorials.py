@@ -1,10 +1,7 @@
 """Every block of every tutorial and every cell of every notebook runs as it stands, and prints what the page says."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -19,11 +16,10 @@ SCREENS = 130  # lines: two screens
 
 
 @pytest.fixture(scope="module")
-def found():
-    """What is wrong with each page, all run in one process: importing costs more than most of them."""
-    environment = os.environ | {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-    program = [sys.executable, str(Path(__file__).with_name("run_pages.py")), *map(str, PAGES + NOTEBOOKS)]
-    finished = subprocess.run(program, env=environment, capture_output=True, text=True)
+def found(forks):
+    """What is wrong with each page."""
+    environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
+    finished = forks.run(Path(__file__).with_name("run_pages.py"), *PAGES, *NOTEBOOKS, **environment)
     assert finished.returncode == 0, finished.stderr
     return json.loads(finished.stdout.splitlines()[-1])
 
@@ -43,20 +39,18 @@ def test_pages_on_what_a_picture_shows_draw_it_themselves():
     assert {page.stem for page in NOTEBOOKS} >= {"start", "templates", "primitives", "kgrl", "exploration", "safety"}
 
 
-def test_a_cell_that_fails_is_found(tmp_path):
+def test_a_cell_that_fails_is_found(forks, tmp_path):
     page = tmp_path / "wrong.md"
     cells = "```{code-cell} python\n---\ntags: [hide-input]\n---\na = 1\n```\n\n```{code-cell} python\na / 0\n```\n"
     page.write_text(f"---\nfile_format: mystnb\n---\n\n```sh\nnobody runs this\n```\n\n{cells}", encoding="utf-8")
-    program = [sys.executable, str(Path(__file__).with_name("run_pages.py")), str(page)]
-    finished = subprocess.run(program, capture_output=True, text=True)
+    finished = forks.run(Path(__file__).with_name("run_pages.py"), page)
     assert "ZeroDivisionError" in json.loads(finished.stdout)["wrong"]
 
 
-def test_a_page_that_says_something_else_is_found(tmp_path):
+def test_a_page_that_says_something_else_is_found(forks, tmp_path):
     page = tmp_path / "wrong.md"
     page.write_text("```python\nprint(1 + 1)\n```\n\n```text\n3\n```\n", encoding="utf-8")
-    program = [sys.executable, str(Path(__file__).with_name("run_pages.py")), str(page)]
-    finished = subprocess.run(program, capture_output=True, text=True)
+    finished = forks.run(Path(__file__).with_name("run_pages.py"), page)
     assert "it prints" in json.loads(finished.stdout)["wrong"]
 
 
