@@ -66,7 +66,6 @@ def test_what_learned_nothing_meets_the_same_episodes_once(bead_run, capsys):
     assert evaluate(bead_run, episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
 
 
-
 def test_a_policy_for_one_offset_and_one_for_any_are_two_claims(bead_run):
     one = claim("BncConnector", {"uncertainty": "calibration"}, fresh=False)
     for_any = claim("BncConnector", {"uncertainty": "calibration"}, fresh=True)
