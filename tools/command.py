@@ -156,6 +156,9 @@ def train(
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
     ] = None,
+    with_person: Annotated[
+        bool, _opt("Somebody watches in the browser, pushes, stops, and says what was a success.", "--with-person")
+    ] = False,
     lcm_url: Annotated[str | None, _opt("Of a robot: the URL of LCM.  [default: LCM's own]")] = None,
     robot: Annotated[str | None, _opt("Which arm.  [default: the station's]", of="robots")] = None,
     rehearse: Rehearse = False,
@@ -182,7 +185,7 @@ def train(
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     words |= {"uncertainty": uncertainty, "station": station, "robot": robot, "lcm_url": lcm_url}
     environment = {k: v for k, v in words.items() if v is not None} | _environment(env)
-    if folders and task is not None and not resume:
+    if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.recording.followed import leaves_demonstrations
 
         if (sentence := leaves_demonstrations(task, environment)) is not None:
@@ -192,8 +195,11 @@ def train(
         there |= {"rehearse": rehearse, "lockstep": lockstep} | ({} if rate is None else {"rate": rate})
         given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
         given |= {"ledger": ledger, "imports": modules}
-        if task is None or out is None or resume:
-            raise InputError("on a robot a run begins anew: name a task and a folder, without --resume")
+        if task is None or out is None or resume or with_person:
+            raise InputError(
+                "on a robot a run begins anew and nobody pushes through a page: name a task and a folder, without "
+                "--resume and --with-person"
+            )
         from guiderail.tools.operate.rehearsal import Other
         from guiderail.tools.operate.train_on_robot import train_on_robot
 
@@ -227,6 +233,7 @@ def train(
         resume=resume,
         imports=modules,
         ledger=ledger,
+        person=_person if with_person else None,
         demonstrator=_rule,
     )
     _print(summary, as_json)
@@ -971,6 +978,15 @@ def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dic
     else:
         chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
     return {name: untrained(config.task, name, config.seed) for name in chosen}
+
+
+def _person() -> Any:
+    """Whoever opens the page; nothing goes on before."""
+    from guiderail.tools.operate.page_person import PagePerson
+
+    person = PagePerson(_tell)
+    person.wait()
+    return person
 
 
 def _rule(task: str) -> Any:

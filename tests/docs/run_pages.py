@@ -2,7 +2,8 @@
 
 A fenced block is one step. `python` is run, in one namespace a page; `sh` is a line of the command each; a block whose
 first line is `# file: NAME` is written to that file. A `text` block right after a step is what that step prints, where
-`...` stands for anything. Each page has an empty folder of its own. Prints one JSON object: page to what was wrong.
+`...` stands for anything. Of a notebook, the cells are run, and only they: what they print is no part of the page. Each
+page has an empty folder of its own. Prints one JSON object: page to what was wrong.
 """
 
 import contextlib
@@ -19,12 +20,14 @@ import traceback
 from pathlib import Path
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CELL = re.compile(r"^```\{code-cell\} (\w+)\n(?:---\n.*?^---\n)?(.*?)^```$", re.MULTILINE | re.DOTALL)
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 def steps(page: Path) -> list[tuple[str, str]]:
-    """Language and text of each block of a page."""
-    return FENCE.findall(page.read_text(encoding="utf-8"))
+    """Language and text of each block of a page, or of each cell of a notebook."""
+    text = page.read_text(encoding="utf-8")
+    return (CELL if "\nfile_format: mystnb\n" in text else FENCE).findall(text)
 
 
 def command(line: str) -> None:

@@ -43,6 +43,7 @@ class RunConfig:
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
     ledger: bool = True  # whether every control step is written down
     task_content: str = ""  # of a task folder: the digest of its files; empty where a run is older than that
+    with_person: bool = False  # whether a person watches; what was corrected is in the environment's via_points
 
     @property
     def hold(self) -> int:

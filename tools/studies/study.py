@@ -96,9 +96,9 @@ class Job:
         study, method = self.study, self.study.methods[self.method]
         choices = [study.learner, method.learner]
         given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
+        given["settings"] = {**study.learner.settings, **method.learner.settings}
         environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
-        settings = {**study.learner.settings, **method.learner.settings}
-        given |= {"imports": study.imports, "settings": settings, "seed": self.seed}
+        given |= {"imports": study.imports, "seed": self.seed}
         return configure(study.task, environment, episodes=max(episodes, 1), **given)
 
     @cached_property

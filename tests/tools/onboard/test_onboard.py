@@ -26,7 +26,7 @@ def call(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The simplest of the six; `tests/tools/onboard/parts.py` onboards all of them."""
+    """The simplest of the six; `learn_parts.py` beside this onboards and learns all of them."""
     where = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(where)
     call("onboard", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
