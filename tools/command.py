@@ -4,7 +4,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -249,27 +249,26 @@ def evaluate(
         str | None,
         _opt("Who else meets the same episodes, or none.  [default: zero, white and constant actions, and the rule]"),
     ] = None,
+    fresh: Annotated[bool, _opt("Draw anew in every episode what is hidden in the run.", "--fresh")] = False,
     as_json: Json = False,
 ) -> None:
     """Evaluate a run's policy on what training never met, beside policies that learned nothing.
 
     It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
-    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again.
+    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again. To be a policy
+    for the offset that a run hides, or with --fresh for any, are two claims: which of them, is printed first.
     """
     from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 
     environment = _environment(env)
     others = _beside(run, environment, beside)
-    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others)
+    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others, fresh=fresh)
     for name in others:
         if name not in found["beside"]:
             _say(f"{name} is left out: it sees or moves other things than this environment")
     differs = [] if as_json else found.pop("differs_from_thesis")
     _print(found, as_json)
-    if differs:
-        typer.echo("differs from the thesis in")
-    for words in differs:
-        typer.echo(f"  · {words}")
+    _print_differences(differs)
 
 
 @command("robustness runs/connector --env station=mujoco --episodes 50")
@@ -523,7 +522,10 @@ def study(
     from guiderail.tools.studies.study import study_command
 
     found = study_command(chosen, out, running)
+    differs = {} if as_json else found.pop("differs_from_thesis", {})
     _print(found, as_json)
+    for methods, words in differs.items():
+        _print_differences(words, f" ({methods})")
     if "failed" in found:
         raise RunsFailedError(found["failed"], None)
 
@@ -1006,6 +1008,14 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
 
     arguments = check_environment(shown, environment)
     return showing.Shown(shown, arguments, untrained(shown, policy), policy, policy, seed=seed)
+
+
+def _print_differences(differs: Sequence[str], of: str = "") -> None:
+    """In what something differs from the thesis, line by line."""
+    if differs:
+        typer.echo(f"differs from the thesis in{of}")
+    for words in differs:
+        typer.echo(f"  · {words}")
 
 
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:

@@ -12,6 +12,7 @@ from guiderail.diagrams.tasks.part_file import PartTaskFile
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
+from guiderail.tools.viewing import replay
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -50,7 +51,8 @@ def test_what_was_measured_is_what_was_drawn(folder):
     assert len(page) > 100_000
 
 
-def test_it_is_a_task(folder, tmp_path, capsys):
+def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(replay, "EPISODES", 1)
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
     call("evaluate", tmp_path / "run", "--episodes", 1, "--beside", "none", "--json")
