@@ -14,8 +14,9 @@ import numpy as np
 from guiderail.diagrams.make import known
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
-from guiderail.models.certificate.bounds import Bounds, Skill, certify
+from guiderail.models.certificate.bounds import certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files
+from guiderail.models.certificate.loop import Bounds, Skill
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder

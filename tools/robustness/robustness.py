@@ -130,7 +130,9 @@ def _policies(runs: Sequence[Path], environment: Mapping[str, Any], tell: Callab
     if differing:
         tell(f"the runs differ in {', '.join(differing)}")
     return [
-        _Who(name, partial(_always, Policy.load(folder.path)), config, config.environment | environment, _digest(folder))
+        _Who(
+            name, partial(_always, Policy.load(folder.path)), config, config.environment | environment, _digest(folder)
+        )
         for name, folder, config in zip(names, folders, configs, strict=True)
     ]
 

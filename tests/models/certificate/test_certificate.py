@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from guiderail.models.certificate import checker
-from guiderail.models.certificate.bounds import Skill, certify
+from guiderail.models.certificate.bounds import certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files, digest
+from guiderail.models.certificate.loop import Skill
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
 

@@ -57,7 +57,9 @@ def test_another_policy_in_the_folder_is_judged_anew(run, capsys):
     assert "demonstration 2/2" not in said
 
 
-def test_several_runs_are_in_one_table_and_a_further_one_costs_only_its_own_episodes(run, bead_config, tmp_path, capsys):
+def test_several_runs_are_in_one_table_and_a_further_one_costs_only_its_own_episodes(
+    run, bead_config, tmp_path, capsys
+):
     other = replace(bead_config, environment={**bead_config.environment, "guidance": "kmp"})
     train(RunFolder(tmp_path / "other"), other)
     told, out = [], tmp_path / "both"
