@@ -300,7 +300,7 @@ def robustness(
     typer.echo(found["picture"])
 
 
-@command("certify runs/passage")
+@command("certify runs/passage --attack 1000000")
 def certify(
     of: Annotated[str, _arg("The folder of a run; or a task, with --out: {tasks}.", "RUN or TASK")],
     env: Env = None,
@@ -308,22 +308,30 @@ def certify(
     start_within: Annotated[
         float | None, _opt("How far beside its start the robot may begin, in the outputs' units.")
     ] = None,
+    attack: Annotated[int, _opt("How many steps an adversary tries to leave the bounds.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Bound what a skill can command for all actions, and have the bounds checked by a program that knows no guiderail.
 
-    The certificate lists what it assumes. Check it anywhere: python checker.py FOLDER, with NumPy alone.
+    The certificate lists what it assumes. Check it anywhere: python checker.py FOLDER, with NumPy alone. An attack
+    says how tight it is: the bounds beside the worst that an adversary found, straight through the primitive.
     """
     from guiderail.tools.certify import certify_skill
 
-    found = certify_skill(of, _environment(env), out=out, start_within=start_within)
+    found = certify_skill(of, _environment(env), out=out, start_within=start_within, attack=attack)
+    rows = found.get("attack", [])
     if as_json:
         typer.echo(json.dumps(found))
     else:
         for name, value in found.items():
+            if name == "attack":
+                continue
             words = ", ".join("–" if x is None else f"{x:.4g}" for x in value) if isinstance(value, list) else value
             typer.echo(f"{name.replace('_', ' ')}: {words}")
-    if found["checker"] != "yes":
+        if rows:
+            table = Path(found["certificate"]).with_name("attack.md")
+            typer.echo(table.read_text(encoding="utf-8"))
+    if found["checker"] != "yes" or any(row["left"] for row in rows):
         raise typer.Exit(1)
 
 

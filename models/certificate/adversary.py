@@ -65,6 +65,11 @@ class Adversary:
             np.full(shape, np.inf), np.full(shape, -np.inf), np.zeros((2, len(self._moved))), np.zeros((2, shape[1])),
         )  # fmt: skip
 
+    @property
+    def middle(self) -> np.ndarray:
+        """The motion without actions, (N, O)."""
+        return self._middle[self._past :]
+
     def attack(self, steps: int) -> Found:
         """Tries sequences until so many steps were executed, and goes on where the last call ended."""
         goal = self.found.steps + steps

@@ -1,10 +1,9 @@
 """Checks a certificate: `python checker.py FOLDER`. It needs NumPy alone, and nothing of what made the certificate.
 
-It forms problem 4.5 at every step anew from the kernel and the demonstrations, and adds up what all sequences of actions
-can come to. It says yes, or no and where. Exit code 0 or 1; 2 if a file can't be read.
+It forms problem 4.5 at every step anew from the kernel and the demonstrations, and adds up what all sequences of
+actions can come to. It says yes, or no and where. Exit code 0 or 1; 2 if a file can't be read:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹
-W maps the history h on the window and C is the kernel given the history. A correction for constraints G y ≥ c with
-multipliers α ≥ 0 moves the window by S Gᵀ α; its squared size is αᵀ G S Gᵀ α.
+W maps the history h on the window, C is the kernel given h; multipliers α ≥ 0 of constraints move it by v = S Gᵀ α.
 """
 
 import hashlib
@@ -66,7 +65,8 @@ class Primitive:
         self.beta, self.hbar = float(p["beta"]), float(p["lambda"]) + float(p["beta"])
         self.noise, self.inverse_length = self.hbar * float(p["history_variance"]), float(p["inverse_length"])
         self.inputs = p["inputs"].astype(np.longdouble)
-        require(len(self.inputs) == self.past + self.steps + self.horizon, "the clock has not one time for each step")
+        clock, times = np.diff(self.inputs.astype(float)), self.past + self.steps + self.horizon
+        require(len(clock) == times - 1 and np.allclose(clock, clock[0]), "the clock is not even, or not the steps'")
         self.G = np.broadcast_to(p["G"], (self.steps, *p["G"].shape[-2:]))
         self.c = np.broadcast_to(p["c"], (self.steps, p["c"].shape[-1]))
         self.known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
@@ -92,8 +92,7 @@ class Primitive:
         F_bar = np.kron(F, np.eye(outs))
         L = np.linalg.solve(np.linalg.cholesky((M + M.T) / 2 + self.hbar * np.eye(len(M))), F_bar.T).T
         weigh = np.einsum("joa,jop->jpa", L.reshape(len(at), outs, -1), precision).reshape(F_bar.shape[0], -1)
-        W_bar = np.kron(W, np.eye(outs))
-        history = W_bar - L @ (weigh.T @ W_bar)
+        history = (W_bar := np.kron(W, np.eye(outs))) - L @ (weigh.T @ W_bar)
         rows = np.einsum("jfo,jk->jfko", self.G[at], np.eye(len(at))).reshape(-1, F_bar.shape[0])
         offset = L @ (weigh.T @ self.means[at].ravel())
         return history, self.beta * L @ L[:outs].T, offset, L, rows, self.c[at].ravel()
@@ -117,8 +116,7 @@ class Primitive:
             history, action, offset, L, rows, c = self.window(n)
             maps[n], y = history[:outs], history @ middle[n : P + n].ravel() + offset
             g = history @ spread[n : P + n].reshape(P * outs, N * A + outs)
-            by = action[:, moved] * p["gains"][moved]
-            g[:, n * A : (n + 1) * A] += by
+            g[:, n * A : (n + 1) * A] += (by := action[:, moved] * p["gains"][moved])
             middle[P + n], spread[P + n] = y[:outs], g[:outs]
             touches = len(c) > 0 and (rows @ y - np.abs(rows @ g).sum(axis=1) < c - KEEPS).any()
             require(claimed[n] or not touches, f"step {n}: a constraint can be active there")
@@ -142,8 +140,10 @@ class Primitive:
             free[name] = np.concatenate([np.zeros((order, outs)), change])[-N:] / period**order
         low = np.where(off, np.maximum(corrected[0], least), free["lower"])
         high = np.where(off, np.minimum(corrected[1], greatest), free["upper"])
-        always = {"lower": low, "upper": high}
-        begin = [np.tile(p["start"] + side * p["start_within"], (2, 1)) for side in (-1, 1)]
+        always, begin = (
+            {"lower": low, "upper": high},
+            [np.tile(p["start"] + side * p["start_within"], (2, 1)) for side in (-1, 1)],
+        )
         low, high = np.vstack([begin[0], low]), np.vstack([begin[1], high])
         off = np.vstack([np.zeros((2, outs), bool), off])
         near = [off[1:-1] | off[2:], off[:-2] | off[1:-1] | off[2:]]
@@ -154,9 +154,9 @@ class Primitive:
             always[name] = np.where(moves, new / period ** (order + 1), free[name])
         return {"free": free, "always": always}
 
-    def budgeted(self, p: Arrays, w: Arrays, claims: Any, found: tuple[np.ndarray, ...]) -> Arrays:
-        """The third regime's. Prices of commands at other steps, which keep their constraints, can only prove bounds."""
-        (middle, spread, _, maps), P, N, outs = found, self.past, self.steps, self.outputs
+    def budgeted(self, p: Arrays, w: Arrays, claims: Any, reached: tuple[np.ndarray, ...]) -> Arrays:
+        """The third regime's. Prices of commands at other steps, which keep their constraints, only prove bounds."""
+        (middle, spread, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
         first, U = int(np.argmax(w["touched"])), np.flatnonzero(p["gains"] == 0)
         A, late, more = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)))
         budgets = [np.array(claims["budgeted"]["excess"]), np.array(claims["budgeted"]["residue"])[:, U]]
@@ -179,16 +179,16 @@ class Primitive:
                 value += (np.sort(np.abs(part).reshape(outs, late, -1), axis=1)[:, ::-1] * spent).sum(axis=(1, 2))
             most[order, side, n] = value
         moves = [most[order].max(axis=0) / claims["period"] ** order for order in (1, 2)]
-        return dict(zip(QUANTITIES, (np.maximum(-most[0, 1], least), np.minimum(most[0, 0], greatest), *moves)))
+        found = np.maximum(-most[0, 1], least), np.minimum(most[0, 0], greatest), *moves
+        return dict(zip(QUANTITIES, found, strict=True))
 
 
 def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alphas: np.ndarray) -> tuple[Any, Any]:
     """What step n commands in cells of actions: corners' mean correction is feasible, v within ‖v̄‖² − ‖v‖² of it."""
-    (rows_L, rows, c), outs = kept, len(L)
-    A, alphas = by.shape[1], alphas.reshape(len(alphas), -1)
+    (rows_L, rows, c), outs, A, alphas = kept, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
     along = round(len(alphas) ** (1 / A)) - 1
-    require(along >= 1 and (along + 1) ** A == len(alphas), f"step {n}: not every corner of the actions is shown")
-    require((alphas >= 0).all() and alphas.shape[1] == len(c), f"step {n}: these are no multipliers")
+    fine = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
+    require(fine, f"step {n}: these are not the multipliers of every corner of the actions")
     places = np.array(list(itertools.product(range(along + 1), repeat=A)))
     free = y + (2.0 * places / along - 1.0) @ by.T
     v, short = alphas @ rows_L, c - free @ rows.T
@@ -212,8 +212,8 @@ def compare(claims: dict[str, Any], found: dict[str, Arrays]) -> None:
     for regime, name in itertools.product(found, QUANTITIES):
         claimed = np.array(claims[regime][name], dtype=float)  # null is NaN: nothing is known
         mine = np.where(np.isinf(found[regime][name]), np.nan, found[regime][name])
-        require(claimed.shape == mine.shape, f"{regime} {name} has not a bound for each step and output")
-        require((np.isnan(claimed) == np.isnan(mine)).all(), f"{regime} {name} is known where it is not, or unknown")
+        fits = claimed.shape == mine.shape and (np.isnan(claimed) == np.isnan(mine)).all()
+        require(fits, f"{regime} {name} is not known of each step and output of which it is")
         scale = np.maximum(np.nan_to_num(np.abs(mine)).max(axis=0), 1e-9)
         wrong = np.nan_to_num(np.abs(claimed - mine), posinf=np.inf) / scale
         n, o = np.unravel_index(int(wrong.argmax()), wrong.shape)
@@ -223,11 +223,8 @@ def compare(claims: dict[str, Any], found: dict[str, Arrays]) -> None:
 def check(folder: Path) -> None:
     """Raises `Rejected` unless the certificate in a folder holds."""
     p, witness, claims = read(folder)
-    period = float(claims["period"])
-    require(period > 0 and claims["format"] == "guiderail certificate 1", "the format or the period is none")
-    primitive = Primitive(p)
-    clock = np.diff(primitive.inputs[primitive.past : primitive.past + primitive.steps]).astype(float)
-    require(np.allclose(clock, clock[0]), "the clock is not even, and speeds would have no one period")
+    primitive, period = Primitive(p), float(claims["period"])
+    require(period > 0 and claims["format"] == "guiderail certificate 2", "the format or the period is none")
     found = primitive.bounds(p, reached := primitive.reach(p, witness), period)
     if "budgeted" in claims:
         third, before = primitive.budgeted(p, witness, claims, reached), np.cumsum(witness["touched"])[:, None] == 0
@@ -249,7 +246,5 @@ if __name__ == "__main__":
         check(Path(sys.argv[1]))
         print("yes")
     except (Rejected, OSError, KeyError, ValueError, TypeError, IndexError, np.linalg.LinAlgError) as why:
-        print(
-            f"no: {why}" if isinstance(why, Rejected) else f"no: the files make no sense ({type(why).__name__}: {why})"
-        )
+        print("no:", why if isinstance(why, Rejected) else f"the files make no sense, {why!r}")
         sys.exit(1 if isinstance(why, Rejected) else 2)

@@ -16,7 +16,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.primitives.kernels import SquaredExponential
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"
-FORMAT = "guiderail certificate 1"
+FORMAT = "guiderail certificate 2"
 ASSUMPTIONS = (
     "actions are numbers in [-1, 1], as the environment and the skill's diagram clip them, held for any time",
     "the skill is executed from its first step to its last, at the period given, and begins at rest within the start",
