@@ -24,7 +24,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
-from guiderail.tools.tasks import check_environment
+from guiderail.tools.tasks import changed_environment, check_environment
 
 CERTIFIED = ("kmp", "kgrl", "skgrl")  # guidance whose law this is
 SEARCH = 40_000  # steps of the adversary whose worst corrections make the budgets
@@ -53,8 +53,8 @@ def certify_skill(
             them, in `attack.csv`.
 
     Returns:
-        Numbers of the regimes, the files' folder, and the checker's word; of an attack `table`, its rows, and what
-        budgets it found.
+        Numbers of the regimes, the files' folder, and the checker's word; of an attack the table's rows, and which
+        part of its budgets corrections spent.
 
     Raises:
         InputError: if there is no such run or task, or its guidance follows no law that is certified.
@@ -171,7 +171,7 @@ def _what(of: str, environment: Mapping[str, Any]) -> tuple[str, dict[str, Any],
     config = RunFolder(Path(of)).config()
     content = (Path(of) / "config.yaml").read_bytes()
     about = {"task": config.task, "config.yaml": hashlib.sha256(content).hexdigest()}
-    return config.task, config.environment | dict(environment), about
+    return config.task, changed_environment(config.task, config.environment, environment), about
 
 
 def _largest(bounds: Bounds) -> dict[str, list[float | None]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,13 @@ class PartTaskFile(Options):
     explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
     measured: dict[str, Any] = Field({}, description="what onboarding measured; nothing reads it")
 
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that it names, beside it."""
+        models = (self.plug, self.socket)
+        meshes = [*(model.visual for model in models), *(piece.file for model in models for piece in model.pieces)]
+        return (*meshes, self.demonstrations.file, *self.scenario)
+
     @cached_property
     def turn(self) -> float:
         """The turn at the bottom [rad]."""
@@ -164,12 +172,23 @@ def read_task_file(folder: Path) -> PartTaskFile:
     if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
         raise InputError(f"{path} is no task: its first line must be 'format: {FILE_FORMAT}'")
     file = validated(PartTaskFile, data, str(path))
-    named = [model.visual for model in (file.plug, file.socket)]
-    named += [piece.file for model in (file.plug, file.socket) for piece in model.pieces]
-    for name in (*named, file.demonstrations.file, *file.scenario):
+    for name in file.files:
         if not (folder / name).is_file():
             raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or onboard the parts again")
     return file
+
+
+def task_folder_digest(folder: Path) -> str:
+    """A digest of what decides a task: what its file says but for what was measured, and the files that it names.
+
+    Raises:
+        InputError: as `read_task_file`.
+    """
+    file = read_task_file(folder)
+    found = hashlib.blake2b(file.model_dump_json(exclude={"measured"}).encode(), digest_size=16)
+    for name in file.files:
+        found.update(hashlib.blake2b((folder / name).read_bytes()).digest())
+    return found.hexdigest()
 
 
 def write_task_file(folder: Path, file: PartTaskFile) -> Path:

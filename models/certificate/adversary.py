@@ -105,9 +105,8 @@ class Adversary:
         np.minimum(found.lower, commands, out=found.lower)
         np.maximum(found.upper, commands, out=found.upper)
         for name, most, spent in (("excess", found.excess, excess), ("residue", found.residue, residue)):
-            for o, value in enumerate(spent[1]):
-                if value > most[1, o]:
-                    found.best[name, o, True] = (float(value), actions, start)
+            for o in np.flatnonzero(spent[1] > most[1]):
+                found.best[name, int(o), True] = (float(spent[1, o]), actions, start)
             np.maximum(most, spent, out=most)
         for name, values in self._measured(commands, start).items():
             np.maximum(self.found.most[name], values, out=self.found.most[name])
@@ -156,7 +155,7 @@ class Adversary:
     def _changed(self) -> tuple[np.ndarray, np.ndarray]:
         """A stretch of the worst so far of some quantity, turned over, moved in time or drawn anew."""
         best, rng = self.found.best, self._rng
-        if not best:
+        if not best or not len(self._moved):
             return self._deflections()
         _, actions, start = best[list(best)[rng.integers(len(best))]]
         actions = actions.copy()

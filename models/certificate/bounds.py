@@ -91,7 +91,7 @@ def nodes(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
     places = list(itertools.product(range(along + 1), repeat=len(moved)))
     number = {place: i for i, place in enumerate(places)}
     raw = np.zeros((len(places), len(gains)))
-    raw[:, moved] = (2.0 * np.array(places).reshape(-1, len(moved)) / along - 1.0) * gains[moved]
+    raw[:, moved] = (2.0 * np.array(places).reshape(len(places), len(moved)) / along - 1.0) * gains[moved]
     cells = [
         [number[tuple(np.add(first, step))] for step in itertools.product((0, 1), repeat=len(moved))]
         for first in itertools.product(range(along), repeat=len(moved))

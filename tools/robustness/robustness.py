@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,7 +23,9 @@ from guiderail.tools.robustness.picture import draw
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, judged_once
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.rollouts.suited import as_learned
 from guiderail.tools.tables import write_table
+from guiderail.tools.tasks import changed_environment
 
 EPISODES = 30  # of each who at each place
 POLICY, DEMONSTRATION = "policy", "demonstration"  # names in the table
@@ -106,8 +109,8 @@ def robustness(
             rows.append(_row(place, one.name, judged))
     if not rows:
         raise InputError("none of these axes can be changed here: choose others with --axes")
-    table = write_table(out / "robustness", rows).with_suffix(".csv")
-    picture = draw(out / "robustness.png", rows)
+    table = write_table(out / f"{_called(axes, environment or {})}.csv", rows).with_suffix(".csv")
+    picture = draw(table.with_suffix(".png"), rows)
     return {"table": table, "picture": picture, "rows": rows, "policies": [one.name for one in policies]}
 
 
@@ -124,21 +127,16 @@ def _policies(runs: Sequence[Path], environment: Mapping[str, Any], tell: Callab
     names = [POLICY] if len(runs) == 1 else kinds if len(set(kinds)) == len(kinds) else [run.name for run in runs]
     if len(set(names)) < len(names):
         raise InputError("runs that are compared are different ones, in folders of different names")
-    asked: list[dict[str, Any]] = [{"seed": config.seed, **config.environment, **environment} for config in configs]
+    where = [changed_environment(config.task, config.environment, environment) for config in configs]
+    asked: list[dict[str, Any]] = [{"seed": config.seed, **one} for config, one in zip(configs, where, strict=True)]
     everything = sorted({key for one in asked for key in one})
     differing = [key for key in everything if any(one.get(key) != asked[0].get(key) for one in asked)]
     if differing:
         tell(f"the runs differ in {', '.join(differing)}")
     return [
-        _Who(
-            name, partial(_always, Policy.load(folder.path)), config, config.environment | environment, _digest(folder)
-        )
-        for name, folder, config in zip(names, folders, configs, strict=True)
+        _Who(name, partial(as_learned, Policy.load(folder.path)), config, one, _digest(folder))
+        for name, folder, config, one in zip(names, folders, configs, where, strict=True)
     ]
-
-
-def _always(policy: Policy, env: gymnasium.Env) -> Act:
-    return policy
 
 
 def _digest(folder: RunFolder) -> str:
@@ -160,13 +158,20 @@ def _places(who: Sequence[_Who], axes: Sequence[Axis], tell: Callable[[str], Non
     return sorted((pair for pairs in found for pair in pairs), key=lambda pair: order[pair[1].axis.name, pair[1].value])
 
 
+def _called(axes: str | None, environment: Mapping[str, Any]) -> str:
+    """The name of a table, by what was asked for: another question does not replace its answer."""
+    asked = [] if axes is None else [axis.name for axis in chosen_axes(axes)]
+    asked += [f"{key}={value}" for key, value in sorted(environment.items())]
+    return re.sub(r"[^\w.=-]+", "_", "-".join(["robustness", *asked]))
+
+
 def _row(place: Point, name: str, judged: pd.DataFrame) -> dict[str, Any]:
     successes = int(judged["success"].sum())
     low, high = wilson(successes, len(judged))
     return {
         "axis": place.axis.name,
         "value": float(place.value),
-        "trained": float(place.axis.trained),
+        "trained": None if place.trained is None else float(place.trained),
         "words": place.axis.words,
         "who": name,
         "episodes": len(judged),
