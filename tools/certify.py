@@ -27,7 +27,7 @@ from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import changed_environment, check_environment
 
 CERTIFIED = ("kmp", "kgrl", "skgrl")  # guidance whose law this is
-SEARCH = 40_000  # steps of the adversary whose worst corrections make the budgets
+SEARCH = 100_000  # steps of the adversary whose worst corrections make the budgets
 MARGIN = 1.5  # of the budgets, over what it found
 ALIKE = 1.0 + 1e-6  # rounding, where an adversary reaches a bound that is exact
 LEAST_EXCESS = ((0.01,), (0.1,))  # of them, in actions: at one step, and in all
@@ -90,8 +90,8 @@ def certify_skill(
     )
     budget = None
     if primitive.history:
-        seen = Adversary(skill, np.ones(primitive.num_steps, bool), seed=SEARCH).attack(SEARCH)
-        budget = Budget(MARGIN * seen.excess + np.array(LEAST_EXCESS), MARGIN * seen.residue)
+        spent = Adversary(skill, np.ones(primitive.num_steps, bool), seed=SEARCH, spends=True).attack(SEARCH)
+        budget = Budget(MARGIN * spent.excess + np.array(LEAST_EXCESS), MARGIN * spent.residue)
     certified = certify(skill, budget)
     pushes = Impedance() if primitive.num_outputs == len(Impedance().stiffness) else None
     stiffness = None if pushes is None else options.get("stiffness_factor", 1.0) * np.array(pushes.stiffness)

@@ -45,20 +45,28 @@ class Found:
 class Adversary:
     """Looks for the worst sequences of actions of a skill."""
 
-    def __init__(self, skill: Skill, constrained: np.ndarray, seed: int = 0):
+    def __init__(self, skill: Skill, constrained: np.ndarray, seed: int = 0, spends: bool = False):
         """
         Args:
             skill: what is attacked.
             constrained: (N,), at which steps a constraint can be active; the worst is looked for with and without.
             seed: of all that is drawn.
+            spends: whether it changes what spent most of the budgets of corrections, rather than what came farthest.
         """
         primitive = skill.primitive
-        self._skill, self._rng = skill, np.random.default_rng(seed)
+        self._skill, self._rng, self._spends = skill, np.random.default_rng(seed), spends
         self._moved = np.flatnonzero(skill.gains)
         self._past = primitive.history
         self._middle, self._generators = reach(skill)
         self._responses = [primitive.linear_response(n) for n in range(primitive.num_steps)]
         self._where = {True: constrained, False: ~constrained}
+        self._farthest = [
+            self._far(order, o, steps)
+            for order in range(len(QUANTITIES))
+            for o in range(primitive.num_outputs)
+            for steps in map(np.flatnonzero, self._where.values())
+            if len(steps)
+        ]
         shape = (primitive.num_steps, primitive.num_outputs)
         self.found = Found(
             {name: np.zeros(shape) for name in QUANTITIES},
@@ -105,14 +113,16 @@ class Adversary:
         np.minimum(found.lower, commands, out=found.lower)
         np.maximum(found.upper, commands, out=found.upper)
         for name, most, spent in (("excess", found.excess, excess), ("residue", found.residue, residue)):
-            for o in np.flatnonzero(spent[1] > most[1]):
-                found.best[name, int(o), True] = (float(spent[1, o]), actions, start)
+            for o, value in enumerate(spent[1]):
+                if value > most[1, o]:
+                    found.best[name, o, True] = (float(value), actions, start)
             np.maximum(most, spent, out=most)
         for name, values in self._measured(commands, start).items():
             np.maximum(self.found.most[name], values, out=self.found.most[name])
             for constrained, steps in self._where.items():
                 for o, value in enumerate(values[steps].max(axis=0, initial=0.0)):
-                    if value > self.found.best.get((name, o, constrained), (0.0,))[0]:
+                    before = self.found.best.get((name, o, constrained))
+                    if before is None or value > before[0]:
                         self.found.best[name, o, constrained] = (float(value), actions, start)
 
     def _measured(self, commands: np.ndarray, start: np.ndarray) -> dict[str, np.ndarray]:
@@ -142,22 +152,34 @@ class Adversary:
     def _signs(self) -> tuple[np.ndarray, np.ndarray]:
         """What goes farthest where no constraint is active, in one quantity at one step."""
         rng, steps, size = self._rng, self._skill.primitive.num_steps, len(self._moved)
-        order, o = int(rng.integers(3)), int(rng.integers(self._generators.shape[1]))
-        n = int(rng.integers(steps - order)) + order
-        response = np.diff(self._generators[self._past + n - order : self._past + n + 1, o], order, axis=0)[0]
-        along = rng.choice([-1.0, 1.0]) * response
+        if self._farthest:
+            order, o, n, side = self._farthest.pop()
+        else:
+            order, o = int(rng.integers(3)), int(rng.integers(self._generators.shape[1]))
+            n, side = int(rng.integers(steps - order)) + order, float(rng.choice([-1.0, 1.0]))
+        row = self._past + n
+        along = side * np.diff(self._generators[row - order : row + 1, o], order, axis=0)[0]
         signs = np.sign(along[: steps * size].reshape(steps, size))
         fill, start = self._deflections()
         if len(along) > steps * size:
             start = self._skill.start + np.sign(along[steps * size :]) * self._skill.start_within
         return np.where(signs == 0.0, fill, signs), start
 
+    def _far(self, order: int, o: int, steps: np.ndarray) -> tuple[int, int, int, float]:
+        """Where, of some steps, an output can go farthest while it is free, and to which side."""
+        steps = steps[steps >= order] if (steps >= order).any() else np.array([order])
+        middle = np.diff(self._middle[:, o], order)[self._past + steps - order] * (order > 0)
+        size = np.abs(np.diff(self._generators[:, o], order, axis=0)).sum(axis=1)[self._past + steps - order]
+        best = int(np.argmax(np.abs(middle) + size))
+        return order, o, int(steps[best]), -1.0 if middle[best] < 0.0 else 1.0
+
     def _changed(self) -> tuple[np.ndarray, np.ndarray]:
         """A stretch of the worst so far of some quantity, turned over, moved in time or drawn anew."""
         best, rng = self.found.best, self._rng
-        if not best or not len(self._moved):
+        names = [name for name in best if (name[0] not in QUANTITIES) or not self._spends]
+        if not names or not len(self._moved):
             return self._deflections()
-        _, actions, start = best[list(best)[rng.integers(len(best))]]
+        _, actions, start = best[names[rng.integers(len(names))]]
         actions = actions.copy()
         for _ in range(rng.integers(1, 4)):
             first = rng.integers(len(actions))
