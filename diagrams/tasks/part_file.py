@@ -9,18 +9,23 @@ from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.options import Number, Numbers, Options, validated
+from guiderail.diagrams.stations.station import ContactOptions
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE, REPEATED
+from guiderail.models.parts.sides import SIDES
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import LinearConstraints
+from guiderail.models.registry import did_you_mean
 from guiderail.models.units import DEGREE, MM
 from guiderail.models.yaml_files import load_yaml
 
 FILE_NAME = "task.yaml"
 FILE_FORMAT = "guiderail task 1"
 NAMESPACE = "parts"
+_LARGEST = float(np.finfo(float).max)
 
 
 class Piece(Options):
@@ -70,17 +75,31 @@ class Bounds(Options):
     lower: tuple[Any, ...]
     upper: tuple[Any, ...]
     phases: tuple[Number, ...] | None = Field(
-        None, description="where in the motion each list begins to hold, from 0 to 1"
+        None, min_length=1, validate_default=True, description="where in the motion each list begins to hold, from 0 on"
     )
 
     @field_validator("lower", "upper")
     @classmethod
     def _are_numbers(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
         rows = value if value and isinstance(value[0], list | tuple) else (value,)
-        for row in rows:
-            if len(row) != POSE_SIZE or not all(one is None or isinstance(one, int | float) for one in row):
-                raise ValueError("bounds are six numbers each, [x y z Rz Ry Rx], null where there is none")
+        if not all(_is_row(row) for row in rows):
+            raise ValueError("bounds are six finite numbers each, [x y z Rz Ry Rx], null where there is none")
         return value
+
+    @field_validator("phases")
+    @classmethod
+    def _fit(cls, phases: tuple[float, ...] | None, others: ValidationInfo) -> tuple[float, ...] | None:
+        if not {"lower", "upper"} <= others.data.keys():
+            return phases  # what is wrong with those is said of them
+        lower, upper = _filled(others.data["lower"], -np.inf), _filled(others.data["upper"], np.inf)
+        if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
+            raise ValueError("bounds that change need phases, and a list of lower and of upper ones for each")
+        if phases is not None and (phases[0] != 0.0 or any(np.diff([*phases, 1.0]) <= 0.0)):
+            raise ValueError("phases begin at 0, increase, and are below 1")
+        for bound in (np.isfinite(lower), np.isfinite(upper)):
+            if phases is not None and (bound.any(axis=0) != bound.all(axis=0)).any():
+                raise ValueError("an output is bounded in every phase or in none")
+        return phases
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper, each (6,) or one row a phase (K, 6), infinite where there is none."""
@@ -89,17 +108,19 @@ class Bounds(Options):
     def constraints(self, num_steps: int) -> LinearConstraints:
         """G y ≥ c: the same at each of N steps, or those of the phase that a step is in."""
         lower, upper = self.arrays()
-        if lower.ndim == 1:
+        if self.phases is None:
             return LinearConstraints.box(lower, upper)
-        if self.phases is None or len(self.phases) != len(lower) or lower.shape != upper.shape:
-            raise InputError("bounds that change need phases, and a list of lower and of upper ones for each")
         phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, num_steps), side="right") - 1
-        lows, highs = (bound[np.clip(phase, 0, len(lower) - 1)] for bound in (lower, upper))
-        bounded = [np.isfinite(lower).all(axis=0), np.isfinite(upper).all(axis=0)]
-        eye = np.eye(POSE_SIZE)
-        G = np.concatenate([eye[bounded[0]], -eye[bounded[1]]])
-        c = np.concatenate([lows[:, bounded[0]], -highs[:, bounded[1]]], axis=1)
-        return LinearConstraints(np.tile(G, (num_steps, 1, 1)), c)
+        return LinearConstraints.box(lower[phase], upper[phase])
+
+
+def _is_row(row: Any) -> bool:
+    # Asked this way round, what is no number is none either, and so is one that no double holds.
+    return (
+        isinstance(row, list | tuple)
+        and len(row) == POSE_SIZE
+        and all(one is None or (type(one) in (int, float) and abs(one) <= _LARGEST) for one in row)
+    )
 
 
 def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
@@ -118,10 +139,26 @@ class Shown(Options):
     file: str = Field("demonstrations.npz", description=".npz or .csv, poses in the target frame")
     components: int | None = Field(None, ge=1, description="of their mixture; by information criterion unless given")
     floor: Numbers = Field(
-        (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE),
-        min_length=6,
-        max_length=6,
-        description="standard deviation that a hand has anyway [m], [rad]",
+        REPEATED, min_length=6, max_length=6, description="standard deviation that a hand has anyway [m], [rad]"
+    )
+
+
+class Recommended(Options):
+    """How it is learned where nobody says otherwise."""
+
+    environment: dict[str, Any] = Field(
+        {
+            "uncertainty": "disc",
+            "offset_range": (1.0 * MM, 1.5 * MM),
+            "observation": "lever",
+            "reward": "aligned",
+            "hold": 5,
+        },
+        description="options of the environment",
+    )
+    learner: dict[str, Any] = Field(
+        {"algorithm": "tqc", "preset": "robust", "settings": {"symmetry": "near"}},
+        description="algorithm, preset, and settings in place of the preset's",
     )
 
 
@@ -137,14 +174,28 @@ class PartTaskFile(Options):
     motion: MotionNumbers
     tolerance: Tolerance = Tolerance.model_validate({})
     bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
-    offset_range: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="distance of the socket from its place [m], the task's own"
-    )
-    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
+    time_step: Number | None = Field(None, gt=0, description="of the simulation [s]; its own unless given")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
     demonstrations: Shown = Shown.model_validate({})
     explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
+    sides: tuple[str, ...] = Field((), description="from which the parts look the same: see models/parts/sides.py")
+    rim_sides: tuple[str, ...] = Field((), description="from which a plug on the rim feels nearly the same")
+    recommended: Recommended = Recommended.model_validate({})
     measured: dict[str, Any] = Field({}, description="what onboarding measured; nothing reads it")
+
+    @field_validator("time_step")
+    @classmethod
+    def _is_a_time_step(cls, value: float | None) -> float | None:
+        return ContactOptions(time_step=value).time_step
+
+    @field_validator("sides", "rim_sides")
+    @classmethod
+    def _are_sides(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for name in value:
+            if name not in SIDES:
+                raise ValueError(f"there is no side {name!r}: {did_you_mean(name, SIDES)}")
+        return value
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -18,39 +18,42 @@ from guiderail.diagrams.options import Number
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.part_workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
-from guiderail.diagrams.tasks.bnc_rewards import reward_terms
+from guiderail.diagrams.task import Symmetry
+from guiderail.diagrams.tasks.bnc_observation import sides_of_the_rim
+from guiderail.diagrams.tasks.bnc_rewards import REWARDS, reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
-from guiderail.diagrams.tasks.part_file import FILE_NAME, PartTaskFile, read_task_file
+from guiderail.diagrams.tasks.own_demonstrations import reference_of_file
+from guiderail.diagrams.tasks.part_file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.task import Choice, Threshold
-from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE, COMMAND_SCALE, LEAST_FORCE, LEVER_SCALE, RHO
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.parts.model_files import part_sdf
+from guiderail.models.parts.sides import SIDES
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.models.units import DEGREE, MM
+from guiderail.models.writing import write_atomically
 from guiderail.systems.contact_lever import ContactLever
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
 COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
-RHO = 1e-11  # ρ [m², rad²], as the connector's
-LEAST_FORCE = 0.5  # [N] with which the plug stands on something
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
-LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 
 
 class PartOptions(HiddenPlace):
     """Of a task of two meshes."""
 
     start_beside: Number = Field(0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]")
-    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
 
 
 class PartInsertion(InsertionTask):
-    """Insert a plug into a socket: "sparse" costs action and force and rewards the end, "shaped" adds the depth gained.
+    """Insert a plug into a socket: "sparse" costs action and force and rewards the end, "shaped" adds the depth gained,
+    "aligned" nearness to the socket's axis, too.
 
     Attributes:
         folder: of the task.
@@ -60,7 +63,7 @@ class PartInsertion(InsertionTask):
     Options = PartOptions
     options: PartOptions
     workpiece, fixture = PLUG, SOCKET
-    rewards = ("sparse", "shaped")
+    rewards = REWARDS
     observations = ("state", "lever")
     isotropic_groups = ((0, 1, 2), (3, 4, 5))
     folder: ClassVar[Path]
@@ -74,16 +77,26 @@ class PartInsertion(InsertionTask):
 
     def world(self) -> PartWorkcell:
         """The socket in the world, the plug in the tool."""
+        return self._workcell
+
+    @cached_property
+    def _workcell(self) -> PartWorkcell:
         return workcell(self.folder, self.file)
 
     def reference(self) -> ReferenceTrajectory:
         """Of the folder's demonstrations."""
-        path = self.folder / self.file.demonstrations.file
-        return _reference(path, path.stat().st_mtime_ns, self.file.demonstrations)
+        shown = self.file.demonstrations
+        return reference_of_file(self.folder / shown.file, shown.components, shown.floor)
 
     def constraints(self) -> LinearConstraints:
         """The folder's bounds."""
         return self.file.bounds.constraints(self.reference().num_steps)
+
+    @classmethod
+    def knows(cls) -> tuple[str, ...]:
+        """As of every task; but what is to be kept out of can't change on the way."""
+        changes = cls.file.bounds.phases is not None
+        return tuple(one for one in super().knows() if not (one == "keep_out" and changes))
 
     def keep_out(self) -> KeepOut:
         """No walls are known: what safe residual learning is projected to are the bounds alone."""
@@ -107,13 +120,27 @@ class PartInsertion(InsertionTask):
         return (*state, Observed("lever", 0.0, LEVER_SCALE), Observed("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Of actions, forces and the end; of depth where the reward is shaped."""
+        """Of actions, forces and the end; of depth and nearness where the reward says so."""
         return reward_terms(self.choice.reward, num_actions)
 
     def conditions(self) -> list[Condition]:
         """At the target for a while, or pushed too hard."""
         seated = Condition("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
         return [seated, self.force_limit()]
+
+    def symmetry(self) -> Symmetry | None:
+        """The sides from which both parts look the same."""
+        return self._seen_from(self.file.sides)
+
+    def near_symmetry(self) -> Symmetry | None:
+        """And those from which a plug on the rim feels nearly the same."""
+        return self._seen_from((*self.file.sides, *self.file.rim_sides))
+
+    def _seen_from(self, names: Sequence[str]) -> Symmetry | None:
+        explored = self.choice.values["explored"]
+        every = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if explored is None else explored)
+        chosen = [number for number, name in enumerate(SIDES) if name in names]
+        return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
 
     @classmethod
     def is_seated(cls, plug: np.ndarray) -> bool:
@@ -134,11 +161,11 @@ class PartInsertion(InsertionTask):
         world.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
-        """Where the demonstrations start, or somewhere beside it."""
+        """Where the demonstrations start, or somewhere beside it, inside the bounds."""
         start = self.reference().means[0].copy()
         if self.options.start_beside > 0.0:
             start[:2] += in_ring(rng, 0.0, self.options.start_beside)
-        return start
+        return self.constraints().nearest(start)
 
     def camera(self) -> Camera:
         """Looks slightly down at the socket."""
@@ -147,16 +174,16 @@ class PartInsertion(InsertionTask):
         return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=6 * size, height=3 * size))
 
     def scene(self) -> Scene:
-        """The demonstrations, and the box that commands stay in."""
+        """The demonstrations, and the box that commands stay in, in each phase."""
         to_world, size = in_frame(self.world().X_WT), self.file.motion.travel
         near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
-        _, upper = self.file.bounds.arrays()
-        bound = float(np.atleast_2d(upper)[:, :2].min())
-        edges = box_edges(bound, 0.0, size) if np.isfinite(bound) else []
+        lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())
+        lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
+        boxes = [corners for corners in zip(lower, upper, strict=True) if np.isfinite(corners).all()]
         return Scene(
             to_world=to_world,
             demonstrations=tuple(Demonstrations.load(self.folder / self.file.demonstrations.file).outputs),
-            constraint=tuple(to_world(edge) for edge in edges),
+            constraint=tuple(to_world(edge) for corners in boxes for edge in box_edges(*corners)),
             viewpoint=near,
             arm_views={"the parts": near, "the arm": ARM_VIEW},
             line_radius=0.0001,
@@ -164,7 +191,11 @@ class PartInsertion(InsertionTask):
 
 
 def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
-    """What a task folder is about, its SDF files written beside its meshes."""
+    """What a task folder is about, its SDF files written beside its meshes.
+
+    Raises:
+        InputError: if they can't be written.
+    """
     for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
         text = part_sdf(
             name,
@@ -177,7 +208,7 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         )
         path = folder / f"{name}.sdf"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
+            write_atomically(path, text.encode())  # other processes read it too
     return PartWorkcell(
         str(folder / f"{PLUG}.sdf"),
         str(folder / f"{SOCKET}.sdf"),
@@ -187,23 +218,6 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
     )
 
 
-@cache
-def _reference(path: Path, changed: int, shown: Any) -> ReferenceTrajectory:
-    """What the demonstrations have in common, on the control period's clock; fitted once a process and version."""
-    demonstrations = Demonstrations.load(path)
-    if demonstrations.num_outputs != POSE_SIZE:
-        raise InputError(
-            f"{path} has {demonstrations.num_outputs} outputs: a task of parts needs the six of a pose, "
-            "[x y z Rz Ry Rx] in the target frame"
-        )
-    duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
-    num_steps = round(duration / CONTROL_PERIOD) + 1
-    fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=shown.components, num_steps=num_steps, floor=np.array(shown.floor)
-    )
-    return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
-
-
 def load_task_folder(folder: Path) -> type[PartInsertion]:
     """The task of a folder, as a class that a registry takes.
 
@@ -211,13 +225,12 @@ def load_task_folder(folder: Path) -> type[PartInsertion]:
         InputError: if it is no task folder, or something in it makes no sense.
     """
     folder = folder.resolve()
-    text = (folder / FILE_NAME).read_text(encoding="utf-8") if (folder / FILE_NAME).is_file() else ""
-    return _task_class(folder, text)
+    return _task_class(folder, task_folder_digest(folder))
 
 
 @cache
-def _task_class(folder: Path, text: str) -> type[PartInsertion]:
-    """One class for each folder and what its file says, so that environments of it can share diagrams."""
+def _task_class(folder: Path, content: str) -> type[PartInsertion]:
+    """One class for each folder and what is in it, so that environments of it can share diagrams."""
     file = read_task_file(folder)
     defaults = {
         "guidance": "skgrl",
@@ -226,9 +239,11 @@ def _task_class(folder: Path, text: str) -> type[PartInsertion]:
         "explored": file.explored,
         "history_variance": RHO,
         "force_limit": file.force_limit,
-        "offset_range": file.offset_range,
+        "time_step": file.time_step,
+        **file.recommended.environment,
     }
-    members = {"folder": folder, "file": file, "defaults": defaults, "__module__": __name__}
+    learner = file.recommended.learner
+    members = {"folder": folder, "file": file, "defaults": defaults, "learner": learner, "__module__": __name__}
     task = type(f"PartInsertion({folder})", (PartInsertion,), members)
     task.__doc__ = f"Insert {file.plug.source or 'a plug'} into {file.socket.source or 'a socket'}."
     return cast(type[PartInsertion], task)

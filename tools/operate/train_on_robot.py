@@ -69,7 +69,7 @@ def train_on_robot(
     folder = RunFolder(out)
     folder.refuse_existing()
     environment = {**environment, **other.environment(str(environment["station"]))}
-    config = configure(task, environment, settings=settings, **with_defaults(task, given))
+    config = configure(task, environment, **with_defaults(task, {**given, "settings": settings}))
     resolved = resolve(config.task, config.environment)
     declared = resolved.task
     if not isinstance(declared, InsertionTask) or declared.seen_by_robot() is None:

@@ -25,7 +25,9 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     axes = list(dict.fromkeys(table["axis"]))
     columns = min(COLUMNS, len(axes))
     bands = -(-len(axes) // columns)
-    figure, panels = new_figure(2 * bands, columns, (max(3.2 * columns, 6.4, 1.6 * table["who"].nunique()), 3.6 * bands + 0.5))
+    figure, panels = new_figure(
+        2 * bands, columns, (max(3.2 * columns, 6.4, 1.6 * table["who"].nunique()), 3.6 * bands + 0.5)
+    )
     colours = dict(zip(dict.fromkeys(table["who"]), COLOURS * 9, strict=False))
     order = {who: place for place, who in enumerate(colours)}
     for number, name in enumerate(axes):

@@ -10,6 +10,7 @@ import yaml
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
+from guiderail.tools.viewing import replay
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -25,7 +26,7 @@ def call(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The simplest of the six; `tests/tools/onboard/parts.py` onboards all of them."""
+    """The simplest of the six; `learn_parts.py` beside this onboards and learns all of them."""
     where = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(where)
     call("onboard", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
@@ -48,7 +49,8 @@ def test_what_was_measured_is_what_was_drawn(folder):
     assert len(page) > 100_000
 
 
-def test_it_is_a_task(folder, tmp_path, capsys):
+def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(replay, "EPISODES", 1)
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
     call("evaluate", tmp_path / "run", "--episodes", 1, "--beside", "none", "--json")
@@ -63,14 +65,18 @@ def test_its_options_are_listed(folder, capsys):
 
 
 def test_bounds_from_demonstrations_become_its_own(folder, capsys):
-    from guiderail.diagrams.make import resolve
+    from guiderail.diagrams.make import make_env, resolve
 
     before = (folder / "task.yaml").read_text()
     try:
         call("constraints", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--into", folder)
         constraints = resolve(str(folder), {}).task.constraints()
         assert constraints.G.shape[0] > 1
-        np.testing.assert_array_equal(constraints.G[0, :2, :2], np.eye(2))
+        np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
+        env = make_env(str(folder))
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
     finally:
         (folder / "task.yaml").write_text(before)
 
