@@ -275,6 +275,7 @@ class HardwareStation(Station):
             (words.get_output_port(), deputy.get_word_input_port()),
             (deputy.get_fault_output_port(), guard.get_status_fault_input_port()),
             (status.get_age_output_port(), guard.get_status_age_input_port()),
+            (status.get_is_new_output_port(), guard.get_status_is_new_input_port()),
             (watchdog.get_holding_output_port(), guard.get_holding_input_port()),
             (guard.get_safe_torque_output_port(), publisher.get_torque_input_port()),
             (guard.get_sending_output_port(), publisher.get_sending_input_port()),
