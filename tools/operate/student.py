@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 
 from guiderail.models.errors import InputError
 from guiderail.tools.learning.off_policy import OffPolicyLearner
+from guiderail.tools.operate.company import end_with_parent
 from guiderail.tools.rollouts.rollout import Decision, Observer
 
 NICENESS = 5  # of the gradient steps, beside whoever has to be in time
@@ -161,6 +162,7 @@ def _learn(pipe: Connection, kind: type[OffPolicyLearner], given: tuple[Any, ...
     """The other process: learns, and writes what takes long."""
     import torch
 
+    end_with_parent()
     os.nice(NICENESS)
     torch.set_num_threads(1)
     learner = kind(*given, **named)
