@@ -57,13 +57,13 @@ def serve_iiwa(
     start = START if task == TASK else declared.start(np.random.default_rng(0)) + ASIDE
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm, driver = DrakeLcm(url), IIWA_DRIVER
+    # In real time, the deputy has ears of its own: beside a real driver it is another process.
+    within, ears = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, DrakeLcm(url))
     robot = SimulatedIiwa(
-        declared.world(), lcm, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
+        declared.world(), within, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
     )
     simulator = Simulator(robot)
     robot.set_pose(simulator.get_mutable_context(), start)
-    # The deputy has ears of its own: beside a real driver it is another process.
-    ears = lcm if rate is None else DrakeLcm(url)
     Deputy(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
     if offset is not None:
         if len(offset) != 2:
@@ -74,7 +74,7 @@ def serve_iiwa(
         declared.move(robot, simulator.get_mutable_context(), fixture, workpiece)
     simulator.Initialize()
     if rate is None:
-        return serve(simulator, lcm, driver, seconds, patience) >= seconds
+        return serve(simulator, within, lcm, driver, seconds, patience) >= seconds
     hurry()
 
     def attend() -> None:
