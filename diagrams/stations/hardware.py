@@ -13,7 +13,7 @@ from pydrake.manipulation import BuildIiwaControl, IiwaDriver
 from pydrake.multibody.parsing import ModelDirective
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, SerializerInterface
 from pydrake.systems.primitives import MatrixGain
@@ -449,6 +449,17 @@ class SimulatedIiwa(Diagram):
             self.known.plant,
         )
         builder.BuildInto(self)
+
+    def simulator(self) -> Simulator:
+        """Runs it, not initialized.
+
+        All that is continuous in it is the driver's low-pass filter. Each time at which an integrator asks how that
+        changes, the contact is solved anew, which costs more than all else: once in a step is enough.
+        """
+        simulator = Simulator(self)
+        ResetIntegratorFromFlags(simulator, "explicit_euler", self.plant.time_step())
+        simulator.get_mutable_integrator().set_fixed_step_mode(True)
+        return simulator
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""

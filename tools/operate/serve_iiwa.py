@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.lcm import DrakeLcm
-from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.make import resolve
 from guiderail.diagrams.options import validated
@@ -62,7 +61,7 @@ def serve_iiwa(
     robot = SimulatedIiwa(
         declared.world(), within, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
     )
-    simulator = Simulator(robot)
+    simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
     Deputy(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
     if offset is not None:
