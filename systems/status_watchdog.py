@@ -26,16 +26,16 @@ _SOUND = (Fault.NONE, Fault.LATE)  # what is no fault of the status itself
 # known before is as good as any.
 _DOUBTFUL = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE, Fault.POSITION_JUMP)
 _FRESH = 0.5  # of the greatest age: speeds no older than that are damped without swinging
-# A status that comes earlier than the clocks' offset says was delayed less than those that the offset is from; taken over
-# at once, one from elsewhere would make all others late.
+# A status that comes earlier than the clocks' offset says was delayed less than those that the offset is from. If that
+# were taken over at once, a single one from elsewhere would make all others late.
 _SOONER = 0.2
 _FORGOTTEN = (0.0, np.nan, np.nan, 0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, np.nan, 0.0)
 
 
 @dataclass(frozen=True)
 class _Verdict:
-    """Of the newest status: what is wrong with it, whether it is new and believed, what is believed then, (3n,), how old
-    that is [s], and by which clock's offset [s] it was judged.
+    """Of the newest status: what is wrong with it, whether it is new and believed, what is believed then, (3n,), how
+    old that is [s], and by which clock's offset [s] it was judged.
     """
 
     fault: Fault
@@ -51,12 +51,12 @@ class StatusWatchdog(LeafSystem):
 
     `judge_status` names the fault. A fault is reported until statuses have been sound for the settling time, so that
     after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
-    when the first status comes, after that by the statuses that come soonest, slowly where all come later, and anew after
-    a fault or a silence: then the next status is judged by the one that was at fault, if its numbers were sound. Where
-    the clock on the wall is told, this program's own
-    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump, of a clock
-    or a position, nothing is believed before the settling time is over, but what agrees with the clock and the
-    positions as they were before: a single status from elsewhere blinds nobody.
+    when the first status comes, after that by the statuses that come soonest, slowly where all come later, and anew
+    after a fault or a silence: then the next status is judged by the one that was at fault, if its numbers were sound.
+    Where the clock on the wall is told, this program's own delays are no robot's fault, and one that is too long is a
+    fault of its own. After a silence or a jump, of a clock or a position, nothing is believed before the settling time
+    is over, but what agrees with the clock and the positions as they were before: a single status from elsewhere blinds
+    nobody.
 
     .. pydrake_system::
 
@@ -74,8 +74,8 @@ class StatusWatchdog(LeafSystem):
     ``status`` is an abstract value: the newest `JointStatus`, or None. ``clock`` is (1,), the time on the wall at this
     check [s]; unconnected, each check is a period after the one before. ``state`` is (2n,), positions and velocities
     [rad, rad/s], and ``external_torque`` (n,) [Nm], both of the last sound status and zero before it. ``fault`` is
-    (1,), a code of `Fault`. ``age`` is (1,), how old the last sound status is, by the soonest that came [s], and ``is_new``
-    (1,) is 1 at the check at which it came.
+    (1,), a code of `Fault`. ``age`` is (1,), how old the last sound status is, by the soonest that came [s], and
+    ``is_new`` (1,) is 1 at the check at which it came.
     """
 
     def __init__(self, limits: StatusLimits, *, period: float):

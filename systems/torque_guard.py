@@ -116,8 +116,8 @@ class TorqueGuard(LeafSystem):
         - not_following
 
     ``torque`` and ``safe_torque`` are (n,) [Nm], ``state`` (2n,), ``external_torque`` (n,) [Nm], ``wrench`` (6,), force
-    first. ``pose`` and ``desired_pose`` are (6,), of which the positions are watched. ``status_fault``,
-    ``status_age`` and ``status_is_new`` are (1,), a `StatusWatchdog`'s. ``holding`` is (1,): 1 while a command watchdog holds.
+    first. ``pose`` and ``desired_pose`` are (6,), of which the positions are watched. ``status_fault``, ``status_age``
+    and ``status_is_new`` are (1,), a `StatusWatchdog`'s. ``holding`` is (1,): 1 while a command watchdog holds.
 
     ``fault`` is (1,), a code of `Fault`: why the arm is stopped, or 0. ``phase`` is (1,), a number of `Phase`, and
     ``authority`` (1,). ``sending`` is (1,): 1 while commands may go out. ``not_following`` is (1,): 1 while the arm

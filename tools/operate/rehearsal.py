@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,14 +92,13 @@ class Other:
         }
 
     @contextmanager
-    def standing_in(self, task: str, url: str, offset: Sequence[float] | None = None) -> Iterator[None]:
-        """A simulated robot in front of a task's fixture, which may be off by (x, y) [m]; nobody, of a real robot."""
+    def standing_in(self, task: str, url: str) -> Iterator[None]:
+        """A simulated robot in front of a task's fixture; nobody, of a real robot."""
         if not self.rehearse:
             yield
             return
         arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300", "--seconds", str(LONGEST)]
         arguments += [] if self.lockstep else ["--rate", str(self.rate)]
-        arguments += [] if offset is None else ["--offset", ",".join(repr(float(value)) for value in offset)]
         arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]
         with companion(f"from guiderail.tools.command import main; main({arguments!r})"):
             yield

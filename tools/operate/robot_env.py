@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -65,6 +65,7 @@ class RobotEnv(GuidedEnv):
         keys: Keys,
         go_on: Callable[[str], None],
         say: Say,
+        places: Callable[[np.random.Generator, Mapping[str, Any]], dict[str, Any]] | None = None,
     ):
         """
         Args:
@@ -77,8 +78,11 @@ class RobotEnv(GuidedEnv):
             keys: of a person.
             go_on: called with why the arm is at rest; returns when it may move again, or raises.
             say: what a person is told.
+            places: called with random numbers and a reset's options when the arm is at the start: where the parts
+                are is drawn anew, as in a simulation, and returned.
         """
         super().__init__(task, hold=hold)
+        self._places = places
         self._skills, self._elsewhere, self._start, self._pace = station, elsewhere, start, pace
         self._keys, self._go_on, self._say = keys, go_on, say
         self._steps = round(task.control_period / station.period)
@@ -137,17 +141,18 @@ class RobotEnv(GuidedEnv):
         """Moves the arm to the start.
 
         Raises:
-            InputError: if it doesn't get there, or options are given: nothing of a robot can be drawn.
+            InputError: if it doesn't get there, or options are given where nothing can be drawn.
         """
-        if options:
+        if options and self._places is None:
             raise InputError("a reset of a robot takes no options: nothing of it can be drawn")
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
         self._return()
+        drawn = {} if self._places is None else self._places(self.np_random, options or {})
         simulator = Simulator(self.task.diagram)
         self._action_value = self.action_port.FixValue(simulator.get_mutable_context(), self._neutral)
         self._hand_over(simulator, self._skills)
-        self.fault, self.drawn = Fault.NONE, {}
+        self.fault, self.drawn = Fault.NONE, drawn
         return self._begun()
 
     def step(self, action):

@@ -13,6 +13,7 @@ from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa, saf
 from guiderail.diagrams.stations.pace import hurry, serve, serve_in_real_time
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.errors import InputError
+from guiderail.tools.operate.places import put
 from guiderail.tools.operate.scenario import load_scenario
 
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # the plug above the jack
@@ -71,6 +72,7 @@ def serve_iiwa(
             np.random.default_rng(0), validated(declared.Reset, {"offset": tuple(offset)}, "a robot")
         )
         declared.move(robot, simulator.get_mutable_context(), fixture, workpiece)
+    put(lcm if rate is None else ears, driver, declared, robot, simulator.get_mutable_context())
     simulator.Initialize()
     if rate is None:
         return serve(simulator, within, lcm, driver, seconds, patience) >= seconds
