@@ -730,8 +730,10 @@ def run(
 
         others = _beside(run, {}, "none" if policy is None else policy)
         acting = None if policy is None else others[policy]
-        how = {"station": station, "policy": policy or "", "acting": acting, "yes": yes, "out": out, "say": _say}
-        _print(evaluate_on_robot(run, other, episodes, **how), as_json)
+        found = evaluate_on_robot(
+            run, other, episodes, station=station, policy=policy or "", acting=acting, yes=yes, out=out, say=_say
+        )
+        _print(found, as_json)
         return
     if policy is not None:
         raise InputError("another policy than the run's acts in episodes alone: give --episodes too")

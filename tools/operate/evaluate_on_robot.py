@@ -72,11 +72,10 @@ def evaluate_on_robot(
         env = robot.env
         act = learned if acting is None else acting(env)
         assert act is not None
-        held_out = {"held_out": True} if other.rehearse else {}
         with no_pauses(), EpisodeProgress(episodes, name=policy or config.task) as progress:
             try:
                 for index in range(episodes):
-                    rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, **held_out))
+                    rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.rehearse))
                     env.idle()
                     write_atomically(path, table_text(pd.DataFrame(rows)).encode())
                     env.idle()
