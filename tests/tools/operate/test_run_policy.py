@@ -127,6 +127,13 @@ def test_what_a_person_gave_wrong_ends_with_2(capsys, tmp_path):
     assert "not a run" in capsys.readouterr().err
 
 
+def test_another_policy_acts_in_episodes_alone(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["run", "runs/none", "--policy", "rule"])
+    assert end.value.code == 2
+    assert "give --episodes" in capsys.readouterr().err
+
+
 def test_nobody_confirms_for_a_person(monkeypatch):
     with pytest.raises(InputError, match="--yes"):
         checks.confirm("So?")

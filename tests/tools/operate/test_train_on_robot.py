@@ -1,7 +1,10 @@
 """Learning on a robot: episodes as motions, both sides of the bus in one process."""
 
+from contextlib import contextmanager
+
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 from injections.together import Together
 from pydrake.lcm import DrakeLcm
@@ -10,8 +13,12 @@ from guiderail.diagrams.make import make_guidance, make_station, resolve
 from guiderail.diagrams.tasks.assemble import assemble
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
+from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.presets import resolve_preset
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.operate.at_robot import AtRobot
+from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
 from guiderail.tools.operate.keys import Keys
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
@@ -48,6 +55,7 @@ def shared():
 
 @pytest.fixture
 def env(shared):
+    shared._try(lambda: None)  # the test before may have left the arm at rest
     shared.asked.clear()
     shared.keys.take_back()
     return shared
@@ -67,6 +75,29 @@ def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
         env.idle()
     with pytest.raises(InputError, match="takes no options"):
         env.reset(options={"offset": (0.0, 0.0)})
+
+
+def test_in_a_rehearsal_a_reset_draws_what_a_simulations_does(env, monkeypatch):
+    monkeypatch.setattr(env, "_places", lambda rng, options: {"drawn": (float(rng.random()), options)})
+    _, info = env.reset(seed=3, options={"held_out": True})
+    assert info["drawn"] == (float(np.random.default_rng(3).random()), {"held_out": True})
+
+
+def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_path):
+    @contextmanager
+    def there(config, other, *, yes, say):
+        assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
+        yield AtRobot(env, env.keys, dict)
+
+    monkeypatch.setattr("guiderail.tools.operate.evaluate_on_robot.at_robot", there)
+    learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
+    RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
+    found = evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
+    assert (found["episodes"], found["success_rate"]) == (2, 0.0)
+    rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
+    assert rows["termination"].tolist() == ["time_limit"] * 2
+    with pytest.raises(InputError, match="at least one"):
+        evaluate_on_robot(tmp_path, Other(), 0)
 
 
 def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
