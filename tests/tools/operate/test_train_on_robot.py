@@ -115,6 +115,22 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     assert env.asked == ["somebody asked for it"]
 
 
+def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought_to_rest(env):
+    def interrupt(context):
+        raise KeyboardInterrupt
+
+    env.reset()
+    env.step(np.ones(2))
+    env.simulator.set_monitor(interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        env.step(np.ones(2))
+    env.rest()
+    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.ASKED
+    plant = env.pace.robot.plant
+    velocities = plant.GetVelocities(plant.GetMyContextFromRoot(env.pace.simulator.get_context()))
+    assert np.abs(velocities).max() < 0.01
+
+
 def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(env):
     env.reset()
     env.step(np.zeros(2))
