@@ -168,7 +168,11 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     reset = randomizes(resolved.task, built.station, built.guidance)
     diagram = replace(built.diagram, randomize=reset, declaration=resolved.task)
     release = partial(_POOL.give_back, key, built)
-    return GuidedEnv(diagram, hold=resolved.task.choice.hold, render_mode=render_mode, release=release)
+    try:
+        return GuidedEnv(diagram, hold=resolved.task.choice.hold, render_mode=render_mode, release=release)
+    except BaseException:  # such as a view that finds no port
+        release()
+        raise
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
 Viewpoint = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -54,9 +55,10 @@ def viewpoint(eye: np.ndarray, target: np.ndarray) -> Viewpoint:
     return (float(eye[0]), float(eye[1]), float(eye[2])), (float(target[0]), float(target[1]), float(target[2]))
 
 
-def box_edges(half_width: float, low: float, high: float) -> list[np.ndarray]:
-    """The twelve edges (2, 3) of an upright box around the z axis: a path that turns sharply is drawn side by side."""
-    square = half_width * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+def box_edges(lower: ArrayLike, upper: ArrayLike) -> list[np.ndarray]:
+    """The twelve edges (2, 3) of a box by its corners (3,) each: a path that turns sharply is drawn side by side."""
+    (left, front, low), (right, back, high) = np.array([lower, upper], dtype=float)
+    square = np.array([[left, front], [right, front], [right, back], [left, back], [left, front]])
     rings = [np.column_stack([square, np.full(5, height)]) for height in (low, high)]
     sides = [ring[i : i + 2] for ring in rings for i in range(4)]
     return sides + [np.array([[x, y, low], [x, y, high]]) for x, y in square[:4]]

@@ -37,18 +37,20 @@ class Policy:
                 is averaged over.
 
         Raises:
-            ValueError: for an activation that it does not know, layers that don't follow each other from observation to
-                action, or a number that is not finite.
+            ValueError: for a description that lacks something, an activation that it does not know, layers that don't
+                follow each other from observation to action, or a number that is not finite.
         """
         self._layers = layers
         self.description = dict(description)
-        self._shape = tuple(description["observation_shape"])
         activation = self.description.setdefault("activation", "relu")
         if activation not in ("relu", "normalized_relu"):
             raise ValueError(f"a policy has no activation {activation!r}")
         self._normalizes = activation == "normalized_relu"
-        self._low = np.asarray(description["action_low"], np.float32)
-        self._high = np.asarray(description["action_high"], np.float32)
+        try:
+            self._shape = tuple(description["observation_shape"])
+            self._low, self._high = (np.asarray(description[f"action_{end}"], np.float32) for end in ("low", "high"))
+        except (KeyError, TypeError, OverflowError) as error:
+            raise ValueError("a description has the observation's shape, and the action's limits as numbers") from error
         self._check()
 
     def _check(self) -> None:
@@ -57,6 +59,8 @@ class Policy:
             raise ValueError("a shape, and the side of a square of pixels, are positive whole numbers")
         if self._low.ndim != 1 or self._low.shape != self._high.shape or not (self._low < self._high).all():
             raise ValueError("an action has a lower limit below an upper one for each of its numbers")
+        if len(self._shape) == 3 and "pool" not in self.description:
+            raise ValueError("of an image the side of the squares of pixels is said, that it is averaged over")
         sizes = [self._num_features(), *(len(bias) for _, bias in self._layers)]
         expected = [(out, into) for into, out in pairwise(sizes)]
         if not self._layers or [weight.shape for weight, _ in self._layers] != expected or sizes[-1] != len(self._low):

@@ -88,10 +88,10 @@ class TorqueGuard(LeafSystem):
     once, and with it what the arm was given since: a period of what was wanted is more than standstill allows.
 
     A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
-    is called. At first it waits until the status is sound, and takes over by itself. A robot that comes back with
-    another clock after a silence was started anew, and what it had of speed is gone: it is left without torque. What is
-    sent is always finite and within the torque limits. Where a robot stays silent nothing is sent to it any more, nor
-    right after it is back.
+    is called. At first it waits until the status is sound, and takes over by itself. A robot that comes back
+    after a silence with a clock that is behind was started anew, and what it had of speed is gone: it is left without
+    torque. What is sent is always finite and within the torque limits. Where a robot stays silent nothing is sent to it
+    any more, nor right after it is back.
 
     .. pydrake_system::
 
@@ -364,7 +364,10 @@ class TorqueGuard(LeafSystem):
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
 
     def _is_started_anew(self, context: Context) -> bool:
-        """Whether a robot for whose silence the arm is stopped speaks again, by another clock."""
+        """Whether a robot for whose silence the arm is stopped speaks again, by a clock that is behind the one before.
+
+        One that is ahead proves nothing: statuses that were delayed for a while look so when they come in time again.
+        """
         status_fault = self._status_fault_port.Eval(context)[0]
         return bool(self._memory_of(context)[_FAULT] == Fault.STALE and status_fault == Fault.OUT_OF_ORDER)
 

@@ -19,7 +19,7 @@ from guiderail.models.certificate.files import CERTIFICATE, certificate_files
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.tasks import check_environment
+from guiderail.tools.tasks import changed_environment, check_environment
 
 CERTIFIED = {"kgrl": False, "skgrl": True}  # guidance whose law this is, and whether it has a history
 
@@ -95,7 +95,7 @@ def _what(of: str, environment: Mapping[str, Any]) -> tuple[str, dict[str, Any],
     config = RunFolder(Path(of)).config()
     content = (Path(of) / "config.yaml").read_bytes()
     about = {"task": config.task, "config.yaml": hashlib.sha256(content).hexdigest()}
-    return config.task, config.environment | dict(environment), about
+    return config.task, changed_environment(config.task, config.environment, environment), about
 
 
 def _largest(bounds: Bounds) -> dict[str, list[float | None]]:

@@ -13,6 +13,7 @@ import typer
 import typer.core
 
 from guiderail.models.errors import InputError, RunsFailedError
+from guiderail.models.insertion import COLLISION_FORCE
 from guiderail.models.registry import did_you_mean
 
 # Tools are imported where they are called: PyTorch and Drake take seconds, and `guiderail --help` should not.
@@ -155,11 +156,11 @@ def train(
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
     ] = None,
-    lcm_url: LcmUrl = "",
-    robot: WhichRobot = "iiwa14",
+    lcm_url: Annotated[str | None, _opt("Of a robot: the URL of LCM.  [default: LCM's own]")] = None,
+    robot: Annotated[str | None, _opt("Which arm.  [default: the station's]", of="robots")] = None,
     rehearse: Rehearse = False,
     lockstep: Lockstep = False,
-    rate: Rate = 0.2,
+    rate: Annotated[float | None, _opt("Of a rehearsal: the robot's clock to the wall's.  [default: 0.2]")] = None,
     scenario: Scenario = None,
     yes: Yes = False,
     resume: Annotated[bool, _opt("Go on with the run in --out.", "--resume")] = False,
@@ -173,20 +174,24 @@ def train(
     it would have had.
     """
     task, folders = (None, ()) if task is None else _named(task)
+    modules = (*folders, *(imports or ()))
+    if imports:
+        from guiderail.tools.tasks import import_modules
+
+        modules = import_modules(modules)  # first, as the station may be in one of them
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
-    words |= {"uncertainty": uncertainty, "station": station}
+    words |= {"uncertainty": uncertainty, "station": station, "robot": robot, "lcm_url": lcm_url}
     environment = {k: v for k, v in words.items() if v is not None} | _environment(env)
     if folders and task is not None and not resume:
         from guiderail.tools.recording.followed import leaves_demonstrations
 
         if (sentence := leaves_demonstrations(task, environment)) is not None:
             _say(sentence)
-    if (
-        station is not None
-        and not import_module("guiderail.diagrams.stations.registry").STATIONS.get(station).simulated
-    ):
-        there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
-        given = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
+    if _is_robot(environment.get("station")):
+        there = {name: environment[name] for name in ("lcm_url", "robot") if name in environment}
+        there |= {"rehearse": rehearse, "lockstep": lockstep} | ({} if rate is None else {"rate": rate})
+        given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
+        given |= {"ledger": ledger, "imports": modules}
         if task is None or out is None or resume:
             raise InputError("on a robot a run begins anew: name a task and a folder, without --resume")
         from guiderail.tools.operate.rehearsal import Other
@@ -204,8 +209,10 @@ def train(
         )
         _print(found, as_json)
         return
-    if rehearse or lockstep or yes:
-        raise InputError("--rehearse, --lockstep and --yes are for a robot: give --station hardware too")
+    if rehearse or lockstep or yes or rate is not None or scenario is not None:
+        raise InputError(
+            "--rehearse, --lockstep, --rate, --scenario and --yes are for a robot: give --station hardware too"
+        )
     from guiderail.tools.learning import configure
 
     summary = configure.run(
@@ -218,7 +225,7 @@ def train(
         episodes=episodes,
         seed=seed,
         resume=resume,
-        imports=(*folders, *(imports or ())),
+        imports=modules,
         ledger=ledger,
         demonstrator=_rule,
     )
@@ -634,7 +641,7 @@ def onboard(
     axis: Annotated[str, _opt("Which way the plug comes out: +x, -x, +y, -y, +z or -z.")] = "+z",
     centre: Annotated[str | None, _opt("x,y,z of a point on the axis.  [default: the plug's centre of mass]")] = None,
     turn: Annotated[float, _opt("By how many degrees the plug turns at the bottom; it is drawn turned.")] = 0.0,
-    force_limit: Annotated[float, _opt("More than that ends an episode [N].")] = 35.0,
+    force_limit: Annotated[float, _opt("More than that ends an episode [N].")] = COLLISION_FORCE,
     friction: Annotated[float, _opt("Of all surfaces.")] = 0.2,
     scenario: Annotated[list[Path] | None, _opt("Drake model directives of what else stands there.")] = None,
     as_json: Json = False,
@@ -957,14 +964,23 @@ def _named(task: str) -> tuple[str, tuple[str, ...]]:
     return task_named(task)
 
 
+def _is_robot(station: Any) -> bool:
+    """Whether that is a station, and no simulated one."""
+    if station is None:
+        return False
+    stations = import_module("guiderail.diagrams.stations.registry").STATIONS
+    return station in stations.names() and not stations.get(station).simulated
+
+
 def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
     """Null policies and rules by name, for an evaluation; unless named those that the run's task has."""
     from guiderail.tools.guidance import is_demonstrated
     from guiderail.tools.learning.run_folder import RunFolder
     from guiderail.tools.studies.scripted import RULES, untrained
+    from guiderail.tools.tasks import changed_environment
 
     config = RunFolder(run).config()
-    where = config.environment | dict(environment)
+    where = changed_environment(config.task, config.environment, environment)
     if names is None:
         zero = [] if is_demonstrated(where.get("guidance")) else ["zero"]
         rule = ["rule"] if config.task in RULES and where.get("observation") != "image" else []

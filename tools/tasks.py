@@ -67,6 +67,23 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
     return name, (str(Path(typed).resolve()),)
 
 
+def task_content(task: str) -> str:
+    """A digest of the files that a task is made of, as they are now; empty where it is made by code.
+
+    Args:
+        task: its name.
+
+    Raises:
+        InputError: if it is of a folder that is none any more.
+    """
+    folder = getattr(TASKS.get(task), "folder", None) if task in TASKS.names() else None
+    if folder is None:
+        return ""
+    from guiderail.diagrams.tasks.part_file import task_folder_digest  # Drake takes a second
+
+    return task_folder_digest(folder)
+
+
 def _import_file(path: Path) -> str:
     path = path.resolve()
     name = f"guiderail_imported_{path.stem}"
@@ -112,6 +129,44 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             raise InputError(f"{task}'s {name} cannot be {brief(value)}: give a value such as {options[name]!r}")
     given = {name: arguments.get(name, default) for name, default in options.items()}
     return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
+
+
+def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of an environment's arguments that it would not have anyway.
+
+    Args:
+        task: its name.
+        environment: all of its arguments.
+
+    Returns:
+        Guidance, station and difficulty that are not the task's own, and what differs from what these three stand for.
+
+    Raises:
+        InputError: for an unknown task, or if one of the three is unknown.
+    """
+    chosen = {key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment}
+    usual = check_environment(task, chosen) | {key: check_environment(task, {}).get(key) for key in chosen}
+    unlike = object()
+    return {key: value for key, value in environment.items() if usual.get(key, unlike) != value}
+
+
+def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's arguments of its environment, with others in their place.
+
+    Another difficulty is other settings: those that the run has of its own difficulty alone make way for them.
+
+    Args:
+        task: the run's.
+        environment: all of its arguments.
+        changes: the others.
+
+    Raises:
+        InputError: if there is no such difficulty.
+    """
+    own = environment.get("difficulty")
+    if changes.get("difficulty", own) == own:
+        return {**environment, **changes}
+    return check_environment(task, {**beyond_defaults(task, environment), **changes})
 
 
 def _is_like(value: Any, default: Any) -> bool:

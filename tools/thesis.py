@@ -141,6 +141,7 @@ _ADDITIONS: tuple[tuple[str, Callable[[Preset], bool], str], ...] = (
         lambda p: p.selection_window > 0,
         "the policy is one of the run's actors: checkpoint selection",
     ),
+    ("pipelined", lambda p: p.pipelined, "acting knows what was learned an episode before"),
     ("averaging", lambda p: p.averaging > 0, "the policy is an average over actors"),
     ("layer_norm", lambda p: p.layer_norm, "hidden layers are normalized"),
     (

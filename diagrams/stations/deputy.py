@@ -105,6 +105,8 @@ class Deputy:
             return
         if len(status.positions) != self._plant.num_positions() or len(status.velocities) != len(status.positions):
             return
+        if self._now - self._silence <= status.time < self._now:
+            return  # another one overtook it
         if self.duty == Duty.WATCHING and (status.time < self._now or not np.isfinite(self._now)):
             self._commanded_at = status.time  # the robot's clock went back, or only began
             if self._now - status.time > self._silence and self._has_torque:

@@ -215,7 +215,7 @@ class HardwareStation(Station):
         self.known = known = KnownArm(workcell, robot, end_effector)
         self.limits = limits = limits or safety_limits(known.plant, driver)
         self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
-        self._robot_timeout = robot_timeout
+        self._robot_timeout, self._wrench_time_constant = robot_timeout, wrench_time_constant
         num_joints = known.plant.num_positions()
         builder = DiagramBuilder()
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(bus))
@@ -224,6 +224,7 @@ class HardwareStation(Station):
             LcmSubscriberSystem(driver.status_channel, _StatusSerializer(driver), bus, robot_timeout),
         )
         status_limits = status_limits or StatusLimits.at_rate(known.plant.GetVelocityUpperLimits().tolist(), period)
+        self.status_limits = status_limits
         self._status = status = builder.AddNamedSystem("status", StatusWatchdog(status_limits, period=period))
         words = builder.AddNamedSystem(
             "deputy_subscriber", LcmSubscriberSystem(word_channel(driver.command_channel), WordSerializer(), bus)
@@ -349,7 +350,7 @@ class HardwareStation(Station):
     def has_deputy(self, context: Context) -> bool:
         """Whether somebody stands by at the robot; `context` is this station's own."""
         words = self.GetSubsystemByName("deputy_subscriber")
-        return words.get_output_port().Eval(words.GetMyContextFromRoot(context)) is not None
+        return words.get_output_port().Eval(self.GetSubsystemContext(words, context)) is not None
 
     def take_over(self, context: Context, before: Context) -> None:
         """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.
@@ -374,10 +375,14 @@ class HardwareStation(Station):
             workcell,
             self.lcm,
             self.impedance,
-            end_effector=self._end_effector,
+            self.period,
+            self._wrench_time_constant,
+            self._robot_timeout,
+            self._end_effector,
             robot=self._robot,
+            lcm_url=self.lcm_url,
             limits=self.limits,
-            robot_timeout=self._robot_timeout,
+            status_limits=self.status_limits,
         )
 
     def force_of(self, positions: np.ndarray, external_torque: np.ndarray) -> np.ndarray:

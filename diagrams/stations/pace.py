@@ -116,10 +116,10 @@ class RealTime:
             lcm: the bus.
             channel: of the statuses.
             period: in which they come [s].
-            rate: of the robot's clock to the wall's, positive: less than 1 where a simulated robot is slow.
+            rate: of the robot's clock to the wall's, positive, up to 1: less where a simulated robot is slow.
 
         Raises:
-            InputError: if the rate is not positive.
+            InputError: if the rate is not positive, or above 1.
         """
         if not 0.0 < rate <= 1.0:
             raise InputError(f"a robot's clock goes as the wall's or slower, at a rate up to 1, not {rate}")
@@ -142,6 +142,8 @@ class RealTime:
             self._taken, now = self._statuses.count, time.monotonic()
             self.gaps.add(now - self._last)
             self._last = now
+            # What happens at an instant belongs to the clock of that instant, and Drake has left it for the next step.
+            simulator.AdvancePendingEvents()
             station.tell_time(context, now * self._rate)
             simulator.AdvanceTo(start + (step + 1) * self._period)
 
@@ -234,7 +236,9 @@ def serve(
     def is_answered() -> bool:
         if not words.count:
             return bool(commands)
-        taken = struct.unpack(HEAD_FORMAT, words.last)[1] if len(words.last) == HEAD else -1
+        if len(words.last) != HEAD:
+            return False
+        taken = struct.unpack(HEAD_FORMAT, words.last)[1]
         return abs(taken * MICROSECOND - steps * driver.period) < 0.5 * driver.period
 
     def settle() -> None:

@@ -17,7 +17,6 @@ from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, BncWorkcell
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import Symmetry
 from guiderail.diagrams.tasks.bnc_observation import (
-    LEAST_FORCE,
     OBSERVATIONS,
     half_turn,
     observed,
@@ -32,21 +31,17 @@ from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Threshold
 from guiderail.models.demonstrations import bnc_connector as inserting
 from guiderail.models.demonstrations import bnc_search as searching
+from guiderail.models.insertion import LEAST_FORCE, REPEATED, RHO
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.models.units import DEGREE, MM
 from guiderail.systems.contact_lever import ContactLever
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
 NUM_STEPS, COMPONENTS = inserting.NUM_STEPS, 16
-# How well a hand repeats itself: added to the demonstrations' covariance as a standard deviation.
-FLOOR = np.array([0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE])
+FLOOR = np.array(REPEATED)
 DEMONSTRATIONS = {"insert": inserting, "search": searching}
-
-# ρ [m², rad²]. The thesis's 1e-8 is (0.1 mm)², much for demonstrations that vary by a millimetre.
-RHO = 1e-11
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
 
@@ -159,10 +154,11 @@ class BncConnector(InsertionTask):
         """The demonstrations, and the square that commands stay in."""
         to_world = in_frame(self._workcell.X_WT)
         near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
+        bound = self.options.bound
         return Scene(
             to_world=to_world,
             demonstrations=tuple(DEMONSTRATIONS[self.options.demonstrations].load().outputs),
-            constraint=tuple(to_world(edge) for edge in box_edges(self.options.bound, 0.0, 0.015)),
+            constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
             line_radius=0.0001,

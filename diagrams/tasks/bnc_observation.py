@@ -11,6 +11,7 @@ from guiderail.diagrams.observation import Observed
 from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, HALF_TURN_OF_WRENCH
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.demonstrations.bnc_connector import NUM_STEPS
+from guiderail.models.insertion import COMMAND_SCALE, LEVER_SCALE
 from guiderail.models.units import DEGREE, MM
 
 OBSERVATIONS = ("state", "lever")
@@ -20,10 +21,6 @@ HALF = 0.5 * (NUM_STEPS * CONTROL_PERIOD)
 POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
-# A torque grows with the push; divided by it, it is the lever, which doesn't. Where the command is tells what an
-# action led to, which a pose that a rim holds back does not.
-LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
-LEAST_FORCE = 0.5  # [N] with which the plug stands on something
 
 
 def observed(observation: str) -> tuple[Observed, ...]:

@@ -11,12 +11,12 @@ from guiderail.diagrams.options import Number
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE
 from guiderail.diagrams.tasks.hidden_place import HiddenPlace
+from guiderail.models.insertion import COLLISION_FORCE
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.objects.bnc_sdf import FRICTION
 from guiderail.models.units import MM
 
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
-COLLISION_FORCE = 35.0  # [N], of the impedance
 DRAWN = BncDimensions()
 
 

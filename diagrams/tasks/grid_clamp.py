@@ -115,7 +115,8 @@ class GridClamp(InsertionTask):
     def scene(self) -> Scene:
         """The cuboid that commands stay in, as high as the clamp begins."""
         to_world, parameters = in_frame(self._workcell.X_WT), make_skill().parameters
-        edges = box_edges(0.5 * parameters["width_m"], -parameters["push_m"], 0.025)
+        half = 0.5 * parameters["width_m"]
+        edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))
         near = viewpoint(*to_world(np.array([[0.045, -0.065, 0.045], [0.0, 0.0, 0.008]])))
         return Scene(
             to_world=to_world,

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.options import Number, Numbers, Options, validated
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE, REPEATED
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.units import DEGREE, MM
@@ -20,6 +22,7 @@ from guiderail.models.yaml_files import load_yaml
 FILE_NAME = "task.yaml"
 FILE_FORMAT = "guiderail task 1"
 NAMESPACE = "parts"
+_LARGEST = float(np.finfo(float).max)
 
 
 class Piece(Options):
@@ -69,17 +72,31 @@ class Bounds(Options):
     lower: tuple[Any, ...]
     upper: tuple[Any, ...]
     phases: tuple[Number, ...] | None = Field(
-        None, description="where in the motion each list begins to hold, from 0 to 1"
+        None, min_length=1, validate_default=True, description="where in the motion each list begins to hold, from 0 on"
     )
 
     @field_validator("lower", "upper")
     @classmethod
     def _are_numbers(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
         rows = value if value and isinstance(value[0], list | tuple) else (value,)
-        for row in rows:
-            if len(row) != POSE_SIZE or not all(one is None or isinstance(one, int | float) for one in row):
-                raise ValueError("bounds are six numbers each, [x y z Rz Ry Rx], null where there is none")
+        if not all(_is_row(row) for row in rows):
+            raise ValueError("bounds are six finite numbers each, [x y z Rz Ry Rx], null where there is none")
         return value
+
+    @field_validator("phases")
+    @classmethod
+    def _fit(cls, phases: tuple[float, ...] | None, others: ValidationInfo) -> tuple[float, ...] | None:
+        if not {"lower", "upper"} <= others.data.keys():
+            return phases  # what is wrong with those is said of them
+        lower, upper = _filled(others.data["lower"], -np.inf), _filled(others.data["upper"], np.inf)
+        if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
+            raise ValueError("bounds that change need phases, and a list of lower and of upper ones for each")
+        if phases is not None and (phases[0] != 0.0 or any(np.diff([*phases, 1.0]) <= 0.0)):
+            raise ValueError("phases begin at 0, increase, and are below 1")
+        for bound in (np.isfinite(lower), np.isfinite(upper)):
+            if phases is not None and (bound.any(axis=0) != bound.all(axis=0)).any():
+                raise ValueError("an output is bounded in every phase or in none")
+        return phases
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper, each (6,) or one row a phase (K, 6), infinite where there is none."""
@@ -88,17 +105,19 @@ class Bounds(Options):
     def constraints(self, num_steps: int) -> LinearConstraints:
         """G y ≥ c: the same at each of N steps, or those of the phase that a step is in."""
         lower, upper = self.arrays()
-        if lower.ndim == 1:
+        if self.phases is None:
             return LinearConstraints.box(lower, upper)
-        if self.phases is None or len(self.phases) != len(lower) or lower.shape != upper.shape:
-            raise InputError("bounds that change need phases, and a list of lower and of upper ones for each")
         phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, num_steps), side="right") - 1
-        lows, highs = (bound[np.clip(phase, 0, len(lower) - 1)] for bound in (lower, upper))
-        bounded = [np.isfinite(lower).all(axis=0), np.isfinite(upper).all(axis=0)]
-        eye = np.eye(POSE_SIZE)
-        G = np.concatenate([eye[bounded[0]], -eye[bounded[1]]])
-        c = np.concatenate([lows[:, bounded[0]], -highs[:, bounded[1]]], axis=1)
-        return LinearConstraints(np.tile(G, (num_steps, 1, 1)), c)
+        return LinearConstraints.box(lower[phase], upper[phase])
+
+
+def _is_row(row: Any) -> bool:
+    # Asked this way round, what is no number is none either, and so is one that no double holds.
+    return (
+        isinstance(row, list | tuple)
+        and len(row) == POSE_SIZE
+        and all(one is None or (type(one) in (int, float) and abs(one) <= _LARGEST) for one in row)
+    )
 
 
 def _filled(rows: tuple[Any, ...], missing: float) -> np.ndarray:
@@ -117,10 +136,7 @@ class Shown(Options):
     file: str = Field("demonstrations.npz", description=".npz or .csv, poses in the target frame")
     components: int | None = Field(None, ge=1, description="of their mixture; by information criterion unless given")
     floor: Numbers = Field(
-        (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE),
-        min_length=6,
-        max_length=6,
-        description="standard deviation that a hand has anyway [m], [rad]",
+        REPEATED, min_length=6, max_length=6, description="standard deviation that a hand has anyway [m], [rad]"
     )
 
 
@@ -139,11 +155,18 @@ class PartTaskFile(Options):
     offset_range: Numbers | None = Field(
         None, min_length=2, max_length=2, description="distance of the socket from its place [m], the task's own"
     )
-    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
     demonstrations: Shown = Shown.model_validate({})
     explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
     measured: dict[str, Any] = Field({}, description="what onboarding measured; nothing reads it")
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files that it names, beside it."""
+        models = (self.plug, self.socket)
+        meshes = [*(model.visual for model in models), *(piece.file for model in models for piece in model.pieces)]
+        return (*meshes, self.demonstrations.file, *self.scenario)
 
     @cached_property
     def turn(self) -> float:
@@ -164,12 +187,23 @@ def read_task_file(folder: Path) -> PartTaskFile:
     if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
         raise InputError(f"{path} is no task: its first line must be 'format: {FILE_FORMAT}'")
     file = validated(PartTaskFile, data, str(path))
-    named = [model.visual for model in (file.plug, file.socket)]
-    named += [piece.file for model in (file.plug, file.socket) for piece in model.pieces]
-    for name in (*named, file.demonstrations.file, *file.scenario):
+    for name in file.files:
         if not (folder / name).is_file():
             raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or onboard the parts again")
     return file
+
+
+def task_folder_digest(folder: Path) -> str:
+    """A digest of what decides a task: what its file says but for what was measured, and the files that it names.
+
+    Raises:
+        InputError: as `read_task_file`.
+    """
+    file = read_task_file(folder)
+    found = hashlib.blake2b(file.model_dump_json(exclude={"measured"}).encode(), digest_size=16)
+    for name in file.files:
+        found.update(hashlib.blake2b((folder / name).read_bytes()).digest())
+    return found.hexdigest()
 
 
 def write_task_file(folder: Path, file: PartTaskFile) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, ClassVar, cast
 
@@ -23,30 +23,29 @@ from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
-from guiderail.diagrams.tasks.part_file import FILE_NAME, PartTaskFile, read_task_file
+from guiderail.diagrams.tasks.part_file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.task import Choice, Threshold
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE, COMMAND_SCALE, LEAST_FORCE, LEVER_SCALE, RHO
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.parts.model_files import part_sdf
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.models.units import DEGREE, MM
+from guiderail.models.writing import write_atomically
 from guiderail.systems.contact_lever import ContactLever
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
 COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
-RHO = 1e-11  # ρ [m², rad²], as the connector's
-LEAST_FORCE = 0.5  # [N] with which the plug stands on something
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
-LEVER_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 
 
 class PartOptions(HiddenPlace):
     """Of a task of two meshes."""
 
     start_beside: Number = Field(0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]")
-    force_limit: Number = Field(35.0, ge=1, le=60, description="more than that ends an episode [N]")
+    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
 
 
 class PartInsertion(InsertionTask):
@@ -74,6 +73,10 @@ class PartInsertion(InsertionTask):
 
     def world(self) -> PartWorkcell:
         """The socket in the world, the plug in the tool."""
+        return self._workcell
+
+    @cached_property
+    def _workcell(self) -> PartWorkcell:
         return workcell(self.folder, self.file)
 
     def reference(self) -> ReferenceTrajectory:
@@ -84,6 +87,12 @@ class PartInsertion(InsertionTask):
     def constraints(self) -> LinearConstraints:
         """The folder's bounds."""
         return self.file.bounds.constraints(self.reference().num_steps)
+
+    @classmethod
+    def knows(cls) -> tuple[str, ...]:
+        """As of every task; but what is to be kept out of can't change on the way."""
+        changes = cls.file.bounds.phases is not None
+        return tuple(one for one in super().knows() if not (one == "keep_out" and changes))
 
     def keep_out(self) -> KeepOut:
         """No walls are known: what safe residual learning is projected to are the bounds alone."""
@@ -134,11 +143,11 @@ class PartInsertion(InsertionTask):
         world.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
-        """Where the demonstrations start, or somewhere beside it."""
+        """Where the demonstrations start, or somewhere beside it, inside the bounds."""
         start = self.reference().means[0].copy()
         if self.options.start_beside > 0.0:
             start[:2] += in_ring(rng, 0.0, self.options.start_beside)
-        return start
+        return self.constraints().nearest(start)
 
     def camera(self) -> Camera:
         """Looks slightly down at the socket."""
@@ -147,16 +156,16 @@ class PartInsertion(InsertionTask):
         return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=6 * size, height=3 * size))
 
     def scene(self) -> Scene:
-        """The demonstrations, and the box that commands stay in."""
+        """The demonstrations, and the box that commands stay in, in each phase."""
         to_world, size = in_frame(self.world().X_WT), self.file.motion.travel
         near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
-        _, upper = self.file.bounds.arrays()
-        bound = float(np.atleast_2d(upper)[:, :2].min())
-        edges = box_edges(bound, 0.0, size) if np.isfinite(bound) else []
+        lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())
+        lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
+        boxes = [corners for corners in zip(lower, upper, strict=True) if np.isfinite(corners).all()]
         return Scene(
             to_world=to_world,
             demonstrations=tuple(Demonstrations.load(self.folder / self.file.demonstrations.file).outputs),
-            constraint=tuple(to_world(edge) for edge in edges),
+            constraint=tuple(to_world(edge) for corners in boxes for edge in box_edges(*corners)),
             viewpoint=near,
             arm_views={"the parts": near, "the arm": ARM_VIEW},
             line_radius=0.0001,
@@ -164,7 +173,11 @@ class PartInsertion(InsertionTask):
 
 
 def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
-    """What a task folder is about, its SDF files written beside its meshes."""
+    """What a task folder is about, its SDF files written beside its meshes.
+
+    Raises:
+        InputError: if they can't be written.
+    """
     for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
         text = part_sdf(
             name,
@@ -177,7 +190,7 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         )
         path = folder / f"{name}.sdf"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
+            write_atomically(path, text.encode())  # other processes read it too
     return PartWorkcell(
         str(folder / f"{PLUG}.sdf"),
         str(folder / f"{SOCKET}.sdf"),
@@ -211,13 +224,12 @@ def load_task_folder(folder: Path) -> type[PartInsertion]:
         InputError: if it is no task folder, or something in it makes no sense.
     """
     folder = folder.resolve()
-    text = (folder / FILE_NAME).read_text(encoding="utf-8") if (folder / FILE_NAME).is_file() else ""
-    return _task_class(folder, text)
+    return _task_class(folder, task_folder_digest(folder))
 
 
 @cache
-def _task_class(folder: Path, text: str) -> type[PartInsertion]:
-    """One class for each folder and what its file says, so that environments of it can share diagrams."""
+def _task_class(folder: Path, content: str) -> type[PartInsertion]:
+    """One class for each folder and what is in it, so that environments of it can share diagrams."""
     file = read_task_file(folder)
     defaults = {
         "guidance": "skgrl",

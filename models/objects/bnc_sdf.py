@@ -41,7 +41,7 @@ def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     for number, side in enumerate((1.0, -1.0)):
         lug = (at(x=side * lug_centre, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
         contents += collision(f"lug_{number}", *lug, lug_material) + visual(f"lug_{number}_visual", *lug, BRASS)
-    return model("jack", 0.05, d.barrel_height / 2, 5.0 * MM, contents)
+    return model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
 
 
 def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
@@ -57,4 +57,4 @@ def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     contents += collision("seat", *seat, SEAT)
     contents += visual("ring_visual", at(), mesh("bnc_ring.obj"), NICKEL)
     contents += visual("shell_visual", *shell, BRASS)
-    return model("plug", PLUG_MASS, d.ring_length, 8.0 * MM, contents)
+    return model("plug", PLUG_MASS, (0.0, 0.0, d.ring_length), 8.0 * MM, contents)

@@ -38,7 +38,7 @@ def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> st
     contents += collision("pad", *body, pad)
     contents += visual("body_visual", *body, GLASS)
     contents += visual("stem_visual", at(z=top + STEM_LENGTH / 2), cylinder(STEM_RADIUS, STEM_LENGTH), STEEL)
-    return model("clamp", CLAMP_MASS, d.peg_length, 20.0 * MM, contents)
+    return model("clamp", CLAMP_MASS, (0.0, 0.0, d.peg_length), 20.0 * MM, contents)
 
 
 def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
@@ -52,4 +52,4 @@ def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> st
     slab = at(z=-d.table_thickness / 2)
     contents += collision("slab", slab, box(d.table_width, d.table_width, d.table_thickness), face)
     contents += visual("slab_visual", at(), mesh("grid_clamp_slab.obj"), ALUMINIUM)
-    return model("table", 1.0, -d.table_thickness / 2, 30.0 * MM, contents)
+    return model("table", 1.0, (0.0, 0.0, -d.table_thickness / 2), 30.0 * MM, contents)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 DRAKE_NAMESPACE = 'xmlns:drake="drake.mit.edu"'
@@ -81,16 +82,26 @@ def visual(name: str, pose: str, geometry: str, color: str) -> str:
       </visual>"""
 
 
-def model(name: str, mass: float, centre_height: float, radius_of_gyration: float, contents: str) -> str:
-    """A file with one model of one link, both called `name`; mass [kg], centre of mass and gyration [m]."""
+def model(
+    name: str,
+    mass: float,
+    centre: Sequence[float],
+    radius_of_gyration: float,
+    contents: str,
+    source: str = "guiderail.models.objects",
+) -> str:
+    """A file with one model of one link, both called `name`; mass [kg], centre of mass (3,) and gyration [m].
+
+    `source` is what the file is written from, for whoever would change a number in it.
+    """
     inertia = mass * radius_of_gyration**2
     return f"""<?xml version="1.0"?>
-<!-- Written by guiderail.models.objects; change the dimensions there. -->
+<!-- Written by {source}; change the dimensions there. -->
 <sdf version="1.9" {DRAKE_NAMESPACE}>
   <model name="{name}">
     <link name="{name}">
       <inertial>
-        <pose>0 0 {centre_height:g} 0 0 0</pose>
+        <pose>{at(*centre)}</pose>
         <mass>{mass:g}</mass>
         <inertia><ixx>{inertia:.4g}</ixx><iyy>{inertia:.4g}</iyy><izz>{inertia:.4g}</izz>
           <ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia>

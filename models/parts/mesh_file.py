@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -76,7 +77,8 @@ def load_part(path: Path, unit: str) -> Part:
         unit: one of `UNITS`, of the file's numbers.
 
     Raises:
-        InputError: if the file can't be read, or is not watertight, inside out or of a size that no arm inserts.
+        InputError: if the file can't be read, or is not watertight, is hollow, inside out or of a size that no arm
+            inserts.
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
@@ -95,8 +97,9 @@ def load_part(path: Path, unit: str) -> Part:
         remedy = f"is its unit {' or '.join(fitting)}?" if fitting else f"give parts of {SMALLEST} to {LARGEST} m"
         raise InputError(f"{path.name} would be {size:.3g} m long with --unit {unit}: {remedy}")
     bodies = []
-    for body in mesh.split(only_watertight=False, repair=False):
-        _check_body(path, body)
+    found = mesh.split(only_watertight=False, repair=False)
+    for body in found:
+        _check_body(path, body, found)
         bodies.append((np.asarray(body.vertices) * UNITS[unit], np.asarray(body.faces)))
     return Part(path, tuple(bodies))
 
@@ -111,7 +114,13 @@ def _read(path: Path) -> Any:
         raise InputError(f"{path} can't be read as a mesh ({brief(str(error))}): export it again") from error
 
 
-def _check_body(path: Path, body: Any) -> None:
+def _encloses(outer: Any, inner: Any) -> bool:
+    """Whether a body with its faces outwards is around another, as far as their boxes tell."""
+    (low, high), (inner_low, inner_high) = outer.bounds, inner.bounds
+    return bool(outer.volume > 0.0 and (low < inner_low).all() and (inner_high < high).all())
+
+
+def _check_body(path: Path, body: Any, bodies: Sequence[Any]) -> None:
     edges = np.sort(body.edges, axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
     if not body.is_watertight:
@@ -125,6 +134,11 @@ def _check_body(path: Path, body: Any) -> None:
     if not body.is_winding_consistent:
         raise InputError(
             f"{path.name} has triangles that face different ways: recalculate its normals outwards, and export it again"
+        )
+    if body.volume <= 0.0 and any(_encloses(other, body) for other in bodies):
+        raise InputError(
+            f"{path.name} has a closed cavity, around {body.bounds.mean(axis=0).round(3).tolist()}: fill it where it "
+            "was drawn, as nothing touches there, and export it again"
         )
     if body.volume <= 0.0:
         raise InputError(

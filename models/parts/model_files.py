@@ -43,4 +43,4 @@ def part_sdf(
         geometry = mesh(surface.file) if surface.modulus is None else convex_mesh(surface.file)
         material = ContactMaterial(surface.friction, surface.modulus, dissipation=surface.dissipation)
         contents += collision(f"piece_{number}", at(), geometry, material)
-    return model(name, mass, centre[2], gyration, contents)
+    return model(name, mass, centre, gyration, contents, source="guiderail from task.yaml")

@@ -16,6 +16,7 @@ from guiderail.models.parts.mesh_file import need
 
 MOST_PIECES = 150
 _SLIVER = 1e-6  # of the whole volume: less is rounding
+_CONVEX = 1e-4  # of its volume: what lacks no more than that is convex
 _FLAT = 1e-2  # [rad] an edge that is less concave than this is none
 _TRIED = 6  # planes at each cut
 _SMALLEST_FACE = 2e-4  # [mm²] Drake makes a plane of each face, and fails at one of 5e-5
@@ -38,21 +39,24 @@ def as_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def convex_pieces(solid: Any, most: int = MOST_PIECES) -> list[Any] | None:
-    """Cuts a solid into convex ones; None if it takes more than `most`.
+    """Cuts a solid into convex ones; None if it takes more than `most`, or what no cut finds would be filled.
 
     Each cut is along the plane of a face beside a concave edge, whichever leaves least to be cut.
     """
-    total, todo, pieces = solid.volume(), [solid], []
+    total, filled, todo, pieces = solid.volume(), 0.0, [solid], []
     while todo:
         for part in todo.pop().decompose():
             if part.volume() < _SLIVER * total:
                 continue
-            cut = None if _hollow(part) < 1e-4 * part.volume() + _SLIVER * total else _best_cut(part, total)
+            hollow = _hollow(part)
+            cut = None if hollow < _CONVEX * part.volume() + _SLIVER * total else _best_cut(part, total)
             if cut is None:
                 pieces.append(_with_large_faces(part.hull()))
+                filled += hollow
             else:
                 todo += cut
-        if len(pieces) + len(todo) > most:
+        # Edges that are too flat to be seen one by one may be a bore.
+        if len(pieces) + len(todo) > most or filled > 2.0 * _CONVEX * total:
             return None
     return pieces
 

@@ -67,11 +67,14 @@ def demonstrated_bounds(
         raise InputError(f"outputs are numbered from 0 to {outputs.shape[2] - 1}, not {chosen}")
     starts = np.arange(phases) / phases
     lower, upper = (np.full((phases, outputs.shape[2]), inf) for inf in (-np.inf, np.inf))
-    at = np.linspace(0.0, 1.0, steps)
+    # Between the common clock's instants a sample of one's own may lie further out.
+    curves = [(np.linspace(0.0, 1.0, steps), y) for y in outputs]
+    curves += [((t - t[0]) / (t[-1] - t[0]), y) for t, y in _as_shown(demonstrations)]
     border = 1.5 / (steps - 1)
     for k, start in enumerate(starts):
-        inside = outputs[:, (at >= start - border) & (at <= start + 1.0 / phases + border)]
-        low, high = inside.min(axis=(0, 1)), inside.max(axis=(0, 1))
+        end = start + 1.0 / phases
+        inside = np.concatenate([y[(at >= start - border) & (at <= end + border)] for at, y in curves])
+        low, high = inside.min(axis=0), inside.max(axis=0)
         room = np.maximum(margin * (high - low), least)
         lower[k, chosen], upper[k, chosen] = (low - room)[chosen], (high + room)[chosen]
     changes = [np.abs(np.diff(y, axis=0) / np.diff(t)[:, None]).max(axis=0) for t, y in _as_shown(demonstrations)]

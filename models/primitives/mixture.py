@@ -59,13 +59,18 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     """
     data, center, scale = _scaled(times, outputs)
     most = min(_MOST_COMPONENTS, len(times) // 2)
-    if components is not None and not 1 <= components <= len(times) // 2:
-        raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {components}")
     candidates = [components] if components is not None else range(1, most + 1)
+    _check_components(times, candidates)
     slices = _slices(times, outputs)
     fits = [_fit(data, slices, count, seed) for count in candidates]
     best = min(fits, key=lambda fit: fit.bic(data)) if len(fits) > 1 else fits[0]
     return Mixture(best.weights_, best.means_, best.covariances_, center, scale)
+
+
+def _check_components(times: np.ndarray, candidates: Sequence[int]) -> None:
+    for count in candidates:
+        if not 1 <= count <= len(times) // 2:
+            raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")
 
 
 def information_criteria(
@@ -76,7 +81,11 @@ def information_criteria(
     Args:
         times, outputs, seed: as in `fit_mixture`.
         candidates: increasing numbers; it stops where two more have not been better than the best before.
+
+    Raises:
+        InputError: if there are fewer points than components need.
     """
+    _check_components(times, candidates)
     data, _, _ = _scaled(times, outputs)
     slices = _slices(times, outputs)
     found: dict[int, float] = {}

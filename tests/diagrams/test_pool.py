@@ -61,6 +61,19 @@ def test_two_environments_never_share_a_diagram():
         one.close()
 
 
+def test_a_diagram_whose_view_can_not_be_opened_is_free_again(monkeypatch):
+    env = make_env("NarrowPassage")
+    diagram = env.task.diagram
+    env.close()
+    with monkeypatch.context() as patch:
+        patch.setattr("guiderail.diagrams.env.View", lambda query: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            make_env("NarrowPassage", render_mode="human")
+    again = make_env("NarrowPassage")
+    assert again.task.diagram is diagram
+    again.close()
+
+
 def test_a_closed_environment_stays_closed():
     env = make_env("NarrowPassage")
     env.reset(seed=0)

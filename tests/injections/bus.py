@@ -153,6 +153,7 @@ class Bus:
             self._station_step += 1
             context = self.simulator.get_mutable_context()
             self.station.get_desired_pose_input_port().FixValue(context, self.desired())
+            self.simulator.AdvancePendingEvents()
             self.station.tell_time(context, self.step * PERIOD)
             self.simulator.AdvanceTo(self._station_step * PERIOD)
             self._settle(self.near_station)

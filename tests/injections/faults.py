@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from drake import lcmt_iiwa_status
 
-from guiderail.models.joint_status import MISSED
+from guiderail.models.joint_status import MISSED, Fault
 
 from . import bus as buses
 from .bus import PERIOD, Bus, changed, passes
@@ -21,7 +21,10 @@ MEASURED = ("joint_position_measured", "joint_velocity_estimated", "joint_torque
 
 @dataclass(frozen=True)
 class Injection:
-    """A fault: how it begins and ends, how long it lasts [s], and whether it must stop the arm; None where it may."""
+    """A fault: how it begins and ends, how long it lasts [s], and whether it must stop the arm; None where it may.
+
+    Where it must, `says` is what the station calls it, if that is always the same.
+    """
 
     kind: str
     words: str
@@ -29,6 +32,7 @@ class Injection:
     end: Callable[[Bus], None]
     lasts: float
     stops: bool | None
+    says: Fault | None = None
 
     def inject(self, bus: Bus) -> buses.Seen:
         """Lets it happen to an arm that is moving, checks what comes of it, and that the arm then goes on."""
@@ -38,6 +42,8 @@ class Injection:
         seen = bus.watch(self.lasts + 0.35, lambda: self.end(bus), self.lasts, standstill)
         if self.stops is not None and self.stops != (seen.detected is not None):
             seen.wrong.append("not detected" if self.stops else f"stopped the arm: {seen.fault}")
+        if self.stops and self.says not in (None, bus.fault):
+            seen.wrong.append(f"is called {bus.fault.name}")
         try:
             bus.run_in(0.05)
         except AssertionError as error:
@@ -194,7 +200,7 @@ def controller_held_up(seconds: float) -> Injection:
     def end(bus: Bus) -> None:
         bus.has_controller = True
 
-    return Injection("controller held up", f"{seconds} s", begin, end, seconds, _must_stop(seconds))
+    return Injection("controller held up", f"{seconds} s", begin, end, seconds, _must_stop(seconds), Fault.LATE)
 
 
 def controller_killed(seconds: float) -> Injection:

@@ -191,15 +191,25 @@ def test_damping_takes_away_exactly_what_the_arm_had_and_was_given_since(plant, 
     np.testing.assert_allclose(taken, -0.1 * momentum - given, rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize(("first", "then", "has_torque"), [(2, 3, False), (3, 3, True), (2, 2, True)])
+@pytest.mark.parametrize(("first", "then", "has_torque"), [(2, 3, False), (3, 3, True), (2, 2, True), (2, 4, True)])
 def test_a_robot_that_was_started_anew_is_not_driven_by_the_speed_that_it_had(plant, first, then, has_torque):
-    """Silence, and then another clock; a clock that jumps without it is the same robot, which is damped."""
+    """Silence, and then a clock that is behind; one that jumps without it, or ahead, is the same robot's: damped."""
     guarded = Guarded(plant)
     for status_fault in (first, first, then):
         guarded.set(status_fault=[float(status_fault)])
         guarded.go(PERIOD)
     assert guarded["safe_torque"].any() == has_torque
     assert guarded.phase == (Phase.DAMPING if has_torque else Phase.OFF)
+
+
+@pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (0.2, False)])
+def test_a_speed_of_long_ago_is_not_damped(plant, age, has_torque):
+    """Whoever was held up himself: somebody else may have stopped the arm meanwhile."""
+    guarded = Guarded(plant)
+    guarded.set(status_age=[age], status_fault=[Fault.STALE])
+    for _ in range(3):
+        assert guarded["safe_torque"].any() == has_torque
+        guarded.go(PERIOD)
 
 
 def test_what_is_wanted_of_an_arm_that_is_not_seen_fades(plant):

@@ -5,6 +5,7 @@ import sys
 import pytest
 
 import guiderail
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.models.objects import bnc_connector, grid_clamp
 from guiderail.tools.command import app, main
 from guiderail.tools.learning.run_folder import RunFolder
@@ -54,6 +55,10 @@ def trained(bead_config, tmp_path):
         (["train", "Bead", "--out", "new", "--env", "hodl=2"], "did you mean hold?"),
         (["train", "Bead", "--out", "new", "--env", "hold=two"], "give a value such as 1"),
         (["train", "Bead", "--out", "new", "--env", "wall=[1, 2]"], "give a value such as 1.0"),
+        (["train", "BncConnector", "--out", "new", "--robot", "panda"], "it is one of station='arm'"),
+        (["train", "BncConnector", "--out", "new", "--lcm-url", "memq://"], "it is one of station='hardware'"),
+        (["train", "BncConnector", "--out", "new", "--rate", "0.5"], "give --station hardware too"),
+        (["train", "BncConnector", "--out", "new", "--scenario", "lab.yaml"], "give --station hardware too"),
         (["evaluate", "new"], "not a run"),
         (["replay", "new"], "not a run"),
         (["plot", "new"], "not a run"),
@@ -255,3 +260,34 @@ def test_shipped_files_are_generated_as_they_are(capsys, tmp_path):
         assert call(capsys, "generate", what, "--out", tmp_path)[0] == 0
         for path in tmp_path.iterdir():
             assert path.read_bytes() == (folder / path.name).read_bytes(), path.name
+
+
+STATION = """
+from guiderail.diagrams.stations.registry import register_station
+
+
+@register_station("desk", world="workcell", simulated=False)
+def desk(world):
+    raise NotImplementedError
+"""
+
+
+@pytest.mark.parametrize(
+    ("typed", "robot"),
+    [([], "iiwa14"), (["--robot", "panda"], "panda"), (["--env", "robot=panda"], "panda")],
+)
+def test_a_robot_and_what_is_imported_reach_whoever_learns_on_it(typed, robot, capsys, tmp_path, monkeypatch):
+    asked = {}
+
+    def learn(task, out, other, **more):
+        asked.update(more, other=other)
+        return {"run": str(out)}
+
+    monkeypatch.setattr("guiderail.tools.operate.train_on_robot.train_on_robot", learn)
+    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # no other test has this one
+    file = tmp_path / "desk.py"
+    file.write_text(STATION)
+    typed = ["train", "BncConnector", "--station", "desk", "--import", file, "--out", "new", "--rate", "0.5", *typed]
+    assert call(capsys, *typed)[0] == 0
+    assert (asked["other"].robot, asked["other"].rate) == (robot, 0.5)
+    assert asked["given"]["imports"] == (str(file),)

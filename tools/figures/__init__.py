@@ -54,10 +54,8 @@ def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: 
     given = {k: v for k, v in given.items() if k in taken and v is not None}
     started = time.perf_counter()
     found = {"figure": number, **make(out, **given), "the thesis": THESIS[number]}
-    words = [f"guiderail reproduce {number!r}" if " " in number else f"guiderail reproduce {number}"]
-    command = " ".join(words + [f"--{key} {value}" for key, value in given.items()])
     left = {
-        "command": command,
+        "command": " ".join([command_of(number), *(f"--{key} {value}" for key, value in given.items())]),
         "seconds": round(time.perf_counter() - started, 1),
         "seeds": given.get("seeds"),
         **found,

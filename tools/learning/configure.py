@@ -15,7 +15,7 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_argumen
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act
-from guiderail.tools.tasks import check_environment, import_modules
+from guiderail.tools.tasks import check_environment, import_modules, task_content
 
 # What a finished run says about itself.
 SUMMARY = (
@@ -48,8 +48,9 @@ def configure(
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)
     return RunConfig(
-        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger
-    )
+        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger,
+        task_content(task),
+    )  # fmt: skip
 
 
 def run(
@@ -130,6 +131,7 @@ def _continued(
 ) -> RunConfig:
     """The configuration of the run that goes on; refuses what would make it another run."""
     config = folder.config()
+    config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
     stored |= {"ledger": config.ledger} | config.environment
     wanted = {**environment, **given} | ({} if task is None else {"task": task})

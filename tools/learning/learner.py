@@ -18,6 +18,15 @@ class Learner(Observer, ABC):
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The action for an observation, in the units of the action space."""
 
+    def hand_over(self) -> None:
+        """Called between episodes, when the last one's checkpoint, if it has one, is written."""
+
+    def finish(self) -> None:
+        """Called after the last episode: everything is learned when it returns."""
+
+    def close(self) -> None:
+        """Ends what it began, such as other processes, whatever they do."""
+
     @abstractmethod
     def policy(self, description: Mapping[str, Any]) -> Policy:
         """What a run leaves, as NumPy evaluates it; `description` is what else is known of it."""
@@ -39,6 +48,18 @@ class Learner(Observer, ABC):
 LEARNERS: Registry[Callable[..., Learner]] = Registry("algorithm", entry_points="guiderail.learners")
 register_learner = LEARNERS.register
 learner_names = LEARNERS.names
+
+
+def arguments_of(config: Any, task: Any) -> dict[str, Any]:
+    """What a learner is called with by name: `hold`, `seed`, `decisions` (the most that the run can take), `symmetry`.
+
+    Args:
+        config: the run's `RunConfig`.
+        task: its task.
+    """
+    decisions = config.episodes * -(-task.num_steps // config.hold)
+    symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
+    return {"hold": config.hold, "seed": config.seed, "decisions": decisions, "symmetry": symmetry}
 
 
 # These import PyTorch, which takes seconds, when one is made.

@@ -72,6 +72,8 @@ class Preset:
     # which only most of an episode is the same.
     symmetry: bool | Literal["near"] = False
     selection_window: Least = 0  # greedy successes before and after an actor that select it; 0 takes the last actor
+    # Learn in a process of its own while the next episode is simulated, and so an episode later: deterministic too.
+    pipelined: bool = False
     averaging: Share = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
 
 

@@ -21,7 +21,7 @@ from guiderail.tools.learning import older
 from guiderail.tools.learning.presets import Preset
 from guiderail.tools.rollouts.metrics import checked_rows
 from guiderail.tools.tables import read_table, table_text
-from guiderail.tools.tasks import check_environment, import_modules
+from guiderail.tools.tasks import check_environment, import_modules, task_content
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
 
@@ -41,11 +41,20 @@ class RunConfig:
     versions: dict[str, str] = field(default_factory=dict)  # that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
     ledger: bool = True  # whether every control step is written down
+    task_content: str = ""  # of a task folder: the digest of its files; empty where a run is older than that
 
     @property
     def hold(self) -> int:
         """Control steps that an action lasts."""
         return int(self.environment.get("hold", 1))
+
+    def refuse_changed_task(self, path: Path) -> None:
+        """Raises an InputError if the task's files are not those with which the run in that folder began."""
+        if self.task_content and self.task_content != task_content(self.task):
+            raise InputError(
+                f"the files of {self.task} are not those that the run in {path} began with: restore them, or train "
+                "anew in another folder"
+            )
 
 
 def installed_versions() -> dict[str, str]:
@@ -123,9 +132,10 @@ class RunFolder:
         """A run with other settings is neither trained further nor judged as if it were this one.
 
         Raises:
-            InputError: if task, environment, learner, seed or one of `also` differs.
+            InputError: if task, environment, learner, seed, the files of the task or one of `also` differs.
         """
         found = self.config()
+        found.refuse_changed_task(self.path)
         # An option that a run is older than had its default then.
         found = replace(found, environment=as_arguments(check_environment(found.task, found.environment)))
         for key in ("task", "environment", "learner", "seed", *also):
@@ -162,6 +172,11 @@ class RunFolder:
             raise InputError(f"{file} is damaged or of another version: restore it, or train anew") from error
         import_modules(config.imports)
         return config
+
+    def remove_policy(self) -> None:
+        """Removes the policy, if there is one: what learns on has another by the end."""
+        for name in ("policy.json", "policy.safetensors"):
+            (self.path / name).unlink(missing_ok=True)
 
     def write_episodes(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replaces `episodes.csv`. Numbers are written so that reading them gives the same number."""

@@ -10,8 +10,9 @@ import torch
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.learner import LEARNERS, Learner
+from guiderail.tools.learning.learner import LEARNERS, Learner, arguments_of
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.learning.student import Spaces, Student
 from guiderail.tools.rollouts.ledger import Ledger
 from guiderail.tools.rollouts.rollout import Act, Observer, rollout
 from guiderail.tools.rollouts.suited import suits
@@ -63,19 +64,19 @@ def train(
             "demonstration_episodes out"
         )
     task = cast(Any, env.unwrapped).task
-    decisions = config.episodes * -(-task.num_steps // config.hold)  # the most that the run can take
     make_learner = LEARNERS.get(config.learner.algorithm)
-    symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
-    learner = make_learner(
-        config.learner, env, hold=config.hold, seed=config.seed, decisions=decisions, symmetry=symmetry
-    )
+    named = arguments_of(config, task)
+    learner: Learner = make_learner(config.learner, env, **named)
     env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
     if not resume:
         folder.refuse_existing()
     try:
         with folder.locked():
+            if config.learner.pipelined:
+                learner = Student(learner, ((config.learner, Spaces(env)), named), waits=True)
             return _train(folder, config, env, learner, resume, report, demonstrator)
     finally:
+        learner.close()
         env.close()
 
 
@@ -91,6 +92,8 @@ def _train(
     if resume:
         rows = _resume(folder, learner, env)
         folder.write_config(config)
+        if len(rows) < config.episodes:
+            folder.remove_policy()  # killed from here on, it has one of fewer episodes than its table
     else:
         rows = []
         folder.create(config)
@@ -121,6 +124,8 @@ def _train(
             _save(folder, rows, learner, env)
             last_saving = time.perf_counter() - started
             spent_saving += last_saving
+        learner.hand_over()
+    learner.finish()
     policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
     policy.save(folder.path, write=write_atomically)
     return rows

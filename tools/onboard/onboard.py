@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE
 from guiderail.models.parts.fit import (
     RESTING,
     Motion,
@@ -123,7 +124,7 @@ def onboard(
     axis: str = "+z",
     centre: Sequence[float] | None = None,
     turn: float = 0.0,
-    force_limit: float = 35.0,
+    force_limit: float = COLLISION_FORCE,
     friction: float = 0.2,
     scenario: Sequence[Path] = (),
     say: Callable[[str], None] = lambda words: None,

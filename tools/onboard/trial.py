@@ -16,7 +16,7 @@ from guiderail.diagrams.stations.part_workcell import PLUG, SOCKET
 from guiderail.diagrams.stations.rails import RailsStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.part_file import PartTaskFile
-from guiderail.diagrams.tasks.part_insertion import PartInsertion, load_task_folder, workcell
+from guiderail.diagrams.tasks.part_insertion import PartInsertion, workcell
 from guiderail.models.parts.fit import nearest_on_surface
 from guiderail.models.parts.motion import straight
 from guiderail.systems.recorder import Recording
@@ -164,8 +164,3 @@ def triangles_of(path: Path) -> np.ndarray:
         elif kind == "f":
             corners.append([int(one.split("/")[0]) - 1 for one in rest])
     return np.array(vertices)[np.array(corners)]
-
-
-def insert_folder(folder: Path, offset: tuple[float, float] = (0.0, 0.0)) -> Trial:
-    """The scripted insertion of a finished task folder."""
-    return insert(folder.resolve(), load_task_folder(folder).file, offset=offset)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 
@@ -36,20 +35,6 @@ def end_with_input() -> None:
     def wait() -> None:
         while os.read(0, 1024):
             pass
-
-    _end_after(wait)
-
-
-def end_with_parent() -> None:
-    """Ends this process, one of `multiprocessing`'s, where the one that started it has ended."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        _end_after(parent.join)
-
-
-def _end_after(wait: Callable[[], None]) -> None:
-    def end() -> None:
-        wait()
         os._exit(1)
 
-    threading.Thread(target=end, daemon=True).start()
+    threading.Thread(target=wait, daemon=True).start()

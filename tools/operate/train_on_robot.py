@@ -13,17 +13,20 @@ import pandas as pd
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.configure import SUMMARY, configure, with_defaults
-from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.learner import LEARNERS, arguments_of
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.learning.student import Spaces, Student
 from guiderail.tools.operate.at_robot import Say, at_robot
 from guiderail.tools.operate.keys import Keys, no_pauses
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
-from guiderail.tools.operate.student import Student
 from guiderail.tools.rollouts.ledger import ledger_file, table
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import rollout
+
+UNSOUND = ("stopped", "did_not_hold", "simulation_failure")  # terminations of episodes that nobody should learn from
+NICENESS = 5  # of the gradient steps, beside whoever has to be in time
 
 
 def train_on_robot(
@@ -81,10 +84,11 @@ def _learn(
     report: Callable[[dict[str, Any]], None],
 ) -> list[dict[str, Any]]:
     """All episodes; the arm is brought to rest whatever is raised."""
-    decisions = config.episodes * -(-env.task.num_steps // config.hold)
-    named = {"hold": config.hold, "seed": config.seed, "decisions": decisions, "symmetry": env.task.symmetry}
+    named = arguments_of(config, env.task)
     acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **named)
-    student = Student(acting, ((config.learner, _Spaces(env)), named), waits=waits)
+    student = Student(
+        acting, ((config.learner, Spaces(env)), named), waits=waits, leaves_out=UNSOUND, niceness=NICENESS
+    )
     rows: list[dict[str, Any]] = []
     try:
         student.warm_up()
@@ -92,6 +96,9 @@ def _learn(
         while len(rows) < config.episodes:
             started = time.perf_counter()
             row = rollout(env, student.act, student, index=len(rows))
+            row |= {"learned_from": row["termination"] not in UNSOUND}
+            row |= {"episodes_known": student.known, "late": student.late}
+            student.hand_over()
             env.idle()
             row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
             rows.append(row)
@@ -108,15 +115,8 @@ def _learn(
         student.finish()
     except BaseException:
         env.rest()
-        student.end_now()
+        student.close()
         raise
     shape = list(env.observation_space.shape or ())
     acting.policy({"task": config.task, "observation_shape": shape}).save(folder.path, write=write_atomically)
     return rows
-
-
-class _Spaces(gymnasium.Env):
-    """Of an environment, for another process."""
-
-    def __init__(self, env: gymnasium.Env):
-        self.observation_space, self.action_space = env.observation_space, env.action_space

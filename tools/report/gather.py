@@ -17,12 +17,12 @@ from guiderail.models.policy import Policy
 from guiderail.tools.guidance import colour, is_demonstrated, label
 from guiderail.tools.learning.presets import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, cached, evaluate_run
+from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, cached, evaluate_run, kept_file
 from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
 from guiderail.tools.tables import read_table
-from guiderail.tools.tasks import check_environment, known_tasks
+from guiderail.tools.tasks import beyond_defaults, known_tasks
 
 LEARNED = "learned"
 BESIDE = ("zero", "white", "constant")  # null policies that an evaluation for a report has beside the learned one
@@ -190,6 +190,12 @@ def _judged(run: Run, episodes: int) -> pd.DataFrame:
             policy == LEARNED and not file.stem.startswith(f"{LEARNED}-{len(run.episodes)}-")
         ):
             continue
+        # An evaluation may have been asked for another environment or other episodes.
+        how: dict[str, Any] = {"episodes": len(table), "seed": HELD_OUT_SEED}
+        if file.parent.name == "beside" and file != kept_file(
+            file.parent, policy, run.config, run.config.environment, **how
+        ):
+            continue
         count = {"episodes": len(table), "successes": int(table["success"].sum())}
         where = {"study": "", "method": run.method, "seed": run.config.seed, "mark": len(run.episodes)}
         if policy not in found or found[policy]["episodes"] < len(table):
@@ -241,12 +247,8 @@ def command(config: RunConfig, out: str) -> str:
     words = ["guiderail", "train", config.task]
     environment = dict(config.environment)
     if config.task in known_tasks():
-        first: dict[str, Any] = {
-            key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment
-        }
-        usual = check_environment(config.task, first)
-        given = {key: value for key, value in environment.items() if usual.get(key, config) != value}
-        environment = {key: environment[key] for key in ("guidance",) if key in environment} | given
+        guidance = {key: environment[key] for key in ("guidance",) if key in environment}
+        environment = guidance | beyond_defaults(config.task, environment)
     if "guidance" in environment:
         words += ["--guidance", str(environment.pop("guidance"))]
     words += ["--algorithm", config.learner.algorithm, "--preset", config.preset]

@@ -13,7 +13,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.report import figures
 from guiderail.tools.report.gather import LEARNED, Gathered, Run, command, finite, flat, gather
-from guiderail.tools.report.statistics import interquartile_mean, median_survival, survival, wilson
+from guiderail.tools.report.statistics import interquartile_mean, median_survival, survival, wilson_of_each
 from guiderail.tools.rollouts.metrics import TOLERANCE, converged_after
 from guiderail.tools.tables import cell
 from guiderail.tools.thesis import differences
@@ -120,14 +120,16 @@ def _held_out(gathered: Gathered) -> Table:
         ["study", "method", "policy", "mark", "judged_on"], sort=False
     ):
         successes, episodes = int(group["successes"].sum()), int(group["episodes"].sum())
-        low, high = wilson(successes, episodes)
-        each = ", ".join(f"{row.successes}/{row.episodes}" for row in group.itertuples())
+        intervals = wilson_of_each(group["successes"], group["episodes"])
+        counts = [f"{row.successes}/{row.episodes}" for row in group.itertuples()]
+        told = [f"{low:.1%} to {high:.1%}" for low, high in intervals]
+        each = ", ".join(f"{count} ({interval})" for count, interval in zip(counts, told, strict=True))
         learned = policy == LEARNED
         name = str(method) if learned or str(method) == str(policy) else f"{method}: {policy}"
         cells = [name, str(mark) if learned and mark else "–", str(where), f"{successes}/{episodes}"]
-        cells += [f"{successes / episodes:.1%}", f"{low:.1%} to {high:.1%}", each]
+        cells += [f"{successes / episodes:.1%}", each]
         rows.append(Row([*map(Cell, cells[:-1]), Cell(cells[-1], "long")], null=not learned))
-    return Table(["who acts", "after episodes", "judged on", "successes", "rate", "95 %", "each seed"], rows)
+    return Table(["who acts", "after episodes", "judged on", "successes", "rate", "each seed, and its 95 %"], rows)
 
 
 def _seeds(methods: dict[str, list[Run]]) -> Table:

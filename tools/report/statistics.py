@@ -49,6 +49,15 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
+def wilson_of_each(successes: Sequence[int], episodes: Sequence[int]) -> list[tuple[float, float]]:
+    """The 95 % interval of each seed's success rate.
+
+    There is none of all seeds together: episodes of one policy are independent, those of several policies are not, as
+    what a seed came to decides all of its own.
+    """
+    return [wilson(won, of) for won, of in zip(successes, episodes, strict=True)]
+
+
 def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """How many of the runs have not converged after so many episodes: steps (k,) and the part (k,) from there on.
 

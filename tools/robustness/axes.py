@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
@@ -23,7 +25,7 @@ class Axis:
         name: as the command takes it.
         words: what it is, with its unit.
         values: in steps, the trained one among them where it has a number.
-        trained: what it is where the policy learned.
+        trained: what it is where a policy learned without asking for anything else.
         changed: from an environment's arguments and a value to the arguments that differ.
     """
 
@@ -110,11 +112,13 @@ class Point:
     Attributes:
         axis, value: where.
         environment: all arguments there.
+        trained: the axis's value where the policy learned; None if that is none of them, such as a whole range.
     """
 
     axis: Axis
     value: float
     environment: Environment
+    trained: float | None
 
 
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
@@ -126,15 +130,27 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
     resolved = check_environment(task, environment)
     found, left_out = [], []
     for axis in axes:
+        trained = axis.trained if _is_trained(axis, resolved) else None
         for value in axis.values:
             try:
-                changed = {} if value == axis.trained else axis.changed(resolved, value)
+                changed = {} if value == trained else axis.changed(resolved, value)
                 if axis.name == "payload" and resolved.get("station") != "arm":
                     raise InputError("a payload hangs from an arm's tool")
-                found.append(Point(axis, value, {**environment, **_checked(task, resolved, changed)}))
+                there = {**environment, **_checked(task, resolved, changed)}
+                found.append(Point(axis, value, there, trained))
             except InputError as error:
                 left_out.append(f"{axis.name} {value:g} is left out: {error}")
     return found, left_out
+
+
+def _is_trained(axis: Axis, resolved: Environment) -> bool:
+    """Whether an environment is at the axis's trained value already, as each is that asks for nothing else."""
+    try:
+        neutral = axis.changed(resolved, axis.trained)
+    except InputError:
+        return True
+    known = {option: resolved[option] for option in neutral if resolved.get(option) is not None}
+    return all(np.allclose(value, neutral[option]) for option, value in known.items())
 
 
 def _checked(task: str, resolved: Environment, changed: dict[str, Any]) -> dict[str, Any]:

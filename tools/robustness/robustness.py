@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,9 @@ from guiderail.tools.robustness.picture import draw
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, judged_once
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.rollouts.suited import as_learned
 from guiderail.tools.tables import write_table
+from guiderail.tools.tasks import changed_environment
 
 EPISODES = 30  # of each who at each place
 POLICY, DEMONSTRATION = "policy", "demonstration"
@@ -63,11 +67,11 @@ def robustness(
         raise InputError(f"robustness needs at least one episode at each place, not {episodes}")
     folder = RunFolder(run)
     config, policy = folder.config(), Policy.load(folder.path)
-    where = config.environment | dict(environment or {})
+    where = changed_environment(config.task, config.environment, environment or {})
     places, left_out = points(config.task, where, chosen_axes(axes))
     for sentence in left_out:
         tell(sentence)
-    who: dict[str, Acts] = {POLICY: lambda env: policy}
+    who: dict[str, Acts] = {POLICY: partial(as_learned, policy)}
     if is_demonstrated(where.get("guidance")):
         who[DEMONSTRATION] = still
     who |= {name: acts for name, acts in (beside or {}).items() if name != "zero" or DEMONSTRATION not in who}
@@ -85,8 +89,15 @@ def robustness(
                 rows.append(_row(place, name, judged))
     if not rows:
         raise InputError("none of these axes can be changed here: choose others with --axes")
-    table = write_table(out / "robustness", rows).with_suffix(".csv")
-    return {"table": table, "picture": draw(out / "robustness.png", rows), "rows": rows}
+    table = write_table(out / f"{_called(axes, environment or {})}.csv", rows).with_suffix(".csv")
+    return {"table": table, "picture": draw(table.with_suffix(".png"), rows), "rows": rows}
+
+
+def _called(axes: str | None, environment: Mapping[str, Any]) -> str:
+    """The name of a table, by what was asked for: another question does not replace its answer."""
+    asked = [] if axes is None else [axis.name for axis in chosen_axes(axes)]
+    asked += [f"{key}={value}" for key, value in sorted(environment.items())]
+    return re.sub(r"[^\w.=-]+", "_", "-".join(["robustness", *asked]))
 
 
 def _row(place: Point, name: str, judged: pd.DataFrame) -> dict[str, Any]:
@@ -95,7 +106,7 @@ def _row(place: Point, name: str, judged: pd.DataFrame) -> dict[str, Any]:
     return {
         "axis": place.axis.name,
         "value": float(place.value),
-        "trained": float(place.axis.trained),
+        "trained": None if place.trained is None else float(place.trained),
         "words": place.axis.words,
         "who": name,
         "episodes": len(judged),

@@ -21,9 +21,9 @@ from guiderail.tools.rollouts.metrics import converged_after, summary
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import Act, rollout
-from guiderail.tools.rollouts.suited import suits
+from guiderail.tools.rollouts.suited import as_learned, suits
 from guiderail.tools.tables import read_table, table_text
-from guiderail.tools.tasks import make_environment
+from guiderail.tools.tasks import changed_environment, make_environment, task_content
 from guiderail.tools.thesis import differences
 
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
@@ -122,13 +122,13 @@ def evaluate(
         the training; `differs_from_thesis`, in what task, learner and environment do, in words.
 
     Raises:
-        InputError: if there is no trained run, or a number is out of range.
+        InputError: if there is no trained run, a number is out of range, or its policy sees or moves other things.
     """
     folder = RunFolder(run)
     config, policy, trained = folder.config(), Policy.load(folder.path), folder.episodes()
-    where = config.environment | dict(environment or {})
+    where = changed_environment(config.task, config.environment, environment or {})
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
-    rows = evaluate_run(config, lambda env: policy, where, words="held-out episodes", **how)
+    rows = evaluate_run(config, partial(as_learned, policy), where, words="held-out episodes", **how)
     alone = pd.DataFrame()
     if is_demonstrated(where.get("guidance")):
         alone = evaluate_run(config, still, where, words="demonstration alone", **how)
@@ -177,16 +177,23 @@ def judged_once(
     Returns:
         None if what they see or move is not this environment's.
     """
-    deciding = {key: value for key, value in how.items() if key != "words"}
-    about = [] if about is None else [about]
-    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
-    digest = hashlib.blake2b(told.encode(), digest_size=6).hexdigest()
+    file = kept_file(kept, name, config, environment, about=about, **how)
     how.setdefault("words", name)
     judged = partial(evaluate_run, config, partial(_suited, acts), environment, **how)
     try:
-        return cached(kept / f"{name}-{digest}.csv", judged)
+        return cached(file, judged)
     except _NotSuitedError:
         return None
+
+
+def kept_file(
+    kept: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
+) -> Path:
+    """The file that `judged_once` keeps its rows in, named by all that decides them; the arguments are its own."""
+    deciding = {key: value for key, value in how.items() if key != "words"}
+    about = [*([] if about is None else [about]), *filter(None, [task_content(config.task)])]
+    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
+    return kept / f"{name}-{hashlib.blake2b(told.encode(), digest_size=6).hexdigest()}.csv"
 
 
 class _NotSuitedError(Exception):

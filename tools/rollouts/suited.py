@@ -1,10 +1,14 @@
 """Whether somebody who acts sees and moves what an environment has."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import gymnasium
 import numpy as np
 
+from guiderail.models.errors import InputError
+from guiderail.models.policy import Policy
 from guiderail.tools.rollouts.rollout import Act
 
 
@@ -19,3 +23,14 @@ def suits(acts: Callable[[gymnasium.Env], Act], env: gymnasium.Env) -> bool:
     except (IndexError, ValueError):
         return False
     return found == {env.action_space.shape}
+
+
+def as_learned(policy: Policy, env: gymnasium.Env) -> Act:
+    """A learned policy, in an environment that may be another one than where it learned.
+
+    Raises:
+        InputError: if what it sees or moves is not this environment's.
+    """
+    if not suits(lambda env: policy, env):
+        raise InputError("what the policy saw or moved where it learned is not what this environment has: change --env")
+    return policy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections import Counter
@@ -25,7 +26,7 @@ from guiderail.tools.rollouts.rollout import Decision, EnvObserver, Observer, ro
 from guiderail.tools.stress import EVERY, STRESSED
 from guiderail.tools.stress.recompute import Frames, RecomputedViolation, nothing_moves
 from guiderail.tools.tables import read_table, table_text
-from guiderail.tools.tasks import make_environment
+from guiderail.tools.tasks import check_environment, make_environment
 
 # Columns of an episode's row that a campaign's table has.
 COLUMNS = (
@@ -106,17 +107,20 @@ def run_campaign(
         say: is told what each round came to.
 
     Returns:
-        A row an episode: case, actions, seed, constrained, waits, `COLUMNS`, `not_finite`, `recomputed_violation`, and
-        what the witness saw.
+        A row an episode: case, actions, seed, a digest of the environment, constrained, waits, `COLUMNS`,
+        `not_finite`, `recomputed_violation`, and what the witness saw.
 
     Raises:
         InputError: if `out` holds another campaign.
     """
     kinds = [(case, name) for name in campaign.actions for case in campaign.cases]
+    wheres = {case.name: {**case.environment, **(environment or {})} for case in campaign.cases}
+    digests = {name: _digest(campaign.task, where) for name, where in wheres.items()}
     rows: list[dict[str, Any]] = read_table(out).to_dict("records") if out is not None and out.exists() else []
     for index, row in enumerate(rows):
         case, name = kinds[index % len(kinds)]
-        if (row.get("case"), row.get("actions"), row.get("seed")) != (case.name, name, seed + index) or (
+        expected = (case.name, name, seed + index, digests[case.name])
+        if tuple(row.get(key) for key in ("case", "actions", "seed", "environment")) != expected or (
             "recomputed_violation" not in row
         ):
             raise InputError(f"{out} holds another campaign: name another file")
@@ -125,7 +129,7 @@ def run_campaign(
     while not enough(rows):
         case, name = kinds[len(rows) % len(kinds)]
         if case.name not in environments:
-            env = make_environment(campaign.task, {**case.environment, **(environment or {})})
+            env = make_environment(campaign.task, wheres[case.name])
             watching: list[Observer] = [Finite(env), RecomputedViolation(env, campaign.frames)]
             watching += [campaign.witness(env)] if campaign.witness else []
             watching += [Ledger(env, ledger)] if ledger is not None else []
@@ -134,7 +138,7 @@ def run_campaign(
         own = seed + len(rows)
         act = campaign.actions[name](np.random.default_rng([own, 1]), int(np.prod(env.action_space.shape or ())))
         found = rollout(env, act, *watching, index=len(rows), seed=own, options=case.options)
-        row = {"case": case.name, "actions": name, "seed": own}
+        row = {"case": case.name, "actions": name, "seed": own, "environment": digests[case.name]}
         row |= {"constrained": int(case.constrained), "waits": int(case.waits)}
         known = [*COLUMNS, *list(found)[list(found).index("not_finite") :]]
         rows.append(row | {column: found[column] for column in known})
@@ -148,6 +152,12 @@ def run_campaign(
     return rows
 
 
+def _digest(task: str, environment: Mapping[str, Any]) -> str:
+    """What an environment comes to, in a word that no table takes for a number."""
+    resolved = json.dumps(check_environment(task, environment), sort_keys=True, default=str)
+    return f"env-{hashlib.blake2b(resolved.encode(), digest_size=6).hexdigest()}"
+
+
 def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What episodes came to: counts, and the worst of everything; a violation is of constrained guidance's commands.
 
@@ -155,7 +165,10 @@ def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     `disagreement` is the greatest difference of the two.
     """
     table = pd.DataFrame(rows)
-    own = ["case", "actions", "seed", "constrained", "waits", *COLUMNS, "not_finite", "recomputed_violation"]
+    own = [
+        "case", "actions", "seed", "environment", "constrained", "waits", *COLUMNS, "not_finite",
+        "recomputed_violation",
+    ]  # fmt: skip
     witnessed = table.columns.drop(own, errors="ignore")
     said, recomputed = (table[name].to_numpy(float) for name in ("worst_violation", "recomputed_violation"))
     constrained, bounded = table["constrained"].to_numpy() == 1, recomputed > -np.inf

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
@@ -18,6 +18,24 @@ from guiderail.tools.rollouts.metrics import STATISTICS
 FolderName = Annotated[str, Field(pattern=r"^[\w.-]+$")]
 SHIPPED = Path(__file__).parent
 LEARNED = "learned"
+
+
+def _filled_in(**words: Any) -> AfterValidator:
+    """A name whose words in braces are some of these, each with something that could stand there."""
+
+    def checked(name: str) -> str:
+        try:
+            name.format(**words)
+        except (LookupError, ValueError, TypeError, AttributeError):
+            known = ", ".join(f"{{{word}}}" for word in words)
+            raise ValueError(f"{name!r} has braces that nothing fills: it may have {known}") from None
+        return name
+
+    return AfterValidator(checked)
+
+
+RunName = Annotated[str, _filled_in(method="skgrl", seed=0, episodes=60, algorithm="tqc")]
+EvaluatedFile = Annotated[str, _filled_in(name="held_out", mark=60, episodes=100, digest="0a")]
 
 
 class _Strict(BaseModel):
@@ -57,7 +75,7 @@ class JudgedOn(_Strict):
     options: dict[str, Any] = {}  # of each reset
     episodes: int = Field(default=100, ge=1)  # how many
     first_seed: int = Field(default=HELD_OUT_SEED, ge=0)  # of the first episode; each has the next
-    file: str = "{name}-{mark}-{digest}.csv"  # in the run's folder: what was evaluated already
+    file: EvaluatedFile = "{name}-{mark}-{digest}.csv"  # in the run's folder: what was evaluated already
 
 
 class Sweep(_Strict):
@@ -99,7 +117,7 @@ class Study(_Strict):
     sweeps: tuple[Sweep, ...] = ()  # of which each value is judged on, too
     statistics: tuple[str, ...] = ()  # of training, besides the usual ones
     ratios: tuple[Ratio, ...] = ()  # what is said beside the table
-    folder: str = "{method}-{seed}"  # of a run
+    folder: RunName = "{method}-{seed}"  # of a run
     imports: tuple[str, ...] = ()  # modules or files (.py) that register what is not installed
 
     @field_validator("statistics")

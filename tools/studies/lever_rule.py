@@ -6,14 +6,13 @@ import numpy as np
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_observation import (
-    COMMAND_SCALE,
-    LEVER_SCALE,
     NUM_STEPS,
     POSE_CENTRE,
     POSE_SCALE,
 )
 from guiderail.models.demonstrations.bnc_search import HOLD_UNTIL, SEARCH
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COMMAND_SCALE, LEVER_SCALE
 from guiderail.models.objects.bnc_motion import RIM
 from guiderail.models.units import MM
 

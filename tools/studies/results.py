@@ -12,6 +12,7 @@ import pandas as pd
 
 from guiderail.models.errors import InputError
 from guiderail.tools.figures import FIGURES as MADE
+from guiderail.tools.figures import command_of
 from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.files import write_atomically
 from guiderail.tools.rollouts.metrics import TOLERANCE
@@ -93,9 +94,7 @@ def _figures(made: Mapping[str, Mapping[str, Any]], studies: Sequence[str]) -> s
         claims = [f"{_words(key)}: {cell(value)}" for key, value in found.items() if key not in NO_CLAIM]
         told: list[Any] = [number, words, "; ".join([*claims, *(["study " + ", ".join(beside)] if beside else [])])]
         told += [found.get("seeds"), f"{found['seconds'] / 60:.1f} min" if found else None, found.get("condition")]
-        command = found.get(
-            "command", f"guiderail reproduce {number!r}" if " " in number else f"guiderail reproduce {number}"
-        )
+        command = found.get("command", command_of(number))
         lines.append(f"| {' | '.join(cell(one or None).replace('|', '/') for one in told)} | `{command}` |")
     return "\n".join([*lines, ""])
 
@@ -112,7 +111,8 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     lines = [f"## {name}", "", f"`guiderail study {name} --out studies`, and the table `{name}.csv`.", ""]
     lines += [f"- Figure {number}: {THESIS[number]}." for number in FIGURES.get(name, ())]
     lines += ["", f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
-    for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
+    # A study that judges nothing has an empty column, whose cells are read as NaN.
+    for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
         told = [method, mark or "–", judged or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
     for words, methods in _differences(study).items():
@@ -123,7 +123,7 @@ def _study(name: str, rows: pd.DataFrame) -> str:
 def _numbers(group: pd.DataFrame) -> list[str]:
     """Of the seeds of a method, side by side."""
     rates, trained = group.get("success_rate", []), "training_episodes" in group
-    held_out = ", ".join("–" if pd.isna(rate) else f"{rate:.0%}" for rate in rates)
+    held_out = ", ".join("–" if pd.isna(rate) else f"{rate:.0%}" for rate in rates) or "–"
     if not trained or group["training_episodes"].isna().all():
         return [held_out, "–", "–", "–", "–"]
     converged = ", ".join("never" if pd.isna(n) else f"{n:g}" for n in group["training_converged_after"])

@@ -15,8 +15,9 @@ import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.make import known
-from guiderail.diagrams.tasks.bnc_connector import RHO, reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import RHO
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.models.smoothness import log_dimensionless_jerk, spectral_arc_length
 from guiderail.tools.guidance import colour

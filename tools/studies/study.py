@@ -11,6 +11,7 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from guiderail.tools.rollouts.evaluate import cached, evaluate_run
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.null_policies import always
 from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.rollouts.suited import as_learned
 from guiderail.tools.studies.attempts import Attempt
 from guiderail.tools.studies.board import Board
 from guiderail.tools.studies.declaration import LEARNED, JudgedOn, Ratio, Study
@@ -35,7 +37,7 @@ from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
 from guiderail.tools.studies.sweep import draw_sweeps
 from guiderail.tools.tables import write_table
-from guiderail.tools.tasks import import_modules, make_environment
+from guiderail.tools.tasks import changed_environment, import_modules, make_environment, task_content
 
 BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
@@ -223,8 +225,9 @@ def _check(job: Job) -> None:
     if policy not in (LEARNED, BEST_CONSTANT):
         untrained(job.study.task, policy)
     for judged in job.study.judgements:
-        extra = {**judged.env, **{name: low for name, (low, _) in judged.sampled.items()}}
-        configure(job.study.task, config.environment | extra, episodes=1)
+        sampled = {name: low for name, (low, _) in judged.sampled.items()}
+        where = changed_environment(config.task, config.environment, judged.env)
+        configure(job.study.task, where | sampled, episodes=1)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
         for mark in job.marks:
@@ -316,7 +319,10 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
     method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
     said = "" if judged is None else judged.model_dump_json(exclude={"name", "file"})
     # As resolved: what a difficulty stands for may change, and what was evaluated before is then another task.
-    environment = json.dumps(job.config(1).environment, sort_keys=True, default=str)
+    where = job.config(1).environment
+    if judged is not None and "difficulty" in judged.env:
+        where = changed_environment(job.study.task, where, judged.env)
+    environment = json.dumps(where, sort_keys=True, default=str) + task_content(job.study.task)
     return hashlib.blake2b((said + method + environment).encode(), digest_size=4).hexdigest()
 
 
@@ -332,7 +338,7 @@ def _evaluated_file(job: Job, mark: int, judged: JudgedOn) -> Path:
 
 def _evaluate(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
     config, policy = job.config(mark), _policy(job, mark)
-    environment = as_arguments(config.environment | judged.env)
+    environment = as_arguments(changed_environment(config.task, config.environment, judged.env))
     every, tables = judged.every if judged.sampled else judged.episodes, []
     for done in range(0, judged.episodes, every):
         rng, number = np.random.default_rng([judged.first_seed, done]), min(every, judged.episodes - done)
@@ -349,7 +355,7 @@ def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], Act]:
     if name == LEARNED:
         _refuse_gone(job, mark)
         learned = Policy.load(_policy_folder(job, mark))
-        return lambda env: learned
+        return partial(as_learned, learned)
     if name == BEST_CONSTANT:
         best = _best_constant(job)
         return lambda env: always(env, best)

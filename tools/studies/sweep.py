@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from guiderail.tools.report.statistics import wilson
+from guiderail.tools.report.statistics import wilson_of_each
 from guiderail.tools.studies.declaration import Study
 from guiderail.tools.viewing.style import legend, new_figure, save_figure
 
 
 def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
-    """Draws a panel for each sweep: success of all seeds together against the quantity, with 95 % intervals.
+    """Draws a panel for each sweep: success against the quantity, the mean of all seeds.
+
+    The band goes from the lowest to the highest end of the seeds' own 95 % intervals.
 
     Args:
         study: whose sweeps are drawn.
@@ -38,11 +40,12 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
 
 
 def _success(rows: pd.DataFrame, method: str, judged: str) -> tuple[float, float, float] | None:
-    """Of all seeds together: the success rate and the ends of its interval."""
+    """The success rate of all seeds, and the lowest and the highest end of their intervals."""
     found = rows[(rows["method"] == method) & (rows["judged_on"] == judged)]
     found = found[found["mark"] == found["mark"].max()]
     if not len(found):
         return None
-    episodes = int(found["episodes"].sum())
-    successes = round(float((found["success_rate"] * found["episodes"]).sum()))
-    return successes / episodes, *wilson(successes, episodes)
+    episodes = found["episodes"].astype(int)
+    successes = (found["success_rate"] * episodes).astype(float).round().astype(int)
+    lows, highs = zip(*wilson_of_each(successes, episodes), strict=True)
+    return successes.sum() / episodes.sum(), min(lows), max(highs)

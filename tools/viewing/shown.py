@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from guiderail.models.policy import Policy
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
 from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.rollouts.suited import as_learned
+from guiderail.tools.tasks import changed_environment
 
 
 @dataclass(frozen=True)
@@ -39,8 +42,8 @@ class Shown:
         config, policy = folder.config(), Policy.load(folder.path)
         return cls(
             task=config.task,
-            environment=config.environment | dict(environment or {}),
-            policy=lambda env: policy,
+            environment=changed_environment(config.task, config.environment, environment or {}),
+            policy=partial(as_learned, policy),
             acting="after learning",
             title=config.learner.algorithm.upper(),
             run_seed=config.seed,

@@ -150,3 +150,13 @@ def test_a_robots_clock_that_goes_back_does_not_make_it_wait(known):
     bus.time = 1.0
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
     assert bus.deputy.duty == Duty.RESTING
+
+
+def test_statuses_that_overtake_each_other_do_not_make_it_wait(known):
+    bus = Bus(known)
+    bus.status()
+    bus.command([1.0] * 7)
+    for _ in range(MISSED):
+        for ahead in (2, 0):  # the second of two comes first
+            bus.status(utime=round((bus.time + ahead * PERIOD) * 1e6))
+    assert bus.deputy.duty == Duty.DAMPING

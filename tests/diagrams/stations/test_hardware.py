@@ -10,9 +10,11 @@ import pytest
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_status
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.deputy import word_channel
 from guiderail.diagrams.stations.hardware import (
     IIWA_DRIVER,
     HardwareStation,
@@ -290,6 +292,19 @@ def test_a_real_arm_is_not_put_anywhere():
     station = HardwareStation(WORKCELL, DrakeLcm("memq://"))
     with pytest.raises(InputError, match="move it there"):
         station.set_pose(station.CreateDefaultContext(), START)
+
+
+def test_a_deputy_is_heard_in_a_larger_diagram_too():
+    lcm, builder = DrakeLcm("memq://"), DiagramBuilder()
+    station = builder.AddSystem(HardwareStation(WORKCELL, lcm, robot_timeout=0.0))
+    simulator = Simulator(builder.Build())
+    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    station.get_desired_pose_input_port().FixValue(context, START)
+    assert not station.has_deputy(context)
+    lcm.Publish(word_channel(IIWA_DRIVER.command_channel), bytes(9))
+    lcm.HandleSubscriptions(0)
+    simulator.AdvancePendingEvents()
+    assert station.has_deputy(context)
 
 
 def test_all_stations_have_the_same_ports():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
@@ -43,6 +44,25 @@ def test_a_step_for_each_status_and_without_one_after_a_while():
     assert simulator.get_context().get_time() == 5 * STATUS_PERIOD
     assert (np.diff(told.clocks) >= 0.5 * STATUS_PERIOD).all()
     assert (np.diff(told.clocks)[-2:] >= 1.5 * STATUS_PERIOD).all()
+
+
+def test_what_happens_at_an_instant_knows_the_clock_of_that_instant():
+    class Clocked(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.clock, self.seen = None, []
+            self.DeclarePeriodicUnrestrictedUpdateEvent(STATUS_PERIOD, 0.0, self._see)
+
+        def tell_time(self, context, clock):
+            self.clock = context.get_time()
+
+        def _see(self, context, state):
+            self.seen.append(self.clock)
+            return EventStatus.Succeeded()
+
+    station = Clocked()
+    RealTime(DrakeLcm("memq://"), "STATUS").advance(Simulator(station), station, 3)
+    assert station.seen == [None, 0.0, STATUS_PERIOD]
 
 
 def test_a_slower_clock_is_told_as_such():
@@ -147,6 +167,14 @@ def test_in_step_it_does_not_matter_who_is_faster():
         moved.append(plant.GetPositions(plant.GetMyContextFromRoot(simulator.get_context())))
     np.testing.assert_array_equal(*moved)
     assert np.abs(moved[0] - moved[0].round(1)).max() > 1e-4
+
+
+def test_a_word_that_is_none_answers_nothing():
+    within, lcm = DrakeLcm("memq://"), DrakeLcm("memq://")
+    simulator = Simulator(SimulatedIiwa(BncWorkcell(), within))
+    lcm.Subscribe(IIWA_DRIVER.status_channel, lambda message: lcm.Publish(IIWA_DRIVER.status_channel + TAKEN, b"yes"))
+    simulator.Initialize()
+    assert serve(simulator, within, lcm, IIWA_DRIVER, 2 * STATUS_PERIOD, 0.01) == 0.0
 
 
 @pytest.mark.parametrize(("periods", "says"), [(MISSED - 1, False), (MISSED + 1, True)])

@@ -7,11 +7,12 @@ import pytest
 import guiderail.diagrams  # noqa: F401 (registers)
 from guiderail.diagrams.make import make_env
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, reference_trajectory
-from guiderail.diagrams.tasks.bnc_options import ALIGNMENT, COLLISION_FORCE
+from guiderail.diagrams.tasks.bnc_options import ALIGNMENT
 from guiderail.diagrams.tasks.bnc_rewards import ALIGNMENT_REWARD, DEPTH_REWARD
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COLLISION_FORCE
 from guiderail.models.units import MM
 from guiderail.tools.rollouts.evaluate import evaluate_policy
 from guiderail.tools.rollouts.null_policies import still

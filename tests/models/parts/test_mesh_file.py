@@ -23,6 +23,16 @@ def inside_out(mesh):
     return mesh
 
 
+def hollow(mesh):
+    cavity = trimesh.creation.box((2.0, 2.0, 4.0))
+    cavity.invert()
+    return trimesh.util.concatenate([mesh, cavity])
+
+
+def inside_out_beside(mesh):
+    return trimesh.util.concatenate([mesh, inside_out(box()).apply_translation((30.0, 0.0, 0.0))])
+
+
 def one_flipped(mesh):
     faces = mesh.faces.copy()
     faces[3] = faces[3][::-1]
@@ -42,6 +52,8 @@ def test_a_sound_part_comes_in_metres(ending, tmp_path):
     [
         (hole, "mm", r"not watertight \(3 open edges.*close it"),
         (inside_out, "mm", "inside out.*flip its normals"),
+        (inside_out_beside, "mm", "inside out.*flip its normals"),
+        (hollow, "mm", "has a closed cavity, around .*fill it"),
         (one_flipped, "mm", "face different ways.*recalculate"),
         (lambda mesh: mesh, "m", "would be 20 m long with --unit m: is its unit mm or cm"),
     ],

@@ -11,6 +11,8 @@ from guiderail.models.parts.pieces import as_arrays, convex_pieces
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
+from manifold3d import Manifold
+
 from oracles.parts import PARTS
 
 
@@ -35,6 +37,12 @@ def test_pieces_are_convex_and_together_the_plug(name, tmp_path):
 def test_a_limit_of_pieces_is_kept(tmp_path):
     plug, _ = loaded("bayonet", tmp_path)
     assert convex_pieces(solids(plug)[0], most=3) is None
+
+
+def test_a_bore_of_many_facets_is_not_filled():
+    """Its edges are too flat to count as concave."""
+    bore = Manifold.cylinder(22.0, 5.0, 5.0, 720).translate((0.0, 0.0, -1.0))
+    assert convex_pieces(Manifold.cube((30.0, 30.0, 20.0)) - bore.translate((15.0, 15.0, 0.0))) is None
 
 
 @pytest.mark.parametrize("name", PARTS)

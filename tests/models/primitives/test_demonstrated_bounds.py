@@ -20,6 +20,14 @@ def test_every_demonstration_keeps_them(phases):
         assert bounds.holds(outputs).all()
 
 
+def test_a_demonstration_whose_samples_are_not_uniform_keeps_them_too():
+    t = np.array([0.0, 0.1, 0.13, 0.16, 1.0, 1.2, 1.7, 2.0])
+    peak = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -2.0, 0.0])
+    bounds = demonstrated_bounds(Demonstrations(t, [peak[:, None], np.zeros((8, 1))]), 2, margin=0.0)
+    np.testing.assert_array_equal(bounds.upper[:, 0], [1.0, 0.0])
+    assert bounds.lower[1, 0] == -2.0
+
+
 def test_more_phases_are_tighter():
     room = [np.mean(b.upper - b.lower) for b in (demonstrated_bounds(shown(), k) for k in (1, 2, 4, 8))]
     assert sorted(room, reverse=True) == room

@@ -162,3 +162,9 @@ def test_refuses_too_few_demonstrations():
         fit(Demonstrations(t, [np.sin(t)[:, None], np.cos(t)[:, None]]))
     with pytest.raises(InputError, match="at least 12 steps"):
         fit(Demonstrations(t[:5], [t[:5, None], 2 * t[:5, None], 3 * t[:5, None]]))
+
+
+@pytest.mark.parametrize("components", [0, 41, 1000])
+def test_refuses_components_that_there_is_nothing_for(components, together):
+    with pytest.raises(InputError, match="components must be between 1 and half the number of steps, 40"):
+        fit(together, components=components)

@@ -106,6 +106,7 @@ def test_a_policy_of_an_earlier_version_has_no_digest(learner, tmp_path):
 WRONG = [
     ("pool", 0), ("observation_shape", [10**13]), ("observation_shape", [-5]), ("observation_shape", [6]),
     ("action_low", [0.0]), ("action_high", [-1.0, -2.0]), ("action_high", [float("nan"), 3.0]),
+    ("action_low", [-(10**400), -2.0]), ("action_low", {}), ("observation_shape", 5),
 ]  # fmt: skip
 
 
@@ -125,6 +126,15 @@ def test_a_policy_whose_parts_do_not_fit_together_is_refused_in_a_sentence(entry
     (tmp_path / "policy.json").write_text(json.dumps(stored | {"format": WITHOUT_DIGEST, entry: value}))
     with pytest.raises(InputError, match="damaged"):
         Policy.load(tmp_path)
+
+
+@pytest.mark.parametrize("lacking", ["observation_shape", "action_low", "action_high", "pool"])
+def test_a_policy_of_an_image_that_is_described_in_part_is_refused(lacking):
+    layers = [(np.ones((1, 3), np.float32), np.zeros(1, np.float32))]
+    whole = {"observation_shape": [2, 2, 3], "action_low": [-1.0], "action_high": [1.0], "pool": 2}
+    Policy(layers, whole)
+    with pytest.raises(ValueError):
+        Policy(layers, {name: value for name, value in whole.items() if name != lacking})
 
 
 def test_a_missing_policy_is_refused_in_a_sentence(tmp_path):

@@ -12,6 +12,7 @@ import threadpoolctl
 from safetensors.numpy import load_file
 
 from guiderail.models.errors import InputError
+from guiderail.models.policy import Policy
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.configure import configure, run, with_defaults
 from guiderail.tools.learning.run_folder import RunFolder
@@ -136,6 +137,49 @@ def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
     train(extended, bead_config, resume=True)
     assert_same_run(long, extended)
     assert extended.config() == bead_config
+
+
+def test_a_run_that_is_killed_learning_on_has_no_policy_of_fewer_episodes(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, replace(bead_config, episodes=2))
+
+    class Killed(Exception):
+        pass
+
+    def kill(row):
+        raise Killed
+
+    with pytest.raises(Killed):
+        train(folder, replace(bead_config, episodes=3), resume=True, report=kill)
+    with pytest.raises(InputError, match="finish it with --resume"):
+        Policy.load(folder.path)
+    train(folder, replace(bead_config, episodes=3), resume=True)
+    before = Policy.load(folder.path).description
+    train(folder, replace(bead_config, episodes=3), resume=True)
+    assert Policy.load(folder.path).description == before, "of a finished one nothing is removed"
+
+
+def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+    """Whatever was not learned yet when it stopped is learned then."""
+    plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
+    config = replace(plain, learner=replace(plain.learner, pipelined=True))
+    undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
+    rows = train(undisturbed, config)
+
+    class Stop(Exception):
+        pass
+
+    def stop(row):
+        if row["episode"] == 4:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(stopped, config, report=stop)
+    train(stopped, config, resume=True)
+    assert_same_run(undisturbed, stopped)
+    # Another run than one that learns between its episodes: what is known is an episode older.
+    train(RunFolder(tmp_path / "other"), plain)
+    assert without_clock(rows) != without_clock(RunFolder(tmp_path / "other").episodes())
 
 
 def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):

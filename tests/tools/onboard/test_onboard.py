@@ -63,14 +63,18 @@ def test_its_options_are_listed(folder, capsys):
 
 
 def test_bounds_from_demonstrations_become_its_own(folder, capsys):
-    from guiderail.diagrams.make import resolve
+    from guiderail.diagrams.make import make_env, resolve
 
     before = (folder / "task.yaml").read_text()
     try:
         call("constraints", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--into", folder)
         constraints = resolve(str(folder), {}).task.constraints()
         assert constraints.G.shape[0] > 1
-        np.testing.assert_array_equal(constraints.G[0, :2, :2], np.eye(2))
+        np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
+        env = make_env(str(folder))
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
     finally:
         (folder / "task.yaml").write_text(before)
 

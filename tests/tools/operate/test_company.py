@@ -16,22 +16,6 @@ from guiderail.tools.operate.rehearsal import Other
 
 started = Other(rehearse=True, lockstep=True).standing_in("BncConnector", "memq://")
 """
-LEARNS = """
-from contextlib import nullcontext
-from multiprocessing import get_context
-from time import sleep
-
-from guiderail.tools.operate.company import end_with_parent
-
-
-def learn():
-    end_with_parent()
-    sleep(60)
-
-
-get_context("fork").Process(target=learn, daemon=True).start()
-started = nullcontext()
-"""
 WAITS = """
 with started:
     print("started", flush=True)
@@ -41,8 +25,8 @@ with started:
 
 @pytest.mark.parametrize(
     ("starts", "ends"),
-    [(SLEEPS, signal.SIGTERM), (SLEEPS, signal.SIGINT), (STANDS_IN, signal.SIGKILL), (LEARNS, signal.SIGKILL)],
-    ids=["terminated", "interrupted", "a robot's killed", "a learner's killed"],
+    [(SLEEPS, signal.SIGTERM), (SLEEPS, signal.SIGINT), (STANDS_IN, signal.SIGKILL)],
+    ids=["terminated", "interrupted", "a robot's killed"],
 )
 def test_a_process_goes_with_whoever_started_it_however_that_one_ends(starts, ends):
     with subprocess.Popen(

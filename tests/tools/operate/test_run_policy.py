@@ -12,7 +12,7 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.make import make_skill, resolve
 from guiderail.diagrams.stations.hardware import HardwareStation
 from guiderail.models.errors import InputError
-from guiderail.models.joint_status import Fault
+from guiderail.models.joint_status import Fault, StatusLimits
 from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.command import main
 from guiderail.tools.operate import checks, run_policy
@@ -172,7 +172,11 @@ def test_refuses_another_end_that_makes_no_sense(wrong, words):
 
 
 def test_the_stations_of_an_operation_have_the_same_limits():
-    station = HardwareStation(resolve("BncConnector", {}).task.world(), DrakeLcm("memq://"), robot="panda")
+    slow = StatusLimits((1.0,) * 7, max_age=0.1)
+    other = {"period": 0.002, "wrench_time_constant": 0.05, "lcm_url": "memq://x", "status_limits": slow}
+    station = HardwareStation(resolve("BncConnector", {}).task.world(), DrakeLcm("memq://"), robot="panda", **other)
     alike = station.alike(resolve("BncConnector", {}).task.world())
     assert (alike.limits, alike.impedance, alike.driver) == (station.limits, station.impedance, station.driver)
     assert alike.lcm is station.lcm
+    assert (alike.period, alike.lcm_url, alike.status_limits) == (0.002, "memq://x", slow)
+    assert len({one.GetSubsystemByName("wrench")._decay for one in (station, alike)}) == 1

@@ -14,8 +14,6 @@ from guiderail.diagrams.tasks.assemble import assemble
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
 from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.operate.at_robot import AtRobot
 from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
@@ -23,9 +21,8 @@ from guiderail.tools.operate.keys import Keys
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
 from guiderail.tools.operate.serve_iiwa import START
-from guiderail.tools.operate.student import Student
 from guiderail.tools.operate.train_on_robot import train_on_robot
-from guiderail.tools.rollouts.rollout import Decision, rollout
+from guiderail.tools.rollouts.rollout import rollout
 
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "reward": "shaped", "hold": 5}
 
@@ -161,29 +158,6 @@ def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, mon
     for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
         one._try(one._take_over)
         assert one._holds() == holds
-
-
-def test_only_sound_episodes_are_learned_from(tmp_path):
-    space = gymnasium.Env()
-    space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
-    space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    small = {"units": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_every": 1}
-    preset = resolve_preset("robust", "sac", small)
-    named = {"hold": 1, "seed": 0, "decisions": 100, "symmetry": None}
-    acting = LEARNERS.get("sac")(preset, space, **named)
-    student = Student(acting, ((preset, space), named), waits=True)
-    before = acting.actor().state_dict()["mu.weight"].clone()
-    rng, last = np.random.default_rng(0), {"success": False}
-    for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):
-        student.begin()
-        for _ in range(6):
-            observation, action = rng.uniform(-1, 1, 3).astype(np.float32), student.act(np.zeros(3, np.float32))
-            student.see(Decision(observation, action, 0.0, observation, False, False, {}))
-        columns = student.end({"termination": termination, **last})
-        assert columns == {"learned_from": termination != "stopped", "episodes_known": known, "late": 0}
-    student.finish()
-    assert (student.known, acting.decisions, acting.episodes) == (4, 24, 4)
-    assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 import itertools
 import re
 import shlex
+import shutil
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -13,7 +15,9 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import train
 from guiderail.tools.report.gather import command, gather
 from guiderail.tools.report.report import write_report
+from guiderail.tools.rollouts.evaluate import evaluate
 from guiderail.tools.rollouts.ledger import Ledger, read_ledger
+from guiderail.tools.rollouts.null_policies import NullPolicy, white
 from guiderail.tools.rollouts.rollout import rollout
 from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import make_environment
@@ -50,7 +54,8 @@ def test_a_study_is_one_page_that_needs_nothing_else(studied, tmp_path):
     text = text_of(page)
     assert "sKGRL" in text
     assert "16/20 80.0%" in text, "successes of all seeds together"
-    assert "9/10, 7/10" in text, "and of each"
+    assert "9/10 (59.6% to 98.2%), 7/10 (39.7% to 89.2%)" in text, "and of each"
+    assert "58.4%" not in text, "of all together there is no interval: their episodes are not independent"
     assert "nothing: zero" in text
     assert "Differs from the thesis in it has no task Bead" in text
     assert "guiderail study beads --out studies" in text
@@ -75,6 +80,17 @@ def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     gather([run], episodes=2)
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+
+
+def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_path):
+    run = shutil.copytree(studied / "skgrl-2", tmp_path / "run")
+    others = {"white": partial(NullPolicy, white)}
+    evaluate(run, episodes=4, environment={"wall": -0.5}, beside=others)
+    evaluate(run, episodes=4, seed=7, beside=others)
+    assert len(gather([run]).held_out) == 0
+    evaluate(run, episodes=2, beside=others)
+    judged = gather([run]).held_out
+    assert judged[["policy", "episodes"]].to_numpy().tolist() == [["white", 2]]
 
 
 def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):

@@ -38,6 +38,14 @@ def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):
     assert robustness(run, **{**how, "episodes": 2})["rows"] != first["rows"]
 
 
+def test_another_question_leaves_the_answer_to_the_first(run):
+    asked = [{}, {"axes": "wall"}, {"environment": {"hold": 2}}]
+    tables = [robustness(run, episodes=1, **one)["table"] for one in asked]
+    assert [table.name for table in tables] == ["robustness.csv", "robustness-wall.csv", "robustness-hold=2.csv"]
+    for table in tables:
+        assert all(table.with_suffix(kind).is_file() for kind in (".csv", ".md", ".png"))
+
+
 def test_a_place_where_the_policy_fails_is_named(run):
     found = robustness(run, episodes=2)
     assert -0.5 in breaks(found["rows"], "policy")["wall"]
@@ -74,6 +82,16 @@ def test_every_axis_can_be_made_or_says_why_not(task):
     names = {sentence.split()[0] for sentence in left_out}
     assert names <= {"payload", "clearance", "offsets"}
     assert all(": " in sentence for sentence in left_out)
+
+
+def test_a_policy_that_learned_with_a_whole_range_is_judged_at_each_value_of_it():
+    arguments = check_environment("BncConnector", {"friction_factor": (0.5, 2.0), "stiffness_factor": 1.7})
+    found, _ = points("BncConnector", arguments, chosen_axes("friction,stiffness,lost"))
+    at = {(point.axis.name, point.value): point for point in found}
+    assert at["friction", 1.0].environment["friction_factor"] == (1.0, 1.0)
+    assert at["stiffness", 1.0].environment["stiffness_factor"] == 1.0
+    assert at["lost", 0.0].environment == arguments
+    assert {point.axis.name: point.trained for point in found} == {"friction": None, "stiffness": None, "lost": 0.0}
 
 
 def test_offsets_go_up_to_twice_the_trained_ones():

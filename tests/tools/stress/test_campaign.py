@@ -58,6 +58,9 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path):
     assert {row["actions"] for row in whole} == set(ACTIONS)
     with pytest.raises(InputError, match="another campaign"):
         run_campaign(BEAD, at_least(6), seed=4, out=table)
+    with pytest.raises(InputError, match="another campaign"):
+        run_campaign(BEAD, at_least(8), seed=3, out=table, environment={"wall": -0.5})
+    run_campaign(BEAD, at_least(7), seed=3, out=table, environment={"wall": 1.0})  # as it is anyway
 
 
 def test_a_witness_sees_every_decision_and_a_case_takes_further_options():

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_observation import COMMAND_SCALE, LEVER_SCALE, POSE_CENTRE, POSE_SCALE
+from guiderail.diagrams.tasks.bnc_observation import POSE_CENTRE, POSE_SCALE
 from guiderail.models.errors import InputError
+from guiderail.models.insertion import COMMAND_SCALE, LEVER_SCALE
 from guiderail.models.objects.bnc_motion import RIM
 from guiderail.models.units import MM
 from guiderail.tools.studies.lever_rule import REACH, STEP, lever_rule

@@ -6,7 +6,7 @@ from guiderail.tools.figures import reproduce
 from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.studies.declaration import shipped_studies
 from guiderail.tools.studies.results import FIGURES, write_results
-from guiderail.tools.tables import write_table
+from guiderail.tools.tables import read_table, write_table
 
 
 @pytest.fixture
@@ -32,6 +32,13 @@ def test_every_seed_stands_beside_the_thesis_with_what_differs(finished, tmp_pat
     assert "guiderail study connector --out studies" in page
     (differs,) = (line for line in page.splitlines() if line.startswith("Differs from the thesis in (skgrl)"))
     assert "reward shaped (thesis: sparse)" in differs
+
+
+def test_a_study_that_judges_nothing_has_its_rows_too(finished, tmp_path):
+    table = read_table(finished / "connector.csv").iloc[:2].drop(columns="success_rate")
+    write_table(tmp_path / "unjudged" / "connector", table.assign(judged_on=""))
+    page = write_results([tmp_path / "unjudged"], tmp_path / "results").read_text()
+    assert "| skgrl | 40 | – | – | 12, never | within | 2 | 1.00 |" in page
 
 
 def test_the_page_is_written_anew_from_what_is_stored(finished, tmp_path):

@@ -231,6 +231,9 @@ WRONG = [
     ({"judged on": [{"episodes": 0}]}, "judged on"),
     ({"judged on": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
     ({"judged on": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
+    ({"folder": "{guidance}-{seed}"}, "it may have {method}, {seed}, {episodes}, {algorithm}"),
+    ({"folder": "{method}-{seed"}, "has braces that nothing fills"),
+    ({"judged on": [{"file": "{mark}-{seed}.csv"}]}, "it may have {name}, {mark}, {episodes}, {digest}"),
     ({"statistics": ["sucess_rate"]}, "did you mean success_rate"),
 ]
 

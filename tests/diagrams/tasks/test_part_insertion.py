@@ -1,0 +1,152 @@
+"""A task folder written by hand: a plug above a plate, and what is asked of the numbers in its file."""
+
+import numpy as np
+import pytest
+import yaml
+from pydrake.multibody.plant import MultibodyPlant
+
+from guiderail.diagrams.make import make_env, resolve
+from guiderail.diagrams.options import validated
+from guiderail.diagrams.tasks.part_file import Bounds
+from guiderail.diagrams.tasks.part_insertion import load_task_folder
+from guiderail.models.errors import InputError
+from guiderail.models.objects.triangle_mesh import lathe
+from guiderail.models.primitives import Demonstrations
+
+PART = {"visual": "{}.obj", "mass": 0.1, "centre": [0.0, 0.0, 0.0], "gyration": 0.01, "pieces": [{"file": "{}.obj"}]}
+BY_PHASE = {
+    "lower": [[-0.002, -0.002, None, None, None, None], [-0.001, -0.001, None, None, None, None]],
+    "upper": [[0.002, 0.002, None, None, None, None], [0.001, 0.001, None, None, None, None]],
+    "phases": [0.0, 0.5],
+}
+
+
+def part(name, **changes):
+    filled = PART | {"visual": f"{name}.obj", "pieces": [{"file": f"{name}.obj", "modulus": 1e9}]}
+    return filled | changes
+
+
+def write(folder, **changes):
+    """A folder with a task; `changes` are of what its file says."""
+    folder.mkdir(exist_ok=True)
+    for name, low, high, radius in (("plug", 0.0, 0.02, 0.005), ("socket", -0.02, -0.005, 0.015)):
+        profile = [(0.0, high), (radius, high), (radius, low), (0.0, low)]
+        (folder / f"{name}.obj").write_text(lathe(profile, 6).to_obj())
+    t = np.linspace(0.0, 1.0, 51)
+    down = [np.column_stack([a * t, -a * t, 20.0 * (1.0 - t), *3 * [0.01 * a * t]]) * 1e-3 for a in (-0.2, 0, 0.2)]
+    Demonstrations(t, down).save(folder / "demonstrations.npz")
+    said = {
+        "format": "guiderail task 1",
+        "name": f"parts/{folder.name}",
+        "plug": part("plug"),
+        "socket": part("socket", pieces=[{"file": "socket.obj"}]),
+        "motion": {"travel": 0.02, "rim": 0.01},
+        "demonstrations": {"components": 3},
+    }
+    (folder / "task.yaml").write_text(yaml.safe_dump(said | changes))
+    return folder
+
+
+def test_bounds_that_change_on_the_way_hold_at_every_step(tmp_path):
+    folder = write(tmp_path / "by_phase", bounds=BY_PHASE)
+    env = make_env(str(folder), hold=10)
+    env.reset(seed=0)
+    done = False
+    while not done:
+        *_, terminated, truncated, _ = env.step(np.ones(2))
+        done = terminated or truncated
+    assert np.abs(env.trace.commanded[26:, :2]).max() <= 0.001 + 1e-9
+    assert np.abs(env.trace.commanded[:25, :2]).max() > 0.0
+    env.close()
+    with pytest.raises(InputError, match="needs walls to keep out of"):
+        resolve(str(folder), {"guidance": "safe_residual"})
+
+
+def with_row(changed):
+    return BY_PHASE | {"lower": [BY_PHASE["lower"][0], changed]}
+
+
+@pytest.mark.parametrize(
+    ("bounds", "says"),
+    [
+        (BY_PHASE | {"phases": [0.5, 0.0]}, "begin at 0"),
+        (BY_PHASE | {"phases": [0.0, 0.0]}, "increase"),
+        (BY_PHASE | {"phases": [0.0, 1.0]}, "below 1"),
+        (BY_PHASE | {"phases": None}, "need phases"),
+        (BY_PHASE | {"phases": [0.0]}, "a list of lower and of upper ones for each"),
+        (with_row([None, -0.001, *[None] * 4]), "in every phase or in none"),
+        (with_row([float("nan"), -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row([float("inf"), -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row([10**400, -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row([True, -0.001, *[None] * 4]), "six finite numbers"),
+        (with_row(3), "six finite numbers"),
+        (BY_PHASE | {"lower": 3}, "tuple"),
+    ],
+)
+def test_bounds_that_mean_nothing_are_refused(bounds, says):
+    with pytest.raises(InputError, match=says):
+        validated(Bounds, bounds, "here")
+
+
+def test_a_bound_is_that_of_its_phase():
+    bounds = Bounds.model_validate(BY_PHASE)
+    constraints = bounds.constraints(11)
+    corner = np.array([0.0015, 0.0, 9.0, 9.0, 9.0, 9.0])
+    assert [constraints.violation(corner, step) <= 0.0 for step in (0, 4, 5, 10)] == [True, True, False, False]
+
+
+def test_a_folder_is_the_same_task_until_a_file_of_it_changes(tmp_path):
+    folder = write(tmp_path / "changed")
+    tasks = [load_task_folder(folder)]
+    for name in ("task.yaml", "demonstrations.npz", "plug.obj", "socket.obj"):
+        content = (folder / name).read_bytes()
+        (folder / name).write_bytes(content)
+        assert load_task_folder(folder) is tasks[-1]
+        if name == "demonstrations.npz":
+            Demonstrations(np.linspace(0.0, 1.0, 51), 2 * [np.zeros((51, 6))]).save(folder / name)
+        else:
+            (folder / name).write_bytes(content.replace(b"0.02", b"0.03"))
+        tasks.append(load_task_folder(folder))
+    assert len(set(tasks)) == 5
+
+
+def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp_path):
+    folder = write(tmp_path / "written")
+    task = resolve(str(folder), {}).task
+    assert task.world() is task.world()
+    assert "from task.yaml; change the dimensions there" in (folder / "plug.sdf").read_text()
+    assert sorted(path.name for path in folder.glob("*.sdf*")) == ["plug.sdf", "socket.sdf"]
+    (folder / "plug.sdf").unlink()
+    (folder / "plug.sdf").mkdir()
+    with pytest.raises(InputError, match=r"plug\.sdf cannot be written"):
+        resolve(str(folder), {}).task.world()
+
+
+def test_a_parts_mass_is_where_its_file_says(tmp_path):
+    centre = [0.001, -0.002, 0.003]
+    folder = write(tmp_path / "centred", plug=part("plug", centre=centre))
+    plant = MultibodyPlant(0.0)
+    plug = resolve(str(folder), {}).task.world().add_workpiece(plant, plant.world_frame())
+    np.testing.assert_allclose(plug.default_com(), centre)
+
+
+def test_it_starts_inside_its_bounds(tmp_path):
+    bounds = {"lower": [*[None] * 3, *[-0.01] * 3], "upper": [0.0001, None, 0.015, *[0.01] * 3]}
+    task = resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_beside": 0.002}).task
+    for seed in range(5):
+        start = task.start(np.random.default_rng(seed))
+        assert task.constraints().violation(start) <= 1e-9
+        assert start[2] == pytest.approx(0.015)
+
+
+def test_what_is_drawn_is_the_box_of_each_phase(tmp_path):
+    lower, upper = [[-0.001, -0.003], [0.0, -0.003]], [[0.002, 0.001], [0.0005, 0.001]]
+    free = [None] * 4
+    bounds = {"lower": [[*row, *free] for row in lower], "upper": [[*row, *free] for row in upper]}
+    task = resolve(str(write(tmp_path / "drawn", bounds=bounds | {"phases": [0.0, 0.5]})), {}).task
+    edges = np.array(task.scene().constraint) - task.file.place
+    for number, box in enumerate(np.split(edges, 2)):
+        np.testing.assert_allclose(box.min(axis=(0, 1)), [*lower[number], 0.0], atol=1e-12)
+        np.testing.assert_allclose(box.max(axis=(0, 1)), [*upper[number], 0.02], atol=1e-12)
+    task = resolve(str(write(tmp_path / "open", bounds={"lower": [0.0, *5 * [None]], "upper": 6 * [0.1]})), {}).task
+    assert task.scene().constraint == ()

@@ -1,0 +1,33 @@
+"""Learning in a process of its own, beside acting."""
+
+import gymnasium
+import numpy as np
+
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.presets import resolve_preset
+from guiderail.tools.learning.student import Student
+from guiderail.tools.rollouts.rollout import Decision
+
+
+def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never():
+    space = gymnasium.Env()
+    space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    small = {"units": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_every": 1}
+    preset = resolve_preset("robust", "sac", small)
+    named = {"hold": 1, "seed": 0, "decisions": 100, "symmetry": None}
+    acting = LEARNERS.get("sac")(preset, space, **named)
+    student = Student(acting, ((preset, space), named), waits=True, leaves_out=("stopped",))
+    before = acting.actor().state_dict()["mu.weight"].clone()
+    rng, last = np.random.default_rng(0), {"success": False}
+    for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):
+        student.begin()
+        for _ in range(6):
+            observation, action = rng.uniform(-1, 1, 3).astype(np.float32), student.act(np.zeros(3, np.float32))
+            student.see(Decision(observation, action, 0.0, observation, False, False, {}))
+        assert (student.known, student.late) == (known, 0)
+        student.end({"termination": termination, **last})
+        student.hand_over()
+    student.finish()
+    assert (student.known, acting.decisions, acting.episodes) == (4, 24, 4)
+    assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])

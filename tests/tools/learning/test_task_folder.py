@@ -1,0 +1,89 @@
+"""A run of a task folder is of the files that were there when it began."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import pytest
+import yaml
+
+import guiderail.models.demonstrations
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.models.errors import InputError
+from guiderail.tools.learning.configure import configure, run
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.rollouts.evaluate import kept_file
+from guiderail.tools.studies.declaration import Study
+from guiderail.tools.studies.study import Job, _digest
+from guiderail.tools.tasks import import_modules, task_content
+
+PART = {"visual": "part.obj", "mass": 0.1, "centre": [0, 0, 0], "gyration": 0.01, "pieces": [{"file": "part.obj"}]}
+TASK = {
+    "format": "guiderail task 1",
+    "name": "parts/pin",
+    "plug": PART,
+    "socket": PART,
+    "motion": {"travel": 0.02, "rim": 0.01},
+    "demonstrations": {"components": 1},
+}
+SHIPPED = Path(guiderail.models.demonstrations.__file__).parent
+
+
+@pytest.fixture
+def folder(tmp_path):
+    path = tmp_path / "pin"
+    path.mkdir()
+    shutil.copy(SHIPPED / "bnc_connector.npz", path / "demonstrations.npz")
+    (path / "part.obj").write_text("v 0 0 0\n")
+    (path / "task.yaml").write_text(yaml.safe_dump(TASK))
+    import_modules([path])
+    yield path
+    del TASKS._entries["parts/pin"]
+    gymnasium.registry.pop(environment_id("parts/pin"))
+
+
+CHANGES = {
+    "task.yaml": yaml.safe_dump(TASK | {"bounds": {"lower": [None] * 6, "upper": [None] * 6}}),
+    "part.obj": "v 0 0 1\n",
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_run_does_not_go_on_as_another_task(name, folder, tmp_path):
+    config = configure("parts/pin", {}, episodes=2, imports=[str(folder)])
+    begun = RunFolder(tmp_path / "run")
+    begun.create(config)
+    before = (folder / name).read_text()
+    (folder / name).write_text(CHANGES[name])
+    for again in (
+        lambda: run(None, begun.path, environment={}, resume=True),
+        lambda: begun.refuse_another(configure("parts/pin", {}, episodes=2)),
+    ):
+        with pytest.raises(InputError, match="the files of parts/pin are not those"):
+            again()
+    (folder / name).write_text(before)
+    begun.refuse_another(config)
+    begun.write_config(replace(config, task_content=""))  # as it was written before anybody kept this
+    (folder / name).write_text(CHANGES[name])
+    begun.refuse_another(config)
+
+
+def test_what_was_judged_of_another_task_is_not_taken_for_this_one(folder, tmp_path):
+    config = configure("parts/pin", {}, episodes=2)
+    said = {"name": "pins", "task": "parts/pin", "methods": {"zero": {"policy": "zero"}}, "seeds": [0]}
+    job = Job(Study.model_validate(said), "zero", 0, tmp_path)
+
+    def files():
+        kept = kept_file(tmp_path, "white", config, config.environment, episodes=2)
+        return kept, _digest(job), _digest(job, job.study.judgements[0])
+
+    before = files()
+    (folder / "task.yaml").write_text(yaml.safe_dump(TASK | {"measured": {"clearance": 1}}))
+    assert files() == before, "nothing reads what was measured"
+    (folder / "part.obj").write_text(CHANGES["part.obj"])
+    assert all(one != other for one, other in zip(files(), before, strict=True))
+
+
+def test_a_task_that_is_code_has_no_files():
+    assert task_content("NarrowPassage") == task_content("Bead") == ""

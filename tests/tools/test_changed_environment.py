@@ -1,0 +1,91 @@
+"""A run's environment with other arguments, wherever one can ask for them."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.certify import _what
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.report.gather import command
+from guiderail.tools.robustness.robustness import robustness
+from guiderail.tools.rollouts import evaluate
+from guiderail.tools.rollouts.suited import as_learned
+from guiderail.tools.studies.declaration import Study
+from guiderail.tools.studies.study import Job, run_job
+from guiderail.tools.tasks import changed_environment, check_environment, make_environment
+from guiderail.tools.viewing.shown import Shown
+
+HARD = {"difficulty": "hard"}
+
+
+def policy(seen, moved):
+    """A network of zeros."""
+    layers = [(np.zeros((moved, seen), np.float32), np.zeros(moved, np.float32))]
+    return Policy(layers, {"observation_shape": [seen], "action_low": [-1.0] * moved, "action_high": [1.0] * moved})
+
+
+@pytest.mark.parametrize("task", ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"])
+def test_another_difficulty_is_what_it_stands_for_and_keeps_what_was_chosen(task):
+    chosen = {"hold": 3, "reward": "sparse"}
+    standard, hard = (check_environment(task, chosen | more) for more in ({}, HARD))
+    assert standard != hard | {"difficulty": "standard"}
+    assert changed_environment(task, standard, HARD) == hard
+    assert changed_environment(task, hard, {"difficulty": "standard"}) == standard
+    assert changed_environment(task, hard, {**HARD, "hold": 4}) == hard | {"hold": 4}
+    assert changed_environment(task, standard, {"hold": 4}) == standard | {"hold": 4}
+
+
+class _AskedFor(Exception):
+    """An environment that is not needed."""
+
+
+def by_study(out):
+    said = {"name": "one", "task": "GridClamp", "methods": {"zero": {"policy": "zero"}}, "seeds": [1]}
+    run_job(Job(Study.model_validate(said | {"judged on": [{"env": HARD, "episodes": 2}]}), "zero", 1, out))
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda run: evaluate.evaluate(run, environment=HARD),
+        lambda run: robustness(run, environment=HARD, axes="friction"),
+        by_study,
+    ],
+    ids=["evaluate", "robustness", "study"],
+)
+def test_a_policy_is_judged_at_another_difficulty(ask, tmp_path, monkeypatch):
+    def refuse(task, environment):
+        raise _AskedFor(dict(environment))
+
+    RunFolder(tmp_path).create(configure("GridClamp", {}, episodes=1))
+    RunFolder(tmp_path).write_episodes([{"episode": 0, "return": 0.0, "success": 0, "termination": "", "steps": 1}])
+    policy(3, 2).save(tmp_path)
+    monkeypatch.setattr(evaluate, "make_environment", refuse)
+    with pytest.raises(_AskedFor) as found:
+        ask(tmp_path)
+    assert found.value.args[0]["force_limit"] == check_environment("GridClamp", HARD)["force_limit"]
+
+
+def test_a_policy_is_shown_and_certified_at_another_difficulty(tmp_path):
+    RunFolder(tmp_path).create(configure("NarrowPassage", {}, episodes=1))
+    policy(3, 2).save(tmp_path)
+    hard = check_environment("NarrowPassage", HARD)
+    assert Shown.of_run(tmp_path, HARD).environment == hard
+    assert _what(str(tmp_path), HARD)[1] == hard
+
+
+def test_a_policy_that_sees_or_moves_other_things_is_refused_in_a_sentence():
+    env = make_environment("Bead", {})
+    as_learned(policy(3, 2), env)
+    for other in (policy(4, 2), policy(3, 1)):
+        with pytest.raises(InputError, match="saw or moved where it learned"):
+            as_learned(other, env)
+
+
+@pytest.mark.parametrize("chosen", [{"difficulty": "hard"}, {"station": "arm", "hold": 7}])
+def test_the_command_of_a_run_says_what_is_not_the_tasks_own(chosen):
+    words = command(configure("BncConnector", {"guidance": "kgrl", **chosen}), "out").split()
+    given = [word for word in words if "=" in word]
+    assert given == [f"{key}={value}" for key, value in chosen.items()]
