@@ -49,11 +49,11 @@ bench: $(VENV)/.ready
 gallery: $(VENV)/.ready
 	$(BIN)/python docs/make_gallery.py
 
-# Nothing is fetched: pictures and the reference are made from the code, a warning and a broken link are errors.
+# Nothing is fetched: code in pages is run, the reference is made from the code, a warning and a broken link are errors.
 docs: $(VENV)/.docs
-	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build
-	$(BIN)/python docs/check_links.py docs/_build
-	@echo docs/_build/index.html
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python docs/check_links.py docs/_build/html
+	@echo docs/_build/html/index.html
 
 $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"
@@ -65,4 +65,4 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist docs/_build docs/pictures/*.svg docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) build dist docs/_build docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache

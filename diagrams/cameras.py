@@ -129,14 +129,17 @@ def check_rendering() -> None:
         ) from None
 
 
-def open_meshcat() -> tuple[Meshcat, MeshcatVisualizer]:
+def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
     """A browser view, on this machine only: Meshcat would listen on every interface by default.
+
+    Args:
+        meshcat: a page that is there already; a new one unless given.
 
     Raises:
         InputError: if the environment forbids Drake to open a port at all.
     """
     try:
-        meshcat = Meshcat(MeshcatParams(host="localhost"))
+        meshcat = meshcat or Meshcat(MeshcatParams(host="localhost"))
     except RuntimeError as error:
         raise InputError(
             f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"

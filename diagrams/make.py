@@ -164,7 +164,10 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     exported = render_mode if render_mode == "rgb_array" else None
     key = _key(resolved, exported)
     built = _POOL.take(key, lambda: _build(resolved, exported))
-    # What a run hides is the task's: it is this environment's own, whoever had the diagram before.
+    # What a run hides is the task's: it is this environment's own, whoever had the diagram before. What a reset sets in
+    # the diagram is the diagram's.
+    assert built.diagram.declaration is not None
+    resolved.task.drawn = built.diagram.declaration.drawn
     reset = randomizes(resolved.task, built.station, built.guidance)
     diagram = replace(built.diagram, randomize=reset, declaration=resolved.task)
     release = partial(_POOL.give_back, key, built)

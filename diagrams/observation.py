@@ -21,7 +21,7 @@ class Observed:
 
     Attributes:
         signal: its name: a port of station, guidance or task, or one of `CLOCKS`.
-        centre, scale: numbers, or one per entry, in the signal's unit.
+        centre, scale: numbers, or one per entry (n,), in the signal's unit.
         entries: which of the signal's numbers; all unless given.
     """
 

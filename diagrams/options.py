@@ -52,6 +52,9 @@ class PrimitiveOptions(Options):
     lambda_: Number = Field(6.0, ge=0, description="λ of problem 4.5")
     beta: Number = Field(6.0, gt=0, description="β of problem 4.5")
     inverse_length: Number = Field(2.0, gt=0, description="of the kernel")
+    via_points: Numbers = Field(
+        (), description="what the mean passes through: a control step and an output each, one after another"
+    )
     solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="of the constrained primitive's QP")
 
 

@@ -18,17 +18,18 @@ class View:
 
     meshcat: Meshcat
 
-    def __init__(self, query: OutputPort):
+    def __init__(self, query: OutputPort, meshcat: Meshcat | None = None):
         """
         Args:
             query: of a scene graph inside a diagram.
+            meshcat: a page that is there already; a new one unless given.
 
         Raises:
             InputError: if the environment forbids Drake to open a port at all.
         """
         self._query = query
         visualizer: MeshcatVisualizer
-        self.meshcat, visualizer = open_meshcat()
+        self.meshcat, visualizer = open_meshcat(meshcat)
         self._visualizer = visualizer
         self._context = visualizer.CreateDefaultContext()
         self._published = -1.0  # s, when it was last

@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +24,12 @@ from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.models.policy import Policy
 from guiderail.tools.learning.configure import run
+from guiderail.tools.onboard.onboard import onboard
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
 from guiderail.tools.rollouts.rollout import Act, rollout
 from guiderail.tools.studies.scripted import untrained
-from guiderail.tools.tasks import make_environment
+from guiderail.tools.tasks import make_environment, task_named
 from guiderail.tools.viewing.film import path_in_picture
 from guiderail.tools.viewing.passage import draw_world
 
@@ -40,6 +42,7 @@ REST = 2000  # ms, at the end
 GREEN, DARK, RED = (0, 150, 60), (28, 31, 36), (179, 38, 30)
 SCALE = 2  # lines are drawn so much larger first, as nothing here smooths them
 LEARNING_EPISODES = 32  # as many as `make demo`
+SCRATCH = tempfile.TemporaryDirectory()
 
 
 @dataclass
@@ -47,7 +50,7 @@ class Panel:
     """An episode in a picture: who acts in what, and after it was run, what was seen of it."""
 
     title: str
-    task: str
+    task: str | Callable[[], str]
     environment: dict[str, Any]
     act: Callable[[Any], Act]
     seed: int = 1_000_000
@@ -68,7 +71,8 @@ class Panel:
 
 def run_panel(panel: Panel, size: tuple[int, int], every: int | None) -> None:
     """Runs the episode; a camera looks at every so many control steps, or a plane is drawn once where that is None."""
-    env = make_environment(panel.task, panel.environment, render_mode=None if every is None else "rgb_array")
+    task = panel.task if isinstance(panel.task, str) else panel.task()
+    env = make_environment(task, panel.environment, render_mode=None if every is None else "rgb_array")
     base: Any = env.unwrapped
     env.reset(seed=0)
     act, period = panel.act(env), base.task.control_period
@@ -163,6 +167,13 @@ def _worst(row: dict[str, Any]) -> str:
     return "no command outside" if outside <= TOLERANCE else f"{1000 * outside:.0f} mm into the forbidden zone"
 
 
+def _within(row: dict[str, Any]) -> str:
+    outside = 1000 * row["worst_violation"]
+    bound = "no command outside" if row["worst_violation"] <= TOLERANCE else f"{outside:.2f} mm outside"
+    words = str(row["termination"]).replace("_", " ")
+    return f"{words}, {bound}, jerk {row['jerk_commanded_linear']:.1f} m/s³"
+
+
 def _obstacle(row: dict[str, Any]) -> str:
     return f"goal reached, obstacle cost {abs(row['reward_obstacle_cost']):.1f}"
 
@@ -178,6 +189,26 @@ def _learned(env: Any) -> Act:
 
 def _right(env: Any) -> Act:
     return NullPolicy(lambda rng, size: lambda observation: np.array([1.0, 0.0]), env)
+
+
+@cache
+def _onboarded(name: str) -> str:
+    """A task made of one of the tests' drawings, as `guiderail onboard` makes it; its name."""
+    sys.path.insert(0, str(HERE.parent / "tests"))
+    try:
+        from oracles.parts import PARTS
+    finally:
+        sys.path.remove(str(HERE.parent / "tests"))
+    folder, drawn = Path(SCRATCH.name) / name, PARTS[name]()
+    folder.mkdir()
+    turn = float(dict(zip(drawn.options[::2], drawn.options[1::2], strict=True)).get("--turn", 0.0))
+    onboard(*drawn.write(folder), folder / "task", unit="mm", turn=turn)
+    return task_named(str(folder / "task"))[0]
+
+
+def _beside(distance: float) -> dict[str, Any]:
+    """The socket so far from where it is believed to be [m]."""
+    return {"guidance": "kgrl", "uncertainty": "disc", "offset_range": [distance, distance]}
 
 
 PASSAGE, SQUARE = (240, 350), (320, 240)
@@ -222,6 +253,34 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
         SQUARE,
         8,
     ),
+    "connector_methods": (
+        lambda: [
+            Panel(
+                title,
+                "BncConnector",
+                {"difficulty": "hard", **guidance},
+                untrained("BncConnector", "rule"),
+                seed=1_000_002,
+                says=_within,
+            )
+            for title, guidance in (
+                ("a rule by hand, through KGRL", {"guidance": "kgrl"}),
+                ("sKGRL, adaptive history", {"guidance": "skgrl", "adaptive_history": True}),
+                ("residual, the same reach", {"guidance": "residual", "kappa": 1.85}),
+            )
+        ],
+        SQUARE,
+        8,
+    ),
+    "parts": (
+        lambda: [
+            Panel("a bayonet: demonstration", partial(_onboarded, "bayonet"), _beside(0.0), still),
+            Panel("the same, socket 1.5 mm beside", partial(_onboarded, "bayonet"), _beside(0.0015), still),
+            Panel("a snap-fit: demonstration", partial(_onboarded, "snap_fit"), _beside(0.0), still),
+        ],
+        SQUARE,
+        8,
+    ),
     "clamp": (
         lambda: [
             Panel("straight down", "GridClamp", {"seconds": 5.0}, untrained("GridClamp", "straight_descent")),
@@ -251,12 +310,12 @@ def draw(name: str) -> tuple[list[Panel], list[Image.Image], float]:
     return panels, compose(panels, size, np.linspace(0.0, end, FRAMES)), end
 
 
-def make(folder: Path, names: Sequence[str] = ()) -> None:
-    """Makes the pictures of these names, and those that are missing where none is named."""
+def make(folder: Path, names: Sequence[str]) -> None:
+    """Makes the pictures of these names."""
     folder.mkdir(exist_ok=True)
     log = folder / "gallery.json"
     told = json.loads(log.read_text(encoding="utf-8")) if log.is_file() else {}
-    for name in names or [name for name in PICTURES if not (folder / f"{name}.webp").is_file()]:
+    for name in names:
         panels, frames, seconds = draw(name)
         save(folder / f"{name}.webp", frames, seconds)
         told[name] = {panel.title: panel.ending() for panel in panels}

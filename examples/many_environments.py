@@ -1,14 +1,17 @@
 """How do I step many environments at once? Gymnasium's own vector environment, a process each: as many as cores."""
 
+import multiprocessing
+
 import gymnasium
 
 if __name__ == "__main__":  # each process imports this file first
+    multiprocessing.set_forkserver_preload(["guiderail.diagrams.make"])  # once, and not by each of them
     envs = gymnasium.make_vec(
         "guiderail.diagrams:guiderail/NarrowPassage-v0",  # so that each process registers it, too
         num_envs=2,
         vectorization_mode="async",
-        # A process that is begun anew: one that is forked shares a parent's threads' locks.
-        vector_kwargs={"context": "spawn"},
+        # Forks of a process that is begun anew: forks of this one would share its threads' locks.
+        vector_kwargs={"context": "forkserver"},
         guidance="skgrl",
         hold=5,
     )

@@ -72,7 +72,8 @@ class LcNsKmpSystem(LeafSystem):
             gain: (O,), raw null-space action per unit of the policy's action (`models.primitives.gains`); ones unless
                 given.
             period: between two control steps [s], positive: that of the reference trajectory.
-            shorter: primitives of the same motion and constraints with histories of 1 … P − 1 outputs, and their gains.
+            shorter: primitives of the same motion and constraints with histories of 1 … P − 1 outputs, and their
+                gains (O,).
 
         Raises:
             InputError: if a gain has the wrong shape or is not finite, the period is not positive, or a shorter history

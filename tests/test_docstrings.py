@@ -68,6 +68,45 @@ def refuses(function):
     return any(isinstance(one.func, ast.Name) and one.func.id == "InputError" for one in raised)
 
 
+def entries(described):
+    """Of each argument that a section lists, what it says."""
+    found, names = {}, []
+    for line in described.splitlines():
+        entry = re.match(r"^    (\S[\w, /*]*):\s+(.*)$", line)
+        if entry:
+            names = [name.strip(" *") for name in re.split("[,/]", entry[1])]
+        for name in names:
+            found[name] = f"{found.get(name, '')} {entry[2] if entry else line.strip()}"
+    return found
+
+
+# (N,), (n, 6), (H+1, O, O) or (∗, 7); or the word.
+SHAPE = re.compile(r"\((?:[\w ]|[+−∗·…()])+(?:, ?[^)]*|,)\)|\bshape")
+
+
+def is_array(annotation):
+    return bool(re.search("ndarray|ArrayLike", str(annotation))) and "Callable" not in str(annotation)
+
+
+@pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
+def test_what_is_exported_says_what_shape_its_arrays_have(thing):
+    said = []
+    for name, function in functions(thing).items():
+        doc, signature = documented(function, thing), inspect.signature(function)
+        described = entries(section(doc, "Args") + section(doc, "Attributes"))
+        for argument, parameter in signature.parameters.items():
+            if is_array(parameter.annotation):
+                said.append((f"{name}({argument})", described.get(argument, doc)))
+        if is_array(signature.return_annotation):
+            said.append((f"what {name} returns", doc))
+    if dataclasses.is_dataclass(thing):
+        doc = inspect.getdoc(thing)
+        described = entries(section(doc, "Attributes") + section(doc, "Args"))
+        said += [(one.name, described.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)]
+    missing = [name for name, words in said if not SHAPE.search(words)]
+    assert not missing, f"{', '.join(missing)}: no shape is given"
+
+
 @pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
 def test_what_is_exported_says_what_it_is_and_refuses(thing):
     assert (inspect.getdoc(thing) or "").strip()

@@ -38,11 +38,3 @@ def bare(code, tmp_path):
 def test_importing_costs_nothing_before_a_name_is_used(tmp_path):
     code = "import sys, guiderail; print(guiderail.__version__, 'pydrake' in sys.modules, 'torch' in sys.modules)"
     assert bare(code, tmp_path).stdout.split()[1:] == ["False", "False"]
-
-
-def test_gymnasium_makes_an_environment_in_one_go(tmp_path):
-    code = (
-        "import gymnasium; env = gymnasium.make('guiderail.diagrams:guiderail/NarrowPassage-v0', guidance='kmp'); "
-        "print(env.reset(seed=0)[1]['control_steps'])"
-    )
-    assert bare(code, tmp_path).stdout.split() == ["0"]

@@ -52,16 +52,17 @@ def test_every_file_is_in_the_wheel(packages):
     assert all(path.name in ("guiderail",) or path.suffix == ".dist-info" for path in installed.iterdir())
 
 
-def test_every_module_imports_from_the_wheel(packages):
+def test_every_module_imports_from_the_wheel(packages, forks):
     _, installed = packages
     modules = sorted(
         ".".join(path.relative_to(installed).with_suffix("").parts).removesuffix(".__init__")
         for path in (installed / "guiderail").rglob("*.py")
     )
     code = (
-        f"import sys, importlib; sys.path.insert(0, {str(installed)!r}); sys.meta_path = "
+        "import sys, importlib\nfor name in [name for name in sys.modules if name.split('.')[0] == 'guiderail']: "
+        f"del sys.modules[name]\nsys.path.insert(0, {str(installed)!r}); sys.meta_path = "
         "[f for f in sys.meta_path if 'editable' not in getattr(f, '__module__', str(f))]\n"
         f"for name in {modules!r}: module = importlib.import_module(name); assert {str(installed)!r} in module.__file__"
     )
-    result = subprocess.run([sys.executable, "-c", code], cwd=installed, capture_output=True, text=True)
+    result = forks.run("-c", code, folder=installed)
     assert result.returncode == 0, result.stderr

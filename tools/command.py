@@ -4,7 +4,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -156,6 +156,9 @@ def train(
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
     ] = None,
+    with_person: Annotated[
+        bool, _opt("Somebody watches in the browser, pushes, stops, and says what was a success.", "--with-person")
+    ] = False,
     lcm_url: Annotated[str | None, _opt("Of a robot: the URL of LCM.  [default: LCM's own]")] = None,
     robot: Annotated[str | None, _opt("Which arm.  [default: the station's]", of="robots")] = None,
     rehearse: Rehearse = False,
@@ -182,7 +185,7 @@ def train(
     words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
     words |= {"uncertainty": uncertainty, "station": station, "robot": robot, "lcm_url": lcm_url}
     environment = {k: v for k, v in words.items() if v is not None} | _environment(env)
-    if folders and task is not None and not resume:
+    if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.recording.followed import leaves_demonstrations
 
         if (sentence := leaves_demonstrations(task, environment)) is not None:
@@ -192,8 +195,11 @@ def train(
         there |= {"rehearse": rehearse, "lockstep": lockstep} | ({} if rate is None else {"rate": rate})
         given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
         given |= {"ledger": ledger, "imports": modules}
-        if task is None or out is None or resume:
-            raise InputError("on a robot a run begins anew: name a task and a folder, without --resume")
+        if task is None or out is None or resume or with_person:
+            raise InputError(
+                "on a robot a run begins anew and nobody pushes through a page: name a task and a folder, without "
+                "--resume and --with-person"
+            )
         from guiderail.tools.operate.rehearsal import Other
         from guiderail.tools.operate.train_on_robot import train_on_robot
 
@@ -227,6 +233,7 @@ def train(
         resume=resume,
         imports=modules,
         ledger=ledger,
+        person=_person if with_person else None,
         demonstrator=_rule,
     )
     _print(summary, as_json)
@@ -242,27 +249,26 @@ def evaluate(
         str | None,
         _opt("Who else meets the same episodes, or none.  [default: zero, white and constant actions, and the rule]"),
     ] = None,
+    fresh: Annotated[bool, _opt("Draw anew in every episode what is hidden in the run.", "--fresh")] = False,
     as_json: Json = False,
 ) -> None:
     """Evaluate a run's policy on what training never met, beside policies that learned nothing.
 
     It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
-    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again.
+    episodes: what they come to is what a success is worth. Their episodes are kept, and not run again. To be a policy
+    for the offset that a run hides, or with --fresh for any, are two claims: which of them, is printed first.
     """
     from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 
     environment = _environment(env)
     others = _beside(run, environment, beside)
-    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others)
+    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others, fresh=fresh)
     for name in others:
         if name not in found["beside"]:
             _say(f"{name} is left out: it sees or moves other things than this environment")
     differs = [] if as_json else found.pop("differs_from_thesis")
     _print(found, as_json)
-    if differs:
-        typer.echo("differs from the thesis in")
-    for words in differs:
-        typer.echo(f"  · {words}")
+    _print_differences(differs)
 
 
 @command("robustness runs/connector --env station=mujoco --episodes 50")
@@ -516,7 +522,10 @@ def study(
     from guiderail.tools.studies.study import study_command
 
     found = study_command(chosen, out, running)
+    differs = {} if as_json else found.pop("differs_from_thesis", {})
     _print(found, as_json)
+    for methods, words in differs.items():
+        _print_differences(words, f" ({methods})")
     if "failed" in found:
         raise RunsFailedError(found["failed"], None)
 
@@ -990,6 +999,15 @@ def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dic
     return {name: untrained(config.task, name, config.seed) for name in chosen}
 
 
+def _person() -> Any:
+    """Whoever opens the page; nothing goes on before."""
+    from guiderail.tools.operate.page_person import PagePerson
+
+    person = PagePerson(_tell)
+    person.wait()
+    return person
+
+
 def _rule(task: str) -> Any:
     """The rule written by hand for a task, which demonstrates it to a learner."""
     from guiderail.tools.studies.scripted import untrained
@@ -1009,6 +1027,14 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int)
 
     arguments = check_environment(shown, environment)
     return showing.Shown(shown, arguments, untrained(shown, policy), policy, policy, seed=seed)
+
+
+def _print_differences(differs: Sequence[str], of: str = "") -> None:
+    """In what something differs from the thesis, line by line."""
+    if differs:
+        typer.echo(f"differs from the thesis in{of}")
+    for words in differs:
+        typer.echo(f"  · {words}")
 
 
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:

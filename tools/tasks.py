@@ -13,7 +13,9 @@ from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
+from guiderail.diagrams.options import Options
 from guiderail.diagrams.register import register_envs
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_task_folder
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
@@ -153,7 +155,8 @@ def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]
 def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """A run's arguments of its environment, with others in their place.
 
-    Another difficulty is other settings: those that the run has of its own difficulty alone make way for them.
+    Another difficulty is other settings: those that the run has of its own difficulty alone make way for them. Another
+    station has no options of the run's station that it doesn't know.
 
     Args:
         task: the run's.
@@ -163,10 +166,20 @@ def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapp
     Raises:
         InputError: if there is no such difficulty.
     """
+    gone = _of_the_station_alone(environment.get("station"), changes.get("station"))
+    environment = {key: value for key, value in environment.items() if key not in gone}
     own = environment.get("difficulty")
     if changes.get("difficulty", own) == own:
         return {**environment, **changes}
     return check_environment(task, {**beyond_defaults(task, environment), **changes})
+
+
+def _of_the_station_alone(own: Any, other: Any) -> set[str]:
+    """The options that a station has and another one doesn't."""
+    if other in (None, own) or not {own, other} <= {*STATIONS.names()}:
+        return set()
+    mine, its = ((STATIONS.get(name).options or Options).model_fields for name in (own, other))
+    return {*mine} - {*its}
 
 
 def _is_like(value: Any, default: Any) -> bool:

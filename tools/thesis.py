@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from guiderail.diagrams.tasks.task import STANDARD
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.units import MM
 from guiderail.tools.learning.presets import PRESETS, Preset, decision_discount
@@ -61,6 +62,10 @@ _SCALE = (
     _always,
 )
 _SIMULATED = ("simulated (thesis: a real robot, the DLR SARA)", _always)
+_HARDER = (
+    "difficulty {difficulty!r}, which is ours: `guiderail list` has its numbers (thesis: one setting of each task)",
+    lambda environment: environment.get("difficulty", STANDARD) != STANDARD,
+)
 
 THESIS = {
     "NarrowPassage": Setting(
@@ -69,6 +74,7 @@ THESIS = {
         "table_4_1_simulation",
         ("tqc",),
         (
+            _HARDER,
             ("passage, obstacle and goal of our own dimensions (thesis: none are given)", _always),
             ("nine demonstrations that a program draws at random (thesis: of a person)", _always),
             _SCALE,
@@ -86,6 +92,7 @@ THESIS = {
         "table_4_1_robot",
         ("tqc",),
         (
+            _HARDER,
             _SIMULATED,
             ("five demonstrations of a script (thesis: of a hand)", _always),
             (
@@ -103,6 +110,7 @@ THESIS = {
         "table_3_2_sara",
         ("sac",),
         (
+            _HARDER,
             _SIMULATED,
             ("a template that is slower upwards than downwards (thesis: no speeds are given)",
              _where("guidance", "sct")),
@@ -116,10 +124,13 @@ THESIS = {
             "reward": ("shaped", "sparse", "hand_shaped"),
             "input_speed": (None, 1.0),
             "mug_offset": (0.0,),
+            "balls": (2,),
+            "ball_diameter": (0.04,),
         },
         "table_3_2_iiwa",
         ("sac", "tqc"),
         (
+            _HARDER,
             ("distances of equation 3.7 are weighted: 0.2 m count as much as the whole tilt (thesis: no weights)",
              _where("reward", "shaped")),
             ("inputs 1.7 times as fast as the template's (thesis: the template's)", lambda e: (
@@ -162,8 +173,13 @@ _COMPARED = ("learning_rate", "soft_update", "train_every", "gradient_steps", "e
 _TABLE_3_2_ONLY = ("learning_starts", "batch_size")
 
 
-def differences(config: RunConfig) -> list[str]:
-    """What a run differs in from the thesis, in words; that there is no such task in it, if there is none."""
+def differences(config: RunConfig, *, learns: bool = True) -> list[str]:
+    """What a run differs in from the thesis, in words; that there is no such task in it, if there is none.
+
+    Args:
+        config: of the run.
+        learns: whether somebody learns in it; otherwise the learner's settings say nothing.
+    """
     setting = THESIS.get(config.task)
     if setting is None:
         return [f"it has no task {config.task}"]
@@ -173,7 +189,7 @@ def differences(config: RunConfig) -> list[str]:
             continue
         if not any(_same(environment[name], value) for value in values):
             found.append(f"{_words(name)} {_value(environment[name])} (thesis: {_either(values)})")
-    found += _learner_differences(config, setting)
+    found += _learner_differences(config, setting) if learns else []
     chamfer = environment.get("mouth_chamfer", BncDimensions().mouth_chamfer)
     known = {"kappa": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
     found += [words.format(**known) for words, holds in setting.remarks if holds(environment)]

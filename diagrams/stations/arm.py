@@ -11,6 +11,7 @@ from pydrake.multibody.tree import FixedOffsetFrame, Frame, JointActuator, Model
 from pydrake.systems.framework import Context, DiagramBuilder, InputPort, OutputPort
 from pydrake.systems.primitives import MatrixGain
 
+from guiderail.diagrams.stations.impedance_control import add_impedance_control
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
@@ -21,8 +22,6 @@ from guiderail.diagrams.stations.station import (
     add_workcell_plant,
     add_wrench_sensor,
     export_simulation_ports,
-    export_station_ports,
-    force_first,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
@@ -37,9 +36,7 @@ from guiderail.models.robots.robot import (
     find_end_effector,
     find_robot,
 )
-from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.gripper_command import GripperCommand
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
 
 # Half way through a quarter turn of what is held, from 90 degrees to 0.
 MIDDLE_OF_TURN = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
@@ -146,6 +143,16 @@ class KnownArm:
         self.plant, self.arm = controller_model(workcell, robot, end_effector)
         self.posture = self.solve(MIDDLE_OF_TURN, np.array(find_robot(robot).home))
 
+    @property
+    def target(self) -> Frame:
+        """T."""
+        return self.arm.target
+
+    @property
+    def tool_centre(self) -> Frame:
+        """P."""
+        return self.arm.tool_centre
+
     def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
         """The joint positions (n,) nearest to `posture`, (n,), with the tool centre at `pose`, (6,)."""
         arm = self.arm
@@ -156,65 +163,6 @@ class KnownArm:
         plant_context = plant.GetMyMutableContextFromRoot(context)
         plant.SetPositions(plant_context, model, self.solve(pose, self.posture))
         plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
-
-
-def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains:
-    """The station's impedance, which is ordered as a pose is, as the controller wants it."""
-    return ImpedanceGains(
-        stiffness=np.diag(force_first(impedance.stiffness)),
-        wrench_limits=force_first(impedance.limits),
-        posture=posture,
-        damping_ratio=impedance.damping_ratio,
-    )
-
-
-def add_controller(
-    builder: DiagramBuilder, known: KnownArm, impedance: Impedance, period: float, *, compensate_gravity: bool
-) -> tuple[CartesianImpedanceController, ImpedanceMonitor]:
-    """Adds an arm's controller, sampled once in `period` [s], and what watches its wrench; the caller wires both."""
-    controller = builder.AddNamedSystem(
-        "controller",
-        CartesianImpedanceController(
-            known.plant,
-            known.arm.target,
-            known.arm.tool_centre,
-            impedance_gains(impedance, known.posture),
-            period=period,
-            compensate_gravity=compensate_gravity,
-        ),
-    )
-    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
-    return controller, monitor
-
-
-def add_impedance_control(
-    builder: DiagramBuilder,
-    known: KnownArm,
-    impedance: Impedance,
-    period: float,
-    *,
-    state: OutputPort,
-    wrench: OutputPort,
-    compensate_gravity: bool = True,
-) -> OutputPort:
-    """Adds the controller of an arm whose joints are at `state`, and exports a station's ports; returns the torque.
-
-    Its watchdog checks commands once in `period` [s].
-    """
-    controller, monitor = add_controller(builder, known, impedance, period, compensate_gravity=compensate_gravity)
-    builder.Connect(state, controller.get_state_input_port())
-    builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
-    export_station_ports(
-        builder,
-        controller.get_desired_pose_input_port(),
-        controller.get_command_time_input_port(),
-        pose=controller.get_pose_output_port(),
-        wrench=wrench,
-        contact_force=monitor.get_contact_force_output_port(),
-        saturation=controller.get_saturation_output_port(),
-        holding=controller.get_holding_output_port(),
-    )
-    return controller.get_torque_output_port()
 
 
 def add_gripper_control(

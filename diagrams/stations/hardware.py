@@ -19,9 +19,10 @@ from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, Seriali
 from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.options import Number, Options
-from guiderail.diagrams.stations.arm import ArmModel, KnownArm, add_arm, add_controller
+from guiderail.diagrams.stations.arm import ArmModel, KnownArm, add_arm
 from guiderail.diagrams.stations.deputy import WordSerializer, word_channel
 from guiderail.diagrams.stations.driver import MICROSECOND, Driver
+from guiderail.diagrams.stations.impedance_control import add_controller
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     Impedance,
@@ -237,8 +238,8 @@ class HardwareStation(Station):
             "wrench",
             JointTorqueWrench(
                 known.plant,
-                known.arm.target,
-                known.arm.tool_centre,
+                known.target,
+                known.tool_centre,
                 period=period,
                 time_constant=wrench_time_constant,
             ),

@@ -26,7 +26,6 @@ from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor
 
-NUM_BALLS = 2
 # Half way between the pourings that the workspace allows, so that a search ends on the same branch for all of them.
 MIDDLE_OF_POURING = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
 
@@ -49,7 +48,8 @@ class PouringConfig:
     Attributes:
         mug: what is poured into.
         thermos: what is poured from.
-        ball: each of the two that are poured.
+        ball: each of those that are poured.
+        num_balls: how many.
         p_WStand: m, the point of the table's surface above which the mug nominally stands.
         stand_height: m, of a stand under the mug: the wrist needs room under a thermos that pours low.
         grip: m, from the flange to the thermos's axis, which lies across the flange's.
@@ -62,6 +62,7 @@ class PouringConfig:
     mug: Vessel = MUG
     thermos: Vessel = THERMOS
     ball: Ball = field(default_factory=Ball)
+    num_balls: int = 2
     p_WStand: tuple[float, float, float] = (0.76, 0.18, 0.0)
     stand_height: float = 0.06
     grip: float = 0.08
@@ -83,6 +84,18 @@ class PouringConfig:
         """Seconds of a control step."""
         return self.substeps * self.plant_period
 
+    def stack(self) -> np.ndarray:
+        """Where the balls lie in the upright thermos, in the frame of its tip, (n, 3) [m].
+
+        To the left and to the right in turn, as far as the thermos is wider than a ball, and as low as they touch.
+        """
+        radius = self.ball.diameter / 2
+        aside = self.thermos.inner_diameter / 2 - radius
+        # Each touches the one before it, or the one before that, which lies under it.
+        step = max(np.sqrt(max(self.ball.diameter**2 - (2 * aside) ** 2, 0.0)), radius)
+        i = np.arange(self.num_balls)
+        return np.stack([aside * (-1.0) ** i, 0.0 * i, -self.thermos.depth + radius + i * step], axis=1)
+
     @cached_property
     def X_WT(self) -> RigidTransform:
         """The target frame: the tip of the mug where it nominally stands. All poses of the station are X_TP."""
@@ -99,7 +112,7 @@ class PouringConfig:
 
 @register_station("pouring", world="pouring")
 class PouringStation(Station):
-    """An arm under Cartesian position control that holds a thermos with two balls, and a mug on a table.
+    """An arm under Cartesian position control that holds a thermos with balls, and a mug on a table.
 
     .. pydrake_system::
 
@@ -151,7 +164,7 @@ class PouringStation(Station):
         self._mug = add_vessel(plant, "mug", config.mug, CHINA)
         _add_stand(plant, self._mug, config)
         plant.WeldFrames(self._mount, self._mug.body_frame())
-        self._balls = [add_ball(plant, f"ball_{i}", config.ball, ORANGE) for i in range(NUM_BALLS)]
+        self._balls = [add_ball(plant, f"ball_{i}", config.ball, ORANGE) for i in range(config.num_balls)]
         _add_table(plant, config)
         plant.Finalize()
         thermos = plant.GetBodyByName("thermos")
@@ -238,12 +251,7 @@ class PouringStation(Station):
         self.plant.SetPositions(plant_context, self.arm, self.solve(pose, self.posture))
         self.plant.SetVelocities(plant_context, self.arm, np.zeros(self.config.arm.num_joints))
         X_WP = self._tip.CalcPoseInWorld(plant_context)
-        radius = self.config.ball.diameter / 2
-        # Side by side as far as the thermos is wider than a ball, and then as low as they touch.
-        aside = self.config.thermos.inner_diameter / 2 - radius
-        step = np.sqrt(self.config.ball.diameter**2 - (2 * aside) ** 2)
-        for i, ball in enumerate(self._balls):
-            p_PB = np.array([aside * (-1) ** i, 0.0, -self.config.thermos.depth + radius + i * step])
+        for ball, p_PB in zip(self._balls, self.config.stack(), strict=True):
             self.plant.SetFloatingBaseBodyPoseInWorldFrame(plant_context, ball, RigidTransform(X_WP @ p_PB))
 
 

@@ -24,6 +24,7 @@ from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives.via_points import through
 from guiderail.models.registry import did_you_mean
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
@@ -44,14 +45,16 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
     knows = task.knows()
     skill = None
     if "demonstrations" in knows:
+        options = dict(primitive)
+        reference = through(task.reference(), options.pop("via_points", ()), options.get("inverse_length", 2.0))
         skill = PrimitiveSkill(
-            reference=task.reference(),
+            reference=reference,
             constraints=task.constraints() or LinearConstraints.none(station.pose_size),
             control_period=station.control_period,
             isotropic_groups=task.isotropic_groups,
             keep_out=task.keep_out() if "keep_out" in knows else None,
             wrench_size=station.wrench_size,
-            **primitive,
+            **options,
         )
     return Known(
         period=station.control_period,

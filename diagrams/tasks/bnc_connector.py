@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,6 +28,7 @@ from guiderail.diagrams.tasks.bnc_rewards import REWARDS, reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
+from guiderail.diagrams.tasks.own_demonstrations import reference_of_file
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Threshold
 from guiderail.models.demonstrations import bnc_connector as inserting
@@ -34,7 +36,7 @@ from guiderail.models.demonstrations import bnc_search as searching
 from guiderail.models.insertion import LEAST_FORCE, REPEATED, RHO
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.pose_coordinates import POSE_SIZE
-from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
+from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.contact_lever import ContactLever
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
@@ -48,7 +50,13 @@ LOCKED_STEPS = 3  # control steps for which the plug must be locked before that 
 
 @cache
 def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
-    """What five demonstrations have in common: Gaussian mixture and regression, fitted once a process."""
+    """What demonstrations have in common: Gaussian mixture and regression, fitted once a process.
+
+    Args:
+        demonstrations: the name of those that come along, or a file.
+    """
+    if demonstrations not in DEMONSTRATIONS:
+        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()))
     loaded = DEMONSTRATIONS[demonstrations].load()
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR)
 
@@ -65,7 +73,6 @@ class BncConnector(InsertionTask):
     observations = OBSERVATIONS
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
     defaults = {"guidance": "skgrl", "station": "rails", "hold": 10, "explored": (0, 1), "history_variance": RHO}
-    num_steps = NUM_STEPS
     isotropic_groups = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
 
     def __init__(self, options: BncOptions, choice: Choice):
@@ -74,13 +81,14 @@ class BncConnector(InsertionTask):
         self.offsets = BncUncertainty(o.uncertainty, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn)
         self.collision = Threshold("contact_force", o.force_limit)
         self._workcell = o.workcell()
+        self.num_steps = NUM_STEPS if o.demonstrations in DEMONSTRATIONS else self.reference().num_steps
 
     def world(self) -> BncWorkcell:
         """A jack in the world, a plug in the tool."""
         return self._workcell
 
     def reference(self) -> ReferenceTrajectory:
-        """Of the five demonstrations."""
+        """Of five demonstrations, or of one's own."""
         return reference_trajectory(self.options.demonstrations)
 
     def constraints(self) -> LinearConstraints:
@@ -108,7 +116,7 @@ class BncConnector(InsertionTask):
 
     def observed(self) -> Sequence[Observed]:
         """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
-        return observed(self.choice.observation)
+        return observed(self.choice.observation, self.num_steps)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of actions, forces and the end; of depth where the reward is shaped."""
@@ -157,9 +165,14 @@ class BncConnector(InsertionTask):
         bound = self.options.bound
         return Scene(
             to_world=to_world,
-            demonstrations=tuple(DEMONSTRATIONS[self.options.demonstrations].load().outputs),
+            demonstrations=tuple(_shown(self.options.demonstrations).outputs),
             constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
             line_radius=0.0001,
         )
+
+
+def _shown(demonstrations: str) -> Demonstrations:
+    known = DEMONSTRATIONS.get(demonstrations)
+    return Demonstrations.load(Path(demonstrations)) if known is None else known.load()

@@ -17,16 +17,16 @@ from guiderail.models.units import DEGREE, MM
 OBSERVATIONS = ("state", "lever")
 
 # The wrench's torques are small, and they are what tells on which side of the rim the plug sits: 0.02 Nm at 4 N.
-HALF = 0.5 * (NUM_STEPS * CONTROL_PERIOD)
 POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
 
-def observed(observation: str) -> tuple[Observed, ...]:
+def observed(observation: str, num_steps: int = NUM_STEPS) -> tuple[Observed, ...]:
     """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
+    half = 0.5 * num_steps * CONTROL_PERIOD
     state = (
-        Observed("time", HALF, HALF),
+        Observed("time", half, half),
         Observed("pose", POSE_CENTRE, POSE_SCALE),
         Observed("wrench", 0.0, WRENCH_SCALE),
     )

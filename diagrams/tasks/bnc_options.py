@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from guiderail.diagrams.options import Number
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
@@ -18,6 +19,7 @@ from guiderail.models.units import MM
 
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
 DRAWN = BncDimensions()
+SHIPPED = ("insert", "search")  # demonstrations
 
 
 class BncOptions(HiddenPlace):
@@ -38,7 +40,17 @@ class BncOptions(HiddenPlace):
         DRAWN.slot_clearance, ge=0.05 * MM, le=0.2 * MM, description="between lug and slot, a side [m]"
     )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="of the connector's metal")
-    demonstrations: Literal["insert", "search"] = Field("insert", description="what was demonstrated")
+    demonstrations: str = Field("insert", description="what was demonstrated: insert, search, or a file of one's own")
+
+    @field_validator("demonstrations")
+    @classmethod
+    def _is_shipped_or_a_file(cls, value: str) -> str:
+        if value in SHIPPED:
+            return value
+        path = Path(value)
+        if not path.is_file():
+            raise ValueError(f"it is {' or '.join(SHIPPED)}, or a file that there is, .npz or .csv")
+        return str(path.resolve())  # whoever goes on with a run elsewhere finds it
 
     def workcell(self) -> BncWorkcell:
         """The connector that is meant."""

@@ -88,7 +88,13 @@ class InsertionTask(Task):
 
     @abstractmethod
     def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Moves fixture and workpiece by their offsets; `context` is the root context."""
+        """Moves fixture and workpiece by their offsets, as this task draws them; `context` is the root context.
+
+        Args:
+            station: whose context it is in.
+            context: the root context.
+            fixture, workpiece: their offsets (n,), in the units of this task's ranges.
+        """
 
     @abstractmethod
     def start(self, rng: np.random.Generator) -> np.ndarray:

@@ -62,7 +62,6 @@ class NarrowPassage(Task):
     def __init__(self, options: NarrowPassageOptions, choice: Choice):
         super().__init__(options, choice)
         self._world = options.world()
-        self._obstacles: Drawn | None = None
 
     def world(self) -> World:
         """Walls, a zone, an obstacle and a goal."""
@@ -72,8 +71,8 @@ class NarrowPassage(Task):
         """Where the obstacles are, one after the other."""
         if not self.options.drawn:
             return {}
-        self._obstacles = Drawn(builder, "obstacles", self._world.obstacles.size)
-        return {"obstacles": self._obstacles.port}
+        self.drawn["obstacles"] = Drawn(builder, "obstacles", self._world.obstacles.size)
+        return {"obstacles": self.drawn["obstacles"].port}
 
     def reference(self) -> ReferenceTrajectory:
         """Of the nine demonstrations."""
@@ -124,10 +123,10 @@ class NarrowPassage(Task):
                 f"the reset option 'start' is at most {FARTHEST_START:g} m along x and y, not {start.tolist()}"
             )
         station.set_pose(context, start)
-        if self._obstacles is None:
+        if not self.options.drawn:
             return {"start": start}
         assert isinstance(station, PlaneStation)
-        self._obstacles.set(context, obstacles.ravel())
+        self.drawn["obstacles"].set(context, obstacles.ravel())
         station.set_obstacles(context, obstacles)
         return {"start": start, "obstacles": obstacles}
 

@@ -12,10 +12,13 @@ import yaml
 from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.options import Number, Numbers, Options, validated
+from guiderail.diagrams.stations.station import ContactOptions
 from guiderail.models.errors import InputError
 from guiderail.models.insertion import COLLISION_FORCE, REPEATED
+from guiderail.models.parts.sides import SIDES
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import LinearConstraints
+from guiderail.models.registry import did_you_mean
 from guiderail.models.units import DEGREE, MM
 from guiderail.models.yaml_files import load_yaml
 
@@ -140,6 +143,25 @@ class Shown(Options):
     )
 
 
+class Recommended(Options):
+    """How it is learned where nobody says otherwise."""
+
+    environment: dict[str, Any] = Field(
+        {
+            "uncertainty": "disc",
+            "offset_range": (1.0 * MM, 1.5 * MM),
+            "observation": "lever",
+            "reward": "aligned",
+            "hold": 5,
+        },
+        description="options of the environment",
+    )
+    learner: dict[str, Any] = Field(
+        {"algorithm": "tqc", "preset": "robust", "settings": {"symmetry": "near"}},
+        description="algorithm, preset, and settings in place of the preset's",
+    )
+
+
 class PartTaskFile(Options):
     """What a task folder says."""
 
@@ -152,14 +174,28 @@ class PartTaskFile(Options):
     motion: MotionNumbers
     tolerance: Tolerance = Tolerance.model_validate({})
     bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
-    offset_range: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="distance of the socket from its place [m], the task's own"
-    )
     force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
+    time_step: Number | None = Field(None, gt=0, description="of the simulation [s]; its own unless given")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
     demonstrations: Shown = Shown.model_validate({})
     explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
+    sides: tuple[str, ...] = Field((), description="from which the parts look the same: see models/parts/sides.py")
+    rim_sides: tuple[str, ...] = Field((), description="from which a plug on the rim feels nearly the same")
+    recommended: Recommended = Recommended.model_validate({})
     measured: dict[str, Any] = Field({}, description="what onboarding measured; nothing reads it")
+
+    @field_validator("time_step")
+    @classmethod
+    def _is_a_time_step(cls, value: float | None) -> float | None:
+        return ContactOptions(time_step=value).time_step
+
+    @field_validator("sides", "rim_sides")
+    @classmethod
+    def _are_sides(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for name in value:
+            if name not in SIDES:
+                raise ValueError(f"there is no side {name!r}: {did_you_mean(name, SIDES)}")
+        return value
 
     @property
     def files(self) -> tuple[str, ...]:

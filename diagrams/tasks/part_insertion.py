@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -18,17 +18,20 @@ from guiderail.diagrams.options import Number
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.part_workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
-from guiderail.diagrams.tasks.bnc_rewards import reward_terms
+from guiderail.diagrams.task import Symmetry
+from guiderail.diagrams.tasks.bnc_observation import sides_of_the_rim
+from guiderail.diagrams.tasks.bnc_rewards import REWARDS, reward_terms
 from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
 from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
+from guiderail.diagrams.tasks.own_demonstrations import reference_of_file
 from guiderail.diagrams.tasks.part_file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.task import Choice, Threshold
-from guiderail.models.errors import InputError
 from guiderail.models.insertion import COLLISION_FORCE, COMMAND_SCALE, LEAST_FORCE, LEVER_SCALE, RHO
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.parts.model_files import part_sdf
+from guiderail.models.parts.sides import SIDES
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.models.units import DEGREE, MM
@@ -49,7 +52,8 @@ class PartOptions(HiddenPlace):
 
 
 class PartInsertion(InsertionTask):
-    """Insert a plug into a socket: "sparse" costs action and force and rewards the end, "shaped" adds the depth gained.
+    """Insert a plug into a socket: "sparse" costs action and force and rewards the end, "shaped" adds the depth gained,
+    "aligned" nearness to the socket's axis, too.
 
     Attributes:
         folder: of the task.
@@ -59,7 +63,7 @@ class PartInsertion(InsertionTask):
     Options = PartOptions
     options: PartOptions
     workpiece, fixture = PLUG, SOCKET
-    rewards = ("sparse", "shaped")
+    rewards = REWARDS
     observations = ("state", "lever")
     isotropic_groups = ((0, 1, 2), (3, 4, 5))
     folder: ClassVar[Path]
@@ -81,8 +85,8 @@ class PartInsertion(InsertionTask):
 
     def reference(self) -> ReferenceTrajectory:
         """Of the folder's demonstrations."""
-        path = self.folder / self.file.demonstrations.file
-        return _reference(path, path.stat().st_mtime_ns, self.file.demonstrations)
+        shown = self.file.demonstrations
+        return reference_of_file(self.folder / shown.file, shown.components, shown.floor)
 
     def constraints(self) -> LinearConstraints:
         """The folder's bounds."""
@@ -116,13 +120,27 @@ class PartInsertion(InsertionTask):
         return (*state, Observed("lever", 0.0, LEVER_SCALE), Observed("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Of actions, forces and the end; of depth where the reward is shaped."""
+        """Of actions, forces and the end; of depth and nearness where the reward says so."""
         return reward_terms(self.choice.reward, num_actions)
 
     def conditions(self) -> list[Condition]:
         """At the target for a while, or pushed too hard."""
         seated = Condition("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
         return [seated, self.force_limit()]
+
+    def symmetry(self) -> Symmetry | None:
+        """The sides from which both parts look the same."""
+        return self._seen_from(self.file.sides)
+
+    def near_symmetry(self) -> Symmetry | None:
+        """And those from which a plug on the rim feels nearly the same."""
+        return self._seen_from((*self.file.sides, *self.file.rim_sides))
+
+    def _seen_from(self, names: Sequence[str]) -> Symmetry | None:
+        explored = self.choice.values["explored"]
+        every = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if explored is None else explored)
+        chosen = [number for number, name in enumerate(SIDES) if name in names]
+        return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
 
     @classmethod
     def is_seated(cls, plug: np.ndarray) -> bool:
@@ -200,23 +218,6 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
     )
 
 
-@cache
-def _reference(path: Path, changed: int, shown: Any) -> ReferenceTrajectory:
-    """What the demonstrations have in common, on the control period's clock; fitted once a process and version."""
-    demonstrations = Demonstrations.load(path)
-    if demonstrations.num_outputs != POSE_SIZE:
-        raise InputError(
-            f"{path} has {demonstrations.num_outputs} outputs: a task of parts needs the six of a pose, "
-            "[x y z Rz Ry Rx] in the target frame"
-        )
-    duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
-    num_steps = round(duration / CONTROL_PERIOD) + 1
-    fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=shown.components, num_steps=num_steps, floor=np.array(shown.floor)
-    )
-    return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
-
-
 def load_task_folder(folder: Path) -> type[PartInsertion]:
     """The task of a folder, as a class that a registry takes.
 
@@ -238,9 +239,11 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
         "explored": file.explored,
         "history_variance": RHO,
         "force_limit": file.force_limit,
-        "offset_range": file.offset_range,
+        "time_step": file.time_step,
+        **file.recommended.environment,
     }
-    members = {"folder": folder, "file": file, "defaults": defaults, "__module__": __name__}
+    learner = file.recommended.learner
+    members = {"folder": folder, "file": file, "defaults": defaults, "learner": learner, "__module__": __name__}
     task = type(f"PartInsertion({folder})", (PartInsertion,), members)
     task.__doc__ = f"Insert {file.plug.source or 'a plug'} into {file.socket.source or 'a socket'}."
     return cast(type[PartInsertion], task)

@@ -26,7 +26,6 @@ from guiderail.diagrams.tasks.pouring_template import SPARSE_INPUT_SPEED, frames
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import STANDARD, Choice, Task, Threshold
 from guiderail.models.errors import InputError
-from guiderail.models.objects.vessels import Ball
 from guiderail.models.pose_coordinates import transform_to_pose
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
@@ -61,13 +60,16 @@ class Pouring(Task):
     def __init__(self, options: PouringOptions, choice: Choice):
         super().__init__(options, choice)
         options.check()
-        self._config = PouringConfig(mug=vessel_or_refuse(options.mug_inner_diameter, options.mug_depth, Ball()))
+        self._config = PouringConfig(
+            mug=vessel_or_refuse(options.mug_inner_diameter, options.mug_depth, options.ball),
+            ball=options.ball,
+            num_balls=options.balls,
+        )
         self.num_steps = round(options.time_limit / self._config.control_period)
         speed = self._input_speed()
         self._skill = make_skill(self._config, speed)
         if options.aim:
             self._skill = make_aimed_skill(self._config, speed, options.aim_speed, options.pour_speed)
-        self._error: Drawn | None = None
 
     def _input_speed(self) -> float:
         if self.options.input_speed is not None:
@@ -82,8 +84,8 @@ class Pouring(Task):
         """Where the mug is believed to be, from where it is, if that is to be seen."""
         if not self.options.aim:
             return {}
-        self._error = Drawn(builder, "mug_error", 2)
-        return {"mug_error": self._error.port}
+        self.drawn["mug_error"] = Drawn(builder, "mug_error", 2)
+        return {"mug_error": self.drawn["mug_error"].port}
 
     def template(self) -> Template:
         """Of figure 2.2 and table 3.3, or the one that can be aimed."""
@@ -102,7 +104,7 @@ class Pouring(Task):
 
     def conditions(self) -> list[Condition]:
         """Poured, spilled, or touched."""
-        return conditions(self._config)
+        return conditions(self._config, self.options.needed)
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
@@ -127,8 +129,8 @@ class Pouring(Task):
         station.set_mug(context, RigidTransform([*p_TMug, 0.0]))
         if isinstance(guidance, Guidance):
             guidance.set_frames(context, frames)
-        if self._error is not None:
-            self._error.set(context, error)
+        if self.options.aim:
+            self.drawn["mug_error"].set(context, error)
         # Turned as the template wants it, whether or not that guides: all kinds of guidance start alike.
         X_TP = self._skill.project(self._skill.initial_state, RigidTransform(believed @ p_MP), frames)
         station.set_pose(context, transform_to_pose(X_TP))

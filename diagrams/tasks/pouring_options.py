@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from pydantic import Field
 
-from guiderail.diagrams.options import Number, Numbers, Options, ResetOptions
+from guiderail.diagrams.options import Integer, Number, Numbers, Options, ResetOptions
+from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.models.errors import InputError
-from guiderail.models.objects.vessels import MUG
+from guiderail.models.objects.vessels import MUG, Ball
 
 MAX_MUG_OFFSET = 0.04  # [m] along x and y: as far as the arm reaches around the mug
 MAX_MUG_ERROR = 0.06  # [m] as far as an aimed Pour leads from where the mug is believed
@@ -24,9 +26,17 @@ HARD: Mapping[str, Any] = {
 """The mug stands elsewhere than the template believes, anew every episode, and whoever pours has to see that."""
 
 
+MOST_BALLS = 8
+
+
 class PouringOptions(Options):
     """Of pouring."""
 
+    balls: Integer = Field(2, ge=2, le=MOST_BALLS, description="how many are poured")
+    balls_in: Integer | None = Field(
+        None, ge=1, le=MOST_BALLS, description="how many of them have to be in the mug; all of them unless given"
+    )
+    ball_diameter: Number = Field(Ball().diameter, ge=0.02, le=0.045, description="[m]")
     input_speed: Number | None = Field(
         None, ge=0.2, le=2.0, description="how much faster the template's inputs are; 1, and 1.7 where sparse, if None"
     )
@@ -48,12 +58,32 @@ class PouringOptions(Options):
     )
     pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="part of the full tilt's with which an aimed Pour tips")
 
+    @property
+    def needed(self) -> int:
+        """How many balls have to be in the mug."""
+        return self.balls if self.balls_in is None else self.balls_in
+
+    @property
+    def ball(self) -> Ball:
+        """Each of them: a shell, whose mass grows with its surface."""
+        usual = Ball()
+        return replace(usual, diameter=self.ball_diameter, mass=usual.mass * (self.ball_diameter / usual.diameter) ** 2)
+
     def check(self) -> None:
         """Refuses numbers that don't go together.
 
         Raises:
-            InputError: if the least error is larger than the largest one.
+            InputError: if the least error is larger than the largest one, more balls have to be in than there are, or
+                they don't go into the thermos.
         """
+        if self.needed > self.balls:
+            raise InputError(f"balls_in must be at most balls, which is {self.balls}, not {self.needed}: give both")
+        top = PouringConfig(ball=self.ball, num_balls=self.balls).stack()[-1, 2] + 0.5 * self.ball_diameter
+        if top > 0.0:
+            raise InputError(
+                f"{self.balls} balls of {self.ball_diameter:g} m don't go into the thermos: take fewer, or smaller "
+                "ones such as ball_diameter=0.026"
+            )
         if self.mug_error_least > self.mug_error_most:
             raise InputError(
                 f"mug_error_least must be at most mug_error_most, which is {self.mug_error_most:g} m, "

@@ -17,6 +17,7 @@ from guiderail.diagrams.observation import Observed
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import Symmetry
+from guiderail.diagrams.tasks.drawn import Drawn
 from guiderail.models.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import Condition
@@ -67,6 +68,8 @@ class Task(ABC):
     Attributes:
         options: the task's own, checked.
         choice: what every environment is made with.
+        drawn: what `signals` adds to a diagram and a reset sets, by name. A diagram is used again by whoever asks for
+            the same, whose task gets these with it: systems that a task keeps anywhere else are missing there.
     """
 
     name: ClassVar[str] = ""
@@ -92,6 +95,7 @@ class Task(ABC):
         """
         self.options = options
         self.choice = choice
+        self.drawn: dict[str, Drawn] = {}
 
     # What there is.
 

@@ -72,9 +72,16 @@ def _with_large_faces(convex: Any) -> Any:
         hull = Convex(np.ascontiguousarray(points.T), "piece").GetConvexHull()
         points = np.array([hull.vertex(i) for i in range(hull.num_vertices())])
         smallest, corner = _smallest_face(points, list(hull.face_data()))
+        if smallest <= _SMALLEST_FACE:
+            points = np.delete(points, corner, axis=0)
+            continue
+        # What Drake takes for one face may be several triangles in the file, one of them next to nothing.
+        written = manifold3d.Manifold.hull_points(np.ascontiguousarray(points * _SCALE))
+        vertices, triangles = as_arrays(written)
+        smallest, corner = _smallest_face(vertices, np.insert(triangles, 0, 3, axis=1).ravel().tolist())
         if smallest > _SMALLEST_FACE:
-            break
-        points = np.delete(points, corner, axis=0)
+            return written
+        points = np.delete(vertices, corner, axis=0)
     return manifold3d.Manifold.hull_points(np.ascontiguousarray(points * _SCALE))
 
 

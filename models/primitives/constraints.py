@@ -90,7 +90,7 @@ class LinearConstraints:
         return self.G[steps], self.c[steps]
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """max over constraints of c − G y [unit of c]: negative is slack, −inf where there is no constraint."""
+        """max over constraints of c − G y, y (O,) [unit of c]: negative is slack, −inf where there is no constraint."""
         if self.num_constraints == 0:
             return -np.inf
         if self.G.ndim == 2:

@@ -101,7 +101,7 @@ class Kmp:
         return name
 
     def move_via_point(self, name: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-        """Moves a via-point in any respect.
+        """Moves a via-point in any respect: `mean` (O,), `input_` (I,), `covariance` (O, O).
 
         Raises:
             InputError: as `add_via_point`, or if there is no via-point of that name.

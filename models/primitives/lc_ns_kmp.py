@@ -47,9 +47,9 @@ class Prediction:
         Args:
             output: (O,), what to execute.
             factor: of the step.
-            x: the history and the null-space action that it was predicted from.
-            v: the correction, where some constraint had to be enforced.
-            signed: the solver's multipliers of the correction.
+            x: ((P + 1) O,), the history and the null-space action that it was predicted from.
+            v: (r,), the correction, where some constraint had to be enforced.
+            signed: (m,), the solver's multipliers of the correction.
         """
         self.output, self._factor, self._x, self._v, self._signed = output, factor, x, v, signed
 
@@ -216,7 +216,7 @@ class LcNsKmp:
         Args:
             inputs: (H+1,) or (H+1, I), the executed point's first.
             means, covariances: (H+1, O) and (H+1, O, O), the reference there.
-            null_space_action, history: as in `predict`.
+            null_space_action, history: (O,) and (P, O), as in `predict`.
             history_inputs: (P,) or (P, I), where the history was.
 
         Raises:
@@ -267,7 +267,7 @@ class LcNsKmp:
             step: n ≥ 0, the executed point; past the end, the last step.
             at: (J,), different steps from n … n+H, in any order.
             null_space_actions: ξ̂ (J, O), one at each of them.
-            history: as in `predict`.
+            history: (P, O), as in `predict`.
 
         Raises:
             InputError: if an argument has the wrong shape, is not finite or no step of the window, or if steps are so

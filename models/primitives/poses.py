@@ -84,8 +84,8 @@ def pose_demonstrations(
 
     Args:
         times, positions, quaternions_wxyz: M × (N_m,), (N_m, 3), (N_m, 4), in any common frame W.
-        target_position, target_quaternion_wxyz: X_WT; each demonstration's own last pose unless given, as in the
-            thesis (section 4.4.2).
+        target_position, target_quaternion_wxyz: X_WT, (3,) and (4,); each demonstration's own last pose unless given,
+            as in the thesis (section 4.4.2).
         orientation: as in `pose_outputs`.
 
     Raises:

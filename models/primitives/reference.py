@@ -99,7 +99,7 @@ class ReferenceTrajectory:
         return np.sqrt(np.einsum("noo->no", self.covariances))
 
     def inputs(self, steps: np.ndarray) -> np.ndarray:
-        """Times at any steps: before the first and after the last, the clock goes on at its first and last period."""
+        """Times (n,) [s] at any steps (n,): before the first and after the last, the clock goes on as it does there."""
         last = self.num_steps - 1
         inside = self.times[np.clip(steps, 0, last)]
         before = np.minimum(steps, 0) * (self.times[1] - self.times[0])

@@ -72,9 +72,9 @@ class PositionConstraint(ActiveConstraint):
 class HalfSpace(PositionConstraint):
     """normal · p_FE ≥ offset_m."""
 
-    normal: tuple[float, ...]
-    offset_m: float
-    frame: str = WORLD
+    normal: tuple[float, ...]  # in F
+    offset_m: float  # along the normal
+    frame: str = WORLD  # F: an object's, or `world`
 
     def __post_init__(self) -> None:
         require_three(self.normal, "normal")
@@ -94,9 +94,9 @@ class HalfSpace(PositionConstraint):
 class Box(PositionConstraint):
     """lower_m ≤ p_FE ≤ upper_m, axis by axis."""
 
-    lower_m: tuple[float, ...]
-    upper_m: tuple[float, ...]
-    frame: str = WORLD
+    lower_m: tuple[float, ...]  # least x, y and z in F
+    upper_m: tuple[float, ...]  # greatest x, y and z in F
+    frame: str = WORLD  # F: an object's, or `world`
 
     def __post_init__(self) -> None:
         require_three(self.lower_m, "lower_m")
@@ -119,9 +119,9 @@ class Cylinder(PositionConstraint):
     With a min_radius_m the axis is kept out, with a max_radius_m the end effector is kept in.
     """
 
-    frame: str
-    min_radius_m: float = 0.0
-    max_radius_m: float = UNBOUNDED
+    frame: str  # F: an object's, or `world`
+    min_radius_m: float = 0.0  # least distance
+    max_radius_m: float = UNBOUNDED  # greatest distance
 
     def __post_init__(self) -> None:
         require(0 <= self.min_radius_m <= self.max_radius_m, "radii must satisfy 0 ≤ min_radius_m ≤ max_radius_m.")
@@ -140,9 +140,9 @@ class Cylinder(PositionConstraint):
 class Sector(PositionConstraint):
     """The azimuth of p_FE about F's z axis is between min_deg and max_deg; radius and z are kept."""
 
-    frame: str
-    min_deg: float
-    max_deg: float
+    frame: str  # F: an object's, or `world`
+    min_deg: float  # least angle
+    max_deg: float  # greatest angle
 
     def __post_init__(self) -> None:
         require(self.min_deg <= self.max_deg <= self.min_deg + 360, "angles must span 0 to 360 degrees.")
@@ -173,8 +173,8 @@ class KeepAbove(ActiveConstraint):
     Without points_m, the end effector's own origin is the point.
     """
 
-    height_m: float
-    frame: str = WORLD
+    height_m: float  # along F's z axis
+    frame: str = WORLD  # F: an object's, or `world`
     points_m: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0),)  # p_EP
 
     def __post_init__(self) -> None:
@@ -196,8 +196,8 @@ class KeepAbove(ActiveConstraint):
 class Funnel(PositionConstraint):
     """p_FE stays under a cone: z ≤ height_m + slope · (radius − radius_m), so that going in leads down."""
 
-    frame: str
-    radius_m: float
+    frame: str  # F: an object's, or `world`
+    radius_m: float  # of its mouth
     height_m: float  # at radius_m and inside of it
     slope: float  # rise over run
 
@@ -215,8 +215,8 @@ class Funnel(PositionConstraint):
 class FixedOrientation(ActiveConstraint):
     """R_FE is one given rotation."""
 
-    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
-    frame: str = WORLD
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE
+    frame: str = WORLD  # F: an object's, or `world`
 
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")
@@ -284,11 +284,11 @@ def nearest_turn(angle: float, centre: float) -> float:
 class TiltLimits(TiltConstraint):
     """Tilted towards F's axis by min_deg to max_deg, wherever it is."""
 
-    frame: str
-    min_deg: float
-    max_deg: float
+    frame: str  # F: an object's, or `world`
+    min_deg: float  # least tilt
+    max_deg: float  # greatest tilt
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
-    turns_along: bool = False
+    turns_along: bool = False  # whether it turns about F's z axis as it moves around it
 
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")
@@ -303,11 +303,11 @@ class TiltLimits(TiltConstraint):
 class TiltByDistance(TiltConstraint):
     """Tilted towards F's axis by an angle that is a function of the distance to F's origin."""
 
-    frame: str
+    frame: str  # F: an object's, or `world`
     distance_m: tuple[float, ...]  # increasing
     tilt_deg: tuple[float, ...]  # one for each distance, linear in between, constant beyond
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
-    turns_along: bool = False
+    turns_along: bool = False  # whether it turns about F's z axis as it moves around it
 
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")
@@ -330,12 +330,12 @@ class Arc(ActiveConstraint):
     At angle 0 the end effector is on F's x axis with R_FE = rpy_deg.
     """
 
-    frame: str
-    radius_m: float
-    height_m: float = 0.0
-    min_deg: float = -180.0
-    max_deg: float = 180.0
-    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
+    frame: str  # F: an object's, or `world`
+    radius_m: float  # of the circle
+    height_m: float = 0.0  # of the circle, along F's z axis
+    min_deg: float = -180.0  # least angle
+    max_deg: float = 180.0  # greatest angle
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at angle 0
 
     def __post_init__(self) -> None:
         require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")

@@ -1,7 +1,10 @@
 """A skill's state machine, drawn: as Graphviz text for those who have it, as a picture for everyone."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 from guiderail.models.errors import InputError
 from guiderail.models.skills.skill import Skill, SkillState
@@ -53,6 +56,11 @@ def draw(skill: Skill, path: str | Path) -> None:
         return
     if path.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(f"A state machine can't be drawn as {path.suffix or 'that'}; use .png, .svg, .pdf or .dot.")
+    drawn(skill).savefig(path, dpi=120)
+
+
+def drawn(skill: Skill) -> "Figure":
+    """The state machine as a Matplotlib figure, which a notebook shows."""
     from matplotlib.figure import Figure
 
     width, gap = 1.8, 1.7
@@ -99,4 +107,4 @@ def draw(skill: Skill, path: str | Path) -> None:
             color="#33506b",
         )
     axes.set_title(f"{skill.name}: {skill.inputs} inputs", fontsize=10, **plain)
-    figure.savefig(path, dpi=120)
+    return figure

@@ -58,10 +58,10 @@ def _require_object(frame: str) -> None:
 class Translation(InputMapping):
     """Each input moves the end effector along one axis of a frame (`world`, `tool`, or an object's)."""
 
-    inputs: tuple[int, ...]
+    inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
     speed_m_per_s: float  # at full input
-    frame: str = WORLD
-    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    frame: str = WORLD  # in which axes are given: an object's, `world` or `tool`
+    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one for each input
 
     def __post_init__(self) -> None:
         _require_axes(self.inputs, self.axes)
@@ -81,10 +81,10 @@ class Translation(InputMapping):
 class Rotation(InputMapping):
     """Each input turns the end effector about one axis of a frame (`world`, `tool`, or an object's)."""
 
-    inputs: tuple[int, ...]
+    inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
     speed_rad_per_s: float  # at full input
-    frame: str = WORLD
-    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    frame: str = WORLD  # in which axes are given: an object's, `world` or `tool`
+    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one for each input
 
     def __post_init__(self) -> None:
         _require_axes(self.inputs, self.axes)
@@ -106,9 +106,9 @@ class Rotation(InputMapping):
 class TiltTowards(InputMapping):
     """Two inputs, a horizontal vector in the frame, are projected on the direction to it: tilt follows that scalar."""
 
-    inputs: tuple[int, ...]
+    inputs: tuple[int, ...]  # numbers of two inputs, from 0
     speed_rad_per_s: float  # at full input
-    frame: str
+    frame: str  # an object's: tilted towards it
 
     def __post_init__(self) -> None:
         _require_object(self.frame)
@@ -131,10 +131,10 @@ class TiltTowards(InputMapping):
 class Scaled(InputMapping):
     """Another mapping, its inputs multiplied by a factor that depends on the distance to a frame: slower when near."""
 
-    frame: str
+    frame: str  # an object's, to which the distance is
     distance_m: tuple[float, ...]  # increasing
     factor: tuple[float, ...]  # in [0, 1], one for each distance, linear in between
-    of: InputMapping
+    of: InputMapping  # the mapping, as an entry of its own
 
     def __post_init__(self) -> None:
         _require_object(self.frame)
@@ -169,7 +169,7 @@ class Uneven(InputMapping):
 
     above: float  # in (0, 1]
     below: float  # in (0, 1]
-    of: InputMapping
+    of: InputMapping  # the mapping, as an entry of its own
 
     def __post_init__(self) -> None:
         require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")

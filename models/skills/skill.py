@@ -101,7 +101,7 @@ class Skill:
     def map(
         self, state: int, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float
     ) -> RigidTransform:
-        """map_q, equation 2.19: the displacement ΔH that the inputs, each clipped to [−1, 1], ask for in one period."""
+        """map_q, equation 2.19: the displacement ΔH that the inputs (n,), clipped to [−1, 1], ask for in one period."""
         inputs = np.clip(inputs, -1.0, 1.0)
         parts = [m.displacement(inputs, X_WE, frames, period_s) for m in self.states[state].input_mapping]
         total = RigidTransform()

@@ -33,8 +33,8 @@ class TransitionDistance(ABC):
 class Distance(TransitionDistance):
     """‖p_FE‖, from the end effector's origin to a point of F."""
 
-    frame: str
-    point_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    frame: str  # F: an object's, or `world`
+    point_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # in F
 
     def __post_init__(self) -> None:
         require_three(self.point_m, "point_m")
@@ -49,7 +49,7 @@ class Distance(TransitionDistance):
 class Height(TransitionDistance):
     """z of p_FE: how high above F."""
 
-    frame: str
+    frame: str  # F: an object's, or `world`
 
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return float(position_in(self.frame, X_WE, frames)[2])
@@ -60,7 +60,7 @@ class Height(TransitionDistance):
 class AxisDistance(TransitionDistance):
     """How far the end effector's origin is from F's z axis."""
 
-    frame: str
+    frame: str  # F: an object's, or `world`
 
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return float(np.hypot(*position_in(self.frame, X_WE, frames)[:2]))
@@ -71,8 +71,8 @@ class AxisDistance(TransitionDistance):
 class TiltToGo(TransitionDistance):
     """What is missing of the tilt `until_deg` towards F's z axis."""
 
-    frame: str
-    until_deg: float
+    frame: str  # F: an object's, or `world`
+    until_deg: float  # the tilt at which nothing is missing
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
     turns_along: bool = False  # as in the constraint on the tilt
     unit = "deg"
@@ -91,8 +91,8 @@ class TiltToGo(TransitionDistance):
 class RotationToGo(TransitionDistance):
     """The angle between the end effector's orientation and a given one."""
 
-    rpy_deg: tuple[float, ...]
-    frame: str = WORLD
+    rpy_deg: tuple[float, ...]  # the given orientation, R_FE
+    frame: str = WORLD  # F: an object's, or `world`
     unit = "deg"
 
     def __post_init__(self) -> None:

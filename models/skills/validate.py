@@ -127,9 +127,12 @@ def _transitions(skill: Skill, scenes: Scenes, rng: np.random.Generator) -> Iter
             ((skill.project(number, X, frames), frames) for X, frames in scenes),
             key=lambda start: skill.distance(number, *start),
         )
-        # From where a phase begins, and from the nearest poses: either proves that the distance can get there.
-        tries = [*starts[len(starts) // 2 :: len(starts) // 8], starts[0]]
-        best = min(_greedy(skill, number, X, frames, lowest) for X, frames in tries)
+        # From the nearest pose, and from where a phase begins: either proves that the distance can get there.
+        best = np.inf
+        for X, frames in [starts[0], *starts[len(starts) // 2 :: len(starts) // 8]]:
+            best = min(best, _greedy(skill, number, X, frames, lowest))
+            if best < lowest:
+                break
         for goal, threshold in goals:
             if best > threshold:
                 inside = skill.distance(number, *starts[0])

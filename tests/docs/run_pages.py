@@ -2,29 +2,32 @@
 
 A fenced block is one step. `python` is run, in one namespace a page; `sh` is a line of the command each; a block whose
 first line is `# file: NAME` is written to that file. A `text` block right after a step is what that step prints, where
-`...` stands for anything. Each page has an empty folder of its own. Prints one JSON object: page to what was wrong.
+`...` stands for anything. Of a notebook, the cells are run, and only they: what they print is no part of the page. Each
+page has an empty folder of its own. Prints one JSON object: page to what was wrong.
 """
 
 import contextlib
 import doctest
 import io
 import json
+import multiprocessing
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tempfile
 import traceback
 from pathlib import Path
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CELL = re.compile(r"^```\{code-cell\} (\w+)\n(?:---\n.*?^---\n)?(.*?)^```$", re.MULTILINE | re.DOTALL)
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
 def steps(page: Path) -> list[tuple[str, str]]:
-    """Language and text of each block of a page."""
-    return FENCE.findall(page.read_text(encoding="utf-8"))
+    """Language and text of each block of a page, or of each cell of a notebook."""
+    text = page.read_text(encoding="utf-8")
+    return (CELL if "\nfile_format: mystnb\n" in text else FENCE).findall(text)
 
 
 def command(line: str) -> None:
@@ -41,17 +44,44 @@ def command(line: str) -> None:
             raise RuntimeError(f"{line!r} ended with {end.code}") from None
 
 
-def shell(text: str) -> None:
-    """The same in a process of its own."""
-    program = [sys.executable, __file__, "--shell", text]
-    finished = subprocess.run(program, capture_output=True, text=True)
-    print(finished.stdout, end="")
-    print(finished.stderr, end="", file=sys.stderr)
-    if finished.returncode:
-        raise RuntimeError(f"{text!r} ended with {finished.returncode}")
+class Shell:
+    """A fork of this process as it is now, for lines that import what a page imports: here it would be there twice."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("fork")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=self._serve, args=(theirs, self._connection), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def run(self, text: str) -> None:
+        """Once only."""
+        self._connection.send((os.getcwd(), text))
+        out, err, wrong = self._connection.recv()
+        print(out, end="")
+        print(err, end="", file=sys.stderr)
+        if wrong:
+            raise RuntimeError(wrong)
+
+    @staticmethod
+    def _serve(connection, others) -> None:
+        others.close()  # so that the end of the page is the end of this
+        try:
+            folder, text = connection.recv()
+        except EOFError:  # the page ended before
+            return
+        os.chdir(folder)
+        wrong = None
+        with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
+            try:
+                for line in text.splitlines():
+                    command(line)
+            except Exception as error:
+                wrong = str(error)
+        connection.send((out.getvalue(), err.getvalue(), wrong))
 
 
-def run(page: Path) -> str:
+def run(page: Path, shell: Shell | None) -> str:
     """What is wrong with a page; nothing where all of it runs and prints what it says."""
     namespace: dict = {"__name__": "page"}
     printed = None
@@ -71,8 +101,8 @@ def run(page: Path) -> str:
                         Path(first.removeprefix("# file: ")).write_text(rest, encoding="utf-8")
                     elif language == "python":
                         exec(compile(text, str(page), "exec"), namespace)
-                    elif language == "sh" and "--import" in text:
-                        shell(text)  # what was imported here already would be there twice
+                    elif shell and language == "sh" and "--import" in text:
+                        shell.run(text)
                     elif language == "sh":
                         for line in text.splitlines():
                             command(line)
@@ -90,10 +120,11 @@ def run(page: Path) -> str:
 def main(pages: list[Path]) -> None:
     """Runs pages one after the other."""
     found = {}
-    for page in pages:
+    shells = [Shell() if "--import" in page.read_text(encoding="utf-8") else None for page in pages]
+    for page, shell in zip(pages, shells, strict=True):
         with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
             sys.path.insert(0, folder)
-            found[page.stem] = run(page)
+            found[page.stem] = run(page, shell)
             sys.path.remove(folder)
     print(json.dumps(found))
     sys.stdout.flush()
@@ -101,8 +132,4 @@ def main(pages: list[Path]) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "--shell":
-        for line in sys.argv[2].splitlines():
-            command(line)
-        sys.exit()
     main([Path(name).resolve() for name in sys.argv[1:]])

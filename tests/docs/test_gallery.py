@@ -31,7 +31,7 @@ def test_the_page_shows_each_picture_that_the_command_makes_and_no_other(gallery
 def test_a_picture_is_there_moves_and_is_small(gallery, name):
     path = gallery.FOLDER / f"{name}.webp"
     assert path.is_file(), f"{path} is missing: make gallery"
-    assert path.stat().st_size < 400_000
+    assert path.stat().st_size < 250_000
     with Image.open(path) as picture:
         assert picture.n_frames > gallery.FRAMES // 2
         first, last = (picture.seek(n) or picture.convert("RGB") for n in (0, picture.n_frames - 1))

@@ -1,7 +1,6 @@
 """Every example runs as it stands, is short, and is understood by a type checker without being told any path."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,12 +13,11 @@ LINES = 60
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def found(forks, tmp_path_factory):
     """What each of them printed, away from the repository."""
-    environment = os.environ | {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
-    program = [sys.executable, str(Path(__file__).with_name("run_all.py")), *map(str, FILES)]
-    folder = tmp_path_factory.mktemp("elsewhere")
-    finished = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True)
+    program = Path(__file__).with_name("run_all.py")
+    environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
+    finished = forks.run(program, *FILES, folder=tmp_path_factory.mktemp("elsewhere"), **environment)
     assert finished.returncode == 0, finished.stderr
     return json.loads(finished.stdout.splitlines()[-1])
 

@@ -11,7 +11,7 @@ import numpy as np
 import trimesh
 from manifold3d import CrossSection, Manifold
 
-SIDES = 32
+SIDES = 24
 CHAMFER = 0.5  # [mm] of a plug's tip and a socket's mouth
 
 
@@ -61,10 +61,10 @@ def _grown(outline: CrossSection, by: float) -> CrossSection:
     return outline.offset(by, JoinType.Miter)
 
 
-def _shaft(outline: CrossSection, low: float, high: float) -> Manifold:
+def _shaft(outline: CrossSection, low: float, high: float, chamfer: float = CHAMFER) -> Manifold:
     """A convex prism whose lower end is chamfered."""
-    tip = _prism(_grown(outline, -CHAMFER), low, low + 0.01)
-    return Manifold.batch_hull([tip, _prism(outline, low + CHAMFER, high)])
+    tip = _prism(_grown(outline, -chamfer), low, low + 0.01)
+    return Manifold.batch_hull([tip, _prism(outline, low + chamfer, high)])
 
 
 def _hole(outline: CrossSection, clearance: float, low: float) -> Manifold:
@@ -147,15 +147,18 @@ def snap_fit(clearance: float = 0.2) -> Part:
 
 
 def dovetail(clearance: float = 0.15) -> Part:
-    """A tongue that slides into a slot wider inside than at its mouth."""
-    tongue = CrossSection([[(-3.0, 0.0), (3.0, 0.0), (5.0, 5.0), (-5.0, 5.0)]])
+    """A tongue that slides into a slot wider inside than at its mouth, its walls at 60 degrees to it."""
+    # Between such walls a lead-in catches twice as far across the slot as it is wide.
+    chamfer = 0.5 * CHAMFER
+    wide = 3.0 + 5.0 / np.sqrt(3.0)
+    tongue = CrossSection([[(-3.0, 0.0), (3.0, 0.0), (wide, 5.0), (-wide, 5.0)]])
     slot = _grown(tongue, clearance)
-    plug = _shaft(tongue, -15.0, 8.0) + _prism(_square(14.0, 5.0, 0.0, -2.4), -15.0, 8.0)
+    plug = _shaft(tongue, -15.0, 8.0, chamfer) + _prism(_square(14.0, 5.0, 0.0, -2.4), -15.0, 8.0)
     # The slot is open to the side of the plug's plate.
     block = _prism(_square(24.0, 12.0, 0.0, 6.0 + 0.1 + clearance), -19.0, 0.0)
     block -= _prism(slot, -15.0, 0.01)
     block -= Manifold.batch_hull(
-        [_prism(_grown(tongue, clearance), -0.5, -0.49), _prism(_grown(tongue, 0.5), 0.0, 0.01)]
+        [_prism(slot, -chamfer, -chamfer + 0.01), _prism(_grown(tongue, clearance + chamfer), 0.0, 0.01)]
     )
     return Part([plug], [block], clearance)
 

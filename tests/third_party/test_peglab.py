@@ -31,13 +31,13 @@ def lab(tmp_path_factory):
     variables = os.environ | {"OMP_NUM_THREADS": "1", "DRAKE_ALLOW_NETWORK": "meshcat:lcm"}
     variables.pop("PYTHONPATH", None)
     served = subprocess.Popen(
-        [str(environment / "bin" / "python"), str(Path(__file__).with_name("served.py"))],
+        [str(environment / "bin" / "python"), str(Path(__file__).parents[1] / "served.py")],
         cwd=folder, env=variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert served.stdout.readline() == "ready\n"
 
     def run(*arguments, code=0):
-        served.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder)}) + "\n")
+        served.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder), "environment": {}}) + "\n")
         served.stdin.flush()
         result = json.loads(served.stdout.readline())
         assert result["returncode"] == code, result["stdout"] + result["stderr"]
@@ -57,7 +57,7 @@ def guiderail(lab, *arguments, code=0):
 @pytest.fixture(scope="module")
 def trained(lab):
     guiderail(
-        lab, "train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "6",
+        lab, "train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "3",
         "--env", "width=0.16", "--out", "run",
     )  # fmt: skip
     return lab.folder / "run"
@@ -98,14 +98,14 @@ def test_a_wrong_option_gets_a_sentence(lab):
 
 
 def test_it_is_trained_resumed_and_evaluated(lab, trained):
-    guiderail(lab, "train", "--resume", "--episodes", "8", "--out", "run")
-    found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "5", "--json"))
-    assert found["episodes"] == 5
+    guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run")
+    found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
+    assert found["episodes"] == 2
     assert found["worst_violation"] <= 1e-9
 
 
 def test_it_is_replayed(lab, trained):
-    guiderail(lab, "replay", "run", "--html", "page.html")
+    guiderail(lab, "replay", "run", "--episodes", "1", "--html", "page.html")
     assert "peglab/Slot" in (lab.folder / "page.html").read_text()
 
 
@@ -123,7 +123,7 @@ judged_on:
   - {name: held_out, episodes: 3}
 """
     )
-    guiderail(lab, "study", "study.yaml", "--out", "study", "--json")
+    guiderail(lab, "study", "study.yaml", "--processes", "1", "--out", "study", "--json")
     assert list((lab.folder / "study").glob("*.csv"))
 
 

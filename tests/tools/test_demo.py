@@ -1,8 +1,11 @@
 from guiderail.tools import demo
+from guiderail.tools.viewing import replay, style
 
 
 def test_the_demo_says_what_it_left_and_replaces_itself(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "HELD_OUT", 1)
+    monkeypatch.setattr(replay, "EPISODES", 1)
+    monkeypatch.setattr(style, "LAYOUT", "constrained")  # pictures as people get them
     out = tmp_path / "demo"
     demo.run_demo(out, episodes=2, seed=0)
     said = capsys.readouterr().out

@@ -18,7 +18,7 @@ from guiderail.tools.recording.record import record
 from guiderail.tools.rollouts.evaluate import evaluate
 from guiderail.tools.rollouts.rollout import reset_held_out
 from guiderail.tools.tasks import make_environment
-from guiderail.tools.viewing.film import write_film
+from guiderail.tools.viewing import film
 from guiderail.tools.viewing.replay import default_page, tube, write_page
 from guiderail.tools.viewing.shown import Shown
 
@@ -79,7 +79,7 @@ def test_held_out_starts_differ_from_those_of_training_and_from_each_other():
 
 
 def test_the_replay_is_one_page_that_needs_nothing_else(trained):
-    write_page(default_page(trained.path, {}), Shown.of_run(trained.path))
+    write_page(default_page(trained.path, {}), Shown.of_run(trained.path), episodes=1)
     page = (trained.path / "replay.html").read_text()
     assert "the constraint" in page
     assert "demonstrations" in page
@@ -88,22 +88,24 @@ def test_the_replay_is_one_page_that_needs_nothing_else(trained):
     assert "https://" not in page.partition("<body>")[0]
 
 
-@pytest.mark.parametrize(("ending", "magic"), [(".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")])
-def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, ending, magic):
-    picture = tmp_path / f"film{ending}"
-    row = write_film(picture, Shown.of_run(trained.path))
-    assert row["success"]
-    assert picture.read_bytes().startswith(magic)
-    image = imread(picture)
-    assert image.shape[0] > 400
-    assert image[..., :3].std() / image.max() > 0.05  # it is not blank
+def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, monkeypatch):
+    watched = film.watch(Shown.of_run(trained.path), film.ROWS * film.COLUMNS)
+    monkeypatch.setattr(film, "watch", lambda *_: watched)  # once for both
+    for ending, magic in ((".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")):
+        picture = tmp_path / f"film{ending}"
+        row = film.write_film(picture, Shown.of_run(trained.path))
+        assert row["success"]
+        assert picture.read_bytes().startswith(magic)
+        image = imread(picture)
+        assert image.shape[0] > 400
+        assert image[..., :3].std() / image.max() > 0.05  # it is not blank
 
 
 def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
     with pytest.raises(InputError, match="no station 'arm': choose one of plane"):
         write_page(tmp_path / "replay.html", Shown.of_run(trained.path, {"station": "arm"}))
     with pytest.raises(InputError, match="a picture is"):
-        write_film(tmp_path / "film.gif", Shown.of_run(trained.path))
+        film.write_film(tmp_path / "film.gif", Shown.of_run(trained.path))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -36,7 +36,8 @@ def test_the_connector_as_the_thesis_has_it_differs_only_in_what_cannot_be_had()
     assert all("thesis: " in one for one in words)
     assert not any(one.startswith(("control steps", "ρ", "learning rate", "discount", "station")) for one in words)
     assert any(one.startswith("simulated") for one in words)
-    assert len(words) == len(THESIS["BncConnector"].remarks)
+    holding = [holds(configure("BncConnector", AS_PRINTED).environment) for _, holds in THESIS["BncConnector"].remarks]
+    assert len(words) == sum(holding)
 
 
 @pytest.mark.parametrize(
@@ -94,3 +95,13 @@ def test_pouring_names_its_weights_and_its_speed():
 def test_the_connectors_dimensions_are_the_runs_own():
     told = " ".join(differences(configure("BncConnector", {"difficulty": "hard"})))
     assert "chamfer of 0.1 mm" in told
+    assert "difficulty 'hard', which is ours" in told
+    assert "difficulty" not in " ".join(differences(configure("BncConnector", {})))
+
+
+def test_who_does_not_learn_differs_in_no_setting_of_a_learner():
+    config = configure("Pouring", {"difficulty": "hard"}, algorithm="tqc", preset="robust")
+    without = differences(config, learns=False)
+    assert set(without) < set(differences(config))
+    assert not any("learning rate" in one or "hidden units" in one for one in without)
+    assert any("difficulty" in one for one in without)

@@ -10,7 +10,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 
 Item = TypeVar("Item")
-BENCHMARKS = ("primitive", "simulation", "loop", "time_step", "engines", "saving", "learner", "training")
+BENCHMARKS = ("primitive", "simulation", "loop", "time_step", "engines", "impedance", "saving", "learner", "training")
 OF_A_TASK = ("training",)  # those that are told which task, and how it is set up
 DRAWN = ("time_step", "engines")  # those that can be drawn
 

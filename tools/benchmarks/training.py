@@ -139,8 +139,8 @@ def measure(
         episodes: how many.
     """
     task = task or TASK
-    how = with_defaults(task, {})
-    config = configure(task, environment or {}, settings={"learning_starts": LEARNING_STARTS}, episodes=episodes, **how)
+    how = with_defaults(task, {"settings": {"learning_starts": LEARNING_STARTS}})
+    config = configure(task, environment or {}, episodes=episodes, **how)
     with tempfile.TemporaryDirectory() as folder, timed_parts() as clock:
         start = time.perf_counter()
         rows = train.train(RunFolder(Path(folder) / "run"), config)

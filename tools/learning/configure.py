@@ -10,6 +10,7 @@ import pandas as pd
 
 from guiderail.models.errors import InputError
 from guiderail.tools.learning.defaults import DEFAULTS, own_defaults
+from guiderail.tools.learning.person import Person
 from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.rollouts.metrics import summary
@@ -35,6 +36,7 @@ def configure(
     seed: int = DEFAULTS["seed"],
     imports: Sequence[str] = (),
     ledger: bool = True,
+    with_person: bool = False,
 ) -> RunConfig:
     """A checked configuration with everything resolved.
 
@@ -49,7 +51,7 @@ def configure(
     resolved = check_environment(task, environment)
     return RunConfig(
         task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger,
-        task_content(task),
+        task_content(task), with_person,
     )  # fmt: skip
 
 
@@ -66,11 +68,13 @@ def run(
     resume: bool = False,
     imports: Sequence[str] = (),
     ledger: bool | None = None,
+    person: Callable[[], Person] | None = None,
     demonstrator: Callable[[str], Callable[[gymnasium.Env], Act]] | None = None,
 ) -> dict[str, Any]:
     """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
 
-    A run that goes on keeps its configuration; only more episodes may be asked for. `demonstrator` finds who acts in
+    A run that goes on keeps its configuration; only more episodes may be asked for. `person` makes who watches, pushes
+    and speaks, where somebody does. `demonstrator` finds who acts in
     the learner's `demonstration_episodes` by the task's name, and raises an InputError where nobody does.
 
     Returns:
@@ -81,6 +85,7 @@ def run(
     folder = RunFolder(out)
     imports = import_modules(imports)
     choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
+    choices["with_person"] = None if person is None else True
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
     if resume:
         config = _continued(folder, task, environment, given, settings)
@@ -88,12 +93,14 @@ def run(
         raise InputError("what should be learned? name a task, such as guiderail train NarrowPassage --out RUN")
     else:
         folder.refuse_existing()
-        config = configure(task, environment, settings=settings, imports=imports, **with_defaults(task, given))
+        given["settings"] = settings
+        config = configure(task, environment, imports=imports, **with_defaults(task, given))
     from guiderail.tools.learning.train import train  # PyTorch takes seconds: what is wrong was refused by now
 
     shows = demonstrator(config.task) if demonstrator and config.learner.demonstration_episodes else None
+    watching = person() if config.with_person and person is not None else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
-        rows = train(folder, config, resume=resume, report=progress.update, demonstrator=shows)
+        rows = train(folder, config, resume=resume, report=progress.update, demonstrator=shows, person=watching)
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
 
 
@@ -102,10 +109,12 @@ def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
 
     Args:
         task: its name.
-        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them.
+        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them, with
+            single settings of it replaced.
     """
     learner = {} if given.keys() & {"algorithm", "preset"} else own_defaults(task)
-    return {**learner, **given}
+    settings = {**learner.get("settings", {}), **(given.get("settings") or {})}
+    return {**learner, **given} | ({"settings": settings} if settings else {})
 
 
 def finish(out: Path) -> dict[str, str]:
@@ -133,7 +142,7 @@ def _continued(
     config = folder.config()
     config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
-    stored |= {"ledger": config.ledger} | config.environment
+    stored |= {"ledger": config.ledger, "with_person": config.with_person} | config.environment
     wanted = {**environment, **given} | ({} if task is None else {"task": task})
     for key, value in wanted.items():
         if key != "episodes" and stored.get(key) != value:

@@ -15,11 +15,25 @@ SETTINGS = {
 # Values of a learner in a checkpoint, and the beginnings of its arrays' names.
 VALUES = {"proving": "selection", "row": "greedy_successes"}
 ARRAYS = {"proving/proven/": "selection/selected/", "proving/": "selection/"}
+# Options of an environment that results are older than, and what they are where nobody asks for them.
+OPTIONS: Mapping[str, Any] = {"impedance_control": "joint", "balls": 2, "balls_in": None, "ball_diameter": 0.04}
+# Tasks whose results don't say which task they are of.
+TASKS = ("NarrowPassage", "BncConnector", "GridClamp", "Pouring")
 
 
 def settings(stored: Mapping[str, Any]) -> dict[str, Any]:
     """A learner's settings by the names that they have here."""
     return {SETTINGS.get(name, name): value for name, value in stored.items()}
+
+
+def options(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """An environment's options without those that would say nothing new of an earlier result."""
+    return {name: value for name, value in environment.items() if name not in OPTIONS or OPTIONS[name] != value}
+
+
+def task(name: str) -> str:
+    """What a digest of results says of their task."""
+    return "" if name in TASKS else name
 
 
 def checkpoint(arrays: Mapping[str, Any], values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -4,6 +4,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, field, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -42,6 +43,7 @@ class RunConfig:
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
     ledger: bool = True  # whether every control step is written down
     task_content: str = ""  # of a task folder: the digest of its files; empty where a run is older than that
+    with_person: bool = False  # whether a person watches; what was corrected is in the environment's via_points
 
     @property
     def hold(self) -> int:
@@ -59,7 +61,13 @@ class RunConfig:
 
 def installed_versions() -> dict[str, str]:
     """The versions that a result depends on."""
-    return {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version()} | {name: _version(name) for name in PACKAGES}
+
+
+@cache
+def _version(name: str) -> str:
+    """Of a package: what an interpreter imported stays what it is, and a study asks a thousand times."""
+    return metadata.version(name)
 
 
 class RunFolder:

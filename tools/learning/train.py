@@ -11,6 +11,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS, Learner, arguments_of
+from guiderail.tools.learning.person import Person, Watched
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.student import Spaces, Student
 from guiderail.tools.rollouts.ledger import Ledger
@@ -31,6 +32,7 @@ def train(
     resume: bool = False,
     report: Callable[[dict[str, Any]], None] | None = None,
     demonstrator: Callable[[gymnasium.Env], Act] | None = None,
+    person: Person | None = None,
 ) -> list[dict[str, Any]]:
     """Trains a run to its last episode and writes its folder.
 
@@ -44,13 +46,16 @@ def train(
         report: called with each episode's row.
         demonstrator: who acts, in an environment, in the learner's `demonstration_episodes`: a policy without a memory
             of earlier episodes. Off-policy learners are taught by what others did (Vecerik et al., 2017).
+        person: who watches a run that is configured so, pushes, and says what was a success.
 
     Returns:
         The rows of `episodes.csv`.
 
     Raises:
-        InputError: if the folder holds another run, another process writes into it, or nobody demonstrates.
+        InputError: if the folder holds another run, another process writes into it, or nobody demonstrates or watches.
     """
+    if config.with_person and person is None:
+        raise InputError("a person watches this run: give --with-person")
     if config.learner.demonstration_episodes and demonstrator is None:
         raise InputError(
             f"nobody demonstrates {config.task}: it has no rule, so leave the setting demonstration_episodes out"
@@ -74,7 +79,7 @@ def train(
         with folder.locked():
             if config.learner.pipelined:
                 learner = Student(learner, ((config.learner, Spaces(env)), named), waits=True)
-            return _train(folder, config, env, learner, resume, report, demonstrator)
+            return _train(folder, config, env, learner, resume, report, demonstrator, person)
     finally:
         learner.close()
         env.close()
@@ -88,15 +93,21 @@ def _train(
     resume: bool,
     report: Callable[[dict[str, Any]], None] | None,
     demonstrator: Callable[[gymnasium.Env], Act] | None,
+    person: Person | None,
 ) -> list[dict[str, Any]]:
     if resume:
         rows = _resume(folder, learner, env)
-        folder.write_config(config)
         if len(rows) < config.episodes:
             folder.remove_policy()  # killed from here on, it has one of fewer episodes than its table
     else:
         rows = []
         folder.create(config)
+    watched = None
+    if config.with_person and person is not None:
+        watched = Watched(config, person, load_checkpoint(folder.checkpoint)[1] if rows else {})
+        watched.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
+        env, config = watched.env, watched.config
+    folder.write_config(config)
 
     ledger = Ledger(env, folder.ledger)
     watching: list[Observer] = [ledger] if config.ledger else []
@@ -105,7 +116,11 @@ def _train(
     for episode in range(len(rows), config.episodes):
         started = time.perf_counter()
         act = demonstrator(env) if demonstrator is not None and episode < shown else learner.act
-        row = rollout(env, act, learner, *watching, index=episode)
+        if watched is None:
+            row = rollout(env, act, learner, *watching, index=episode)
+        else:
+            row = watched.rollout(act, learner, *watching, index=episode)
+            env = watched.env
         if learner.has_diverged():
             raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
         row["wall_time"] = time.perf_counter() - started
@@ -121,7 +136,7 @@ def _train(
         with_another = ledger.seconds + spent_saving + last_saving
         if with_another <= SAVING_SHARE * spent_training or episode + 1 in (1, config.episodes):
             started = time.perf_counter()
-            _save(folder, rows, learner, env)
+            _save(folder, rows, learner, env, watched)
             last_saving = time.perf_counter() - started
             spent_saving += last_saving
         learner.hand_over()
@@ -131,11 +146,14 @@ def _train(
     return rows
 
 
-def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any) -> None:
+def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, watched: Watched | None) -> None:
     """The checkpoint first: it holds the table too, and whoever is killed between the two loses nothing."""
     arrays, values = learner.state()
     generator = env.unwrapped.np_random.bit_generator.state
-    save_checkpoint(folder.checkpoint, arrays, {"rows": rows, "learner": values, "environment": generator})
+    held = {"rows": rows, "learner": values, "environment": generator}
+    save_checkpoint(folder.checkpoint, arrays, held | ({} if watched is None else watched.state()))
+    if watched is not None:
+        folder.write_config(watched.config)
     folder.write_episodes(rows)
 
 

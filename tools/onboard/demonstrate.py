@@ -37,7 +37,7 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:
-    driven, _ = drive_along(RailsStation(workcell(folder, file)), times, motion)
+    driven, _ = drive_along(RailsStation(workcell(folder, file), time_step=file.time_step), times, motion)
     plant = driven.station.plant
     X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
     turn = X.rotation().ToAngleAxis()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,15 @@ from guiderail.models.parts.fit import (
 from guiderail.models.parts.mesh_file import UNITS, Part, load_part, unit_of
 from guiderail.models.parts.model_files import obj_text
 from guiderail.models.parts.pieces import as_arrays, convex_pieces
+from guiderail.models.parts.sides import sides
 from guiderail.models.units import DEGREE, MM
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 MODULI = (2e9, 1e10)  # [Pa] of what is compliant, tried in this order until it is stiff enough
 SNAP_MODULI = (2e7, 5e7, 5e6)  # [Pa] of a body that has to give way
 PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)  # commanded below the target, as little as seats the plug
-OFF = 1.5 * MM  # beside its place a socket must stop the plug
+BESIDE = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # so far from its place a socket must stop the plug
+TIME_STEPS = (None, 0.005)  # [s] of the simulation: its own, and half of it where parts are too deep in each other
 FAST_ENOUGH = 4.0  # times real time, from which the other side is not tried
 DENSITY = 2700.0  # [kg/m³] of a part, aluminium's; rails carry no weight
 CLEAR = 3.0 * MM
@@ -48,6 +51,7 @@ class Contact:
         modulus: of those that don't snap [Pa].
         snap_modulus: of those that do [Pa].
         snapping: numbers of the bodies that do.
+        time_step: of the simulation [s], its own unless given.
     """
 
     compliant: str
@@ -55,6 +59,7 @@ class Contact:
     modulus: float
     snap_modulus: float
     snapping: frozenset[int]
+    time_step: float | None = None
 
     @property
     def pieces(self) -> list[tuple[str, float, Any]]:
@@ -203,9 +208,12 @@ def _make(
     for file in scenario:
         shutil.copy(file, folder / file.name)
     numbers = {"name": name, "force_limit": force_limit, "friction": friction, "scenario": scenario, "path": path}
+    same, near = sides(*parts, path)
+    numbers |= {"sides": same, "rim_sides": near}
+    say(f"the parts look the same from {len(same)} of 7 other sides, and the rim nearly so from {len(near)} more")
     contact, push, aligned = _choose_contact(folder, parts, numbers, clearance, snapping, say)
     file = _task_file(parts, contact, push, numbers)
-    off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in ((OFF, 0.0), (0.0, OFF))]
+    off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in BESIDE]
     penetration = max(trial.penetration for trial in (aligned, *off))
     succeeded, page = demonstrate(folder, file), folder / "preview.html"
     measured = {
@@ -213,6 +221,7 @@ def _make(
         "compliant": contact.compliant,
         "pieces": len(contact.pieces),
         "modulus": contact.modulus,
+        "time_step_ms": None if contact.time_step is None else 1e3 * contact.time_step,
         "inserted": aligned.success,
         "inserted_1.5_mm_off": [trial.success for trial in off],
         "force": round(aligned.peak_force, 2),
@@ -248,16 +257,18 @@ def _choose_contact(
         if any(body is None for body in cut):
             say(f"{side}: too intricate to be cut into convex pieces")
             continue
-        for modulus in MODULI:
-            bodies = tuple(tuple(body or ()) for body in cut)
-            trial, contact, push = _first_that_seats(folder, parts, side, bodies, modulus, snapping, numbers)
+        bodies = tuple(tuple(body or ()) for body in cut)
+        for modulus, time_step in itertools.product(MODULI, TIME_STEPS):
+            contact = Contact(side, bodies, modulus, modulus, snapping, time_step)
+            trial, contact, push = _first_that_seats(folder, parts, contact, numbers)
             good = trial.success and trial.penetration <= allowed
             if good:
                 # Pressed on the rim it is deepest: there an edge meets an edge.
                 file = _task_file(parts, contact, push, numbers)
-                good = insert(folder, file, offset=(OFF, 0.0)).penetration <= allowed
+                good = all(insert(folder, file, offset=one).penetration <= allowed for one in BESIDE)
             say(
-                f"{side} compliant, {len(contact.pieces)} convex pieces, {modulus:.0e} Pa: "
+                f"{side} compliant, {len(contact.pieces)} convex pieces, {modulus:.0e} Pa"
+                f"{f', {1e3 * time_step:g} ms a step' if time_step else ''}: "
                 f"{'seats' if trial.success else 'does not seat'}, {trial.peak_force:.1f} N, "
                 f"{1e3 * trial.penetration:.3f} mm deep, {trial.real_time_factor:.1f} × real time"
             )
@@ -280,19 +291,16 @@ def _choose_contact(
 def _first_that_seats(
     folder: Path,
     parts: tuple[Part, Part],
-    side: str,
-    bodies: tuple[tuple[Any, ...], ...],
-    modulus: float,
-    snapping: frozenset[int],
+    contact: Contact,
     numbers: dict[str, Any],
 ) -> tuple[Any, Contact, float]:
     """The first trial that seats, over how far is pushed and how soft a snap is; the last one if none does."""
     from guiderail.tools.onboard.trial import insert
 
-    for soft in SNAP_MODULI if snapping else (modulus,):
-        contact = Contact(side, bodies, modulus, soft, snapping)
+    for soft in SNAP_MODULI if contact.snapping else (contact.modulus,):
+        contact = replace(contact, snap_modulus=soft)
         _write_pieces(folder, parts, contact)
-        for push in PUSHES if snapping else PUSHES[:1]:
+        for push in PUSHES if contact.snapping else PUSHES[:1]:
             file = _task_file(parts, contact, push, numbers)
             trial = insert(folder, file, snapping=contact.snapping_pieces)
             if trial.success:
@@ -338,6 +346,9 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
             {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push}
         ),
         force_limit=numbers["force_limit"],
+        time_step=contact.time_step,
+        sides=numbers["sides"],
+        rim_sides=numbers["rim_sides"],
     )
     return PartTaskFile.model_validate(values)
 

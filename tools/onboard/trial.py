@@ -117,7 +117,7 @@ def insert(
     numbers = file.motion
     times, poses = straight(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
     world = workcell(folder, file)
-    station = RailsStation(world)
+    station = RailsStation(world, time_step=file.time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     world.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
     compliant = {

@@ -54,6 +54,8 @@ SNAPSHOT = 1.0  # [s] that one undo takes back
 FORCE_LENGTH = 2.0 * MM  # of the arrow, for each newton
 BAR = 30.0  # [N] a full bar
 LEAST_SAMPLES = 10
+REST = 0.1  # [s] for which the command may stay where it is in a demonstration
+NEAREST = 1.0 * MM  # that a page's camera sees
 
 
 @dataclass
@@ -93,7 +95,7 @@ class Teaching:
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", make_station(resolved))
         builder.ExportInput(self.station.get_desired_pose_input_port(), "desired_pose")
-        self.meshcat = add_meshcat(builder, self.station.GetOutputPort("query"))[0] if meshcat is None else meshcat
+        self.meshcat = add_meshcat(builder, self.station.GetOutputPort("query")) if meshcat is None else meshcat
         self.simulator = Simulator(builder.Build())
         self.kept: list[tuple[np.ndarray, np.ndarray]] = []
         self.succeeded: list[bool | None] = []
@@ -101,6 +103,7 @@ class Teaching:
         self._pristine = self.simulator.get_context().Clone()
         self._clicks: dict[str, int] = {}
         self._slow = False
+        look_at(self.meshcat, self.task)
         for name, (reach, step, lower, higher, _) in SLIDERS.items():
             self.meshcat.AddSlider(name, -reach, reach, step, 0.0, lower, higher)
         for name, key in BUTTONS.items():
@@ -176,12 +179,13 @@ class Teaching:
         if len(self.taken.times) < LEAST_SAMPLES:
             raise InputError("nothing was shown yet: move the sliders or press the keys first")
         success = self.is_success()
-        self.kept.append((np.array(self.taken.times), np.array(self.taken.commands)))
+        self.kept.append(without_rests(self._period, np.array(self.taken.commands)))
         self.succeeded.append(success)
         self.out.parent.mkdir(parents=True, exist_ok=True)
         self.demonstrations().save(self.out)
         ended = {None: "", True: ", at the target", False: ", NOT at the target"}[success]
-        return f"kept demonstration {len(self.kept)}: {self.taken.times[-1]:.1f} s{ended}; {self.out}"
+        lasts = f"{self.taken.times[-1]:.1f} s, {self.kept[-1][0][-1]:.1f} s of them without rests"
+        return f"kept demonstration {len(self.kept)}: {lasts}{ended}; {self.out}"
 
     def demonstrations(self) -> Demonstrations:
         """All that were kept."""
@@ -289,6 +293,29 @@ class Teaching:
 
     def _port(self) -> Any:
         return self.simulator.get_system().GetInputPort("desired_pose")
+
+
+def without_rests(period: float, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times (n,) and commands (n, 6) of a demonstration whose rests are cut to `REST`: a person looks, and thinks.
+
+    Args:
+        period: of the control steps [s].
+        commands: one for each of them, (N, 6).
+    """
+    resting, kept = 0, [0]
+    for step in range(1, len(commands)):
+        resting = resting + 1 if np.array_equal(commands[step], commands[step - 1]) else 0
+        if resting * period <= REST:
+            kept.append(step)
+    return period * np.arange(len(kept)), commands[kept]
+
+
+def look_at(meshcat: Any, task: Any) -> None:
+    """Opens a page with the view of a task's scene, near enough to see parts of a centimetre."""
+    view = task.scene().viewpoint
+    if view is not None:
+        meshcat.SetProperty("/Cameras/default/rotated/<object>", "near", NEAREST)
+        meshcat.SetCameraPose(*(np.array(point) for point in view))
 
 
 def teach(

@@ -58,7 +58,7 @@ def train_on_robot(
     folder = RunFolder(out)
     folder.refuse_existing()
     environment = {**environment, **other.environment(str(environment["station"]))}
-    config = configure(task, environment, settings=settings, **with_defaults(task, given))
+    config = configure(task, environment, **with_defaults(task, {**given, "settings": settings}))
     if config.learner.demonstration_episodes:
         raise InputError("nobody demonstrates on a robot: leave the setting demonstration_episodes out")
     with folder.locked(), at_robot(config, other, yes=yes, say=say) as robot:

@@ -12,10 +12,12 @@ from typing import Any
 import gymnasium
 import pandas as pd
 
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.files import write_atomically
 from guiderail.tools.guidance import is_demonstrated
+from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.rollouts.metrics import converged_after, summary
 from guiderail.tools.rollouts.null_policies import still
@@ -26,6 +28,7 @@ from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import changed_environment, make_environment, task_content
 from guiderail.tools.thesis import differences
 
+CALIBRATION = "calibration"  # the uncertainty under which a run hides an offset of its own
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
 COMPARED = (
     "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "worst_violation",
@@ -104,6 +107,7 @@ def evaluate(
     seed: int = HELD_OUT_SEED,
     environment: Mapping[str, Any] | None = None,
     beside: Mapping[str, Callable[[gymnasium.Env], Act]] | None = None,
+    fresh: bool = False,
 ) -> dict[str, Any]:
     """Evaluates the policy that a run left, beside policies that learned nothing.
 
@@ -114,20 +118,26 @@ def evaluate(
         environment: arguments of the environment that are other ones than where it learned, such as the station.
         beside: what else acts in the same episodes, by a name: null policies and rules by hand. Their rows are kept in
             the run's folder and used again.
+        fresh: what is hidden and constant in the run is drawn anew in every episode.
 
     Returns:
-        The statistics `COMPARED`, each also as `demonstration_<name>` (the same episodes before anything was learned;
-        None where guidance has no demonstration) and as `<policy>_<name>` for those beside it; `beside`, the names of
-        those that can act in this environment; `episodes` and `seed`; `converged_after` and `trained_episodes` of
-        the training; `differs_from_thesis`, in what task, learner and environment do, in words.
+        `claim`, what the policy is then judged as; the statistics `COMPARED`, each also as `demonstration_<name>` (the
+        same episodes before anything was learned; None where guidance has no demonstration) and as `<policy>_<name>`
+        for those beside it; `beside`, the names of those that can act in this environment; `episodes` and `seed`;
+        `converged_after` and `trained_episodes` of the training; `differs_from_thesis`, in what task, learner and
+        environment do, in words.
 
     Raises:
-        InputError: if there is no trained run, a number is out of range, or its policy sees or moves other things.
+        InputError: if there is no trained run, a number is out of range, its policy sees or moves other things, or
+            nothing is hidden that could be drawn anew.
     """
     folder = RunFolder(run)
     config, policy, trained = folder.config(), Policy.load(folder.path), folder.episodes()
     where = changed_environment(config.task, config.environment, environment or {})
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
+    claimed = claim(config.task, where, fresh)
+    if fresh:
+        how["options"] = {"new_run": True}
     rows = evaluate_run(config, partial(as_learned, policy), where, words="held-out episodes", **how)
     alone = pd.DataFrame()
     if is_demonstrated(where.get("guidance")):
@@ -141,6 +151,7 @@ def evaluate(
         others |= summary(judged, COMPARED, f"{name}_")
         names.append(name)
     return {
+        "claim": claimed,
         **summary(rows, COMPARED),
         **summary(alone, COMPARED, "demonstration_"),
         **others,
@@ -151,6 +162,27 @@ def evaluate(
         "trained_episodes": len(trained),
         "differs_from_thesis": differences(replace(config, environment=where)),
     }
+
+
+def claim(task: str, environment: Mapping[str, Any], fresh: bool) -> str:
+    """What a policy is judged as: one for what a run hides, or one for whatever may be hidden.
+
+    Args:
+        task: its name.
+        environment: in which it is judged.
+        fresh: whether what a run hides is drawn anew in every episode.
+
+    Raises:
+        InputError: if a run hides nothing that could be drawn anew.
+    """
+    hides = task in TASKS.names() and "new_run" in TASKS.get(task).Reset.model_fields
+    if fresh and not hides:
+        raise InputError(f"a run of {task} hides nothing that could be drawn anew: leave --fresh out")
+    if not hides:
+        return "a policy for starts that training never drew"
+    if fresh or environment.get("uncertainty", CALIBRATION) != CALIBRATION:
+        return "a policy for any offset: a new one in every episode"
+    return "a policy for the one offset that is hidden in this run, and for no other (--fresh: for any)"
 
 
 def judged_once(
@@ -192,7 +224,9 @@ def kept_file(
     """The file that `judged_once` keeps its rows in, named by all that decides them; the arguments are its own."""
     deciding = {key: value for key, value in how.items() if key != "words"}
     about = [*([] if about is None else [about]), *filter(None, [task_content(config.task)])]
-    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
+    told = json.dumps(
+        [older.options(environment), deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str
+    )
     return kept / f"{name}-{hashlib.blake2b(told.encode(), digest_size=6).hexdigest()}.csv"
 
 

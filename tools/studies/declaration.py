@@ -82,7 +82,7 @@ class Sweep(_Strict):
     """One number of the environment made harder and harder: judged at each of its values, and drawn."""
 
     quantity: str  # what is varied, with its unit, under the picture
-    at: dict[float, dict[str, Any]] = Field(min_length=1)  # arguments of the environment, by the quantity's value
+    at: dict[float, dict[str, Any]] = Field(min_length=1)  # the environment's arguments by its value, the easiest first
     options: dict[str, Any] = {}  # of each reset
     episodes: int = Field(default=40, ge=1)  # at each value
 

@@ -16,10 +16,9 @@ from guiderail.tools.figures import command_of
 from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.files import write_atomically
 from guiderail.tools.rollouts.metrics import TOLERANCE
-from guiderail.tools.studies.declaration import Study, load_study, shipped_studies
-from guiderail.tools.studies.study import Job
+from guiderail.tools.studies.declaration import LEARNED, Study, load_study, shipped_studies
+from guiderail.tools.studies.study import differences_of
 from guiderail.tools.tables import cell, read_table, table_text
-from guiderail.tools.thesis import differences
 
 # The figures of the thesis that a study stands beside.
 FIGURES = {
@@ -115,7 +114,10 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
         told = [method, mark or "–", judged or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
-    for words, methods in _differences(study).items():
+    differing: dict[str, list[str]] = {}
+    for method in (method for method, one in study.methods.items() if one.policy == LEARNED):
+        differing.setdefault("; ".join(differences_of(study, method)), []).append(method)
+    for words, methods in differing.items():
         lines += ["", f"Differs from the thesis in ({', '.join(methods)}): {words}."]
     return "\n".join([*lines, ""])
 
@@ -131,13 +133,3 @@ def _numbers(group: pd.DataFrame) -> list[str]:
     kept = "within" if worst <= TOLERANCE else f"{worst:.2g} outside"
     hours = float(np.nansum(group["training_wall_time"].to_numpy(float))) / 3600
     return [held_out, converged, kept, f"{int(group['training_collisions'].sum())}", f"{hours:.2f}"]
-
-
-def _differences(study: Study) -> dict[str, list[str]]:
-    """In what its methods that learn differ from the thesis; those that do in the same are told together."""
-    told: dict[str, list[str]] = {}
-    for method in study.methods:
-        job = Job(study, method, study.seeds[0], Path())
-        if job.learns:
-            told.setdefault("; ".join(differences(job.config(job.marks[-1]))), []).append(method)
-    return told

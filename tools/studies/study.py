@@ -11,7 +11,7 @@ import itertools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from rich.console import Console
 from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.models.policy import Policy
 from guiderail.tools.files import write_atomically
+from guiderail.tools.learning import older
 from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.rollouts.evaluate import cached, evaluate_run
@@ -35,9 +36,10 @@ from guiderail.tools.studies.board import Board
 from guiderail.tools.studies.declaration import LEARNED, JudgedOn, Ratio, Study
 from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
-from guiderail.tools.studies.sweep import draw_sweeps
+from guiderail.tools.studies.sweep import broken, draw_sweeps
 from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import changed_environment, import_modules, make_environment, task_content
+from guiderail.tools.thesis import differences
 
 BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
@@ -94,12 +96,12 @@ class Job:
         study, method = self.study, self.study.methods[self.method]
         choices = [study.learner, method.learner]
         given = {k: v for c in choices for k in ("algorithm", "preset") if (v := getattr(c, k)) is not None}
+        given["settings"] = {**study.learner.settings, **method.learner.settings}
         environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
-        settings = {**study.learner.settings, **method.learner.settings}
-        given |= {"imports": study.imports, "settings": settings, "seed": self.seed}
+        given |= {"imports": study.imports, "seed": self.seed}
         return configure(study.task, environment, episodes=max(episodes, 1), **given)
 
-    @property
+    @cached_property
     def folder(self) -> RunFolder:
         """Where its run is, and what was evaluated of it."""
         config = self.config(self.marks[-1])
@@ -150,6 +152,8 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
 def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict[str, Any]:
     """Runs a study, writes `<name>.csv` and `.md`, and says what the rows come to, each seed by itself.
 
+    `differs_from_thesis` says in what, by the methods that do.
+
     Where runs failed, the table has the others, and `failed` says what became of these.
     """
     result: dict[str, Any] = {}
@@ -162,6 +166,7 @@ def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict
     result["table"] = str(write_table(out / study.name, rows.drop(columns="folder")))
     if study.sweeps:
         result["picture"] = str(draw_sweeps(study, rows, out / f"{study.name}.png"))
+        result |= broken(study, rows)
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
         after = f" after {mark} episodes" if mark else ""
         if judged:
@@ -170,7 +175,29 @@ def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict
             result[f"{method}{after}, converged after, each seed"] = each(group, "training_converged_after")
     for one in study.ratios:
         result |= ratio(rows, one)
+    result["differs_from_thesis"] = differing(study)
     return result
+
+
+ALL = "all methods"
+
+
+def differing(study: Study) -> dict[str, list[str]]:
+    """In what methods differ from the thesis: first all of them, then those that differ in the same things besides."""
+    told = {method: differences_of(study, method) for method in study.methods}
+    first, *others = told.values()
+    common = [words for words in first if all(words in other for other in others)]
+    own: dict[tuple[str, ...], list[str]] = {}
+    for method, words in told.items():
+        own.setdefault(tuple(one for one in words if one not in common), []).append(method)
+    found = {ALL: common} if common else {}
+    return found | {", ".join(methods): list(words) for words, methods in own.items() if words}
+
+
+def differences_of(study: Study, method: str) -> list[str]:
+    """In what a method differs from the thesis, in words; without a learner's settings where nobody learns."""
+    job = Job(study, method, study.seeds[0], Path())
+    return differences(job.config(job.marks[-1]), learns=job.learns)
 
 
 def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
@@ -228,6 +255,8 @@ def _check(job: Job) -> None:
         sampled = {name: low for name, (low, _) in judged.sampled.items()}
         where = changed_environment(config.task, config.environment, judged.env)
         configure(job.study.task, where | sampled, episodes=1)
+    for mark, judged in itertools.product(job.marks, job.study.judgements):
+        _refuse_other_rows(job, _evaluated_file(job, mark, judged), judged)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
         for mark in job.marks:
@@ -304,10 +333,11 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
         config = job.config(mark)
         shows = untrained(config.task, "rule") if config.learner.demonstration_episodes else None
         train(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=shows)
-    if len(folder.episodes()) == mark and not (copy / "policy.json").exists():
+    rows = folder.episodes()
+    if len(rows) == mark and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):
             write_atomically(copy / name, (folder.path / name).read_bytes())
-    return folder.episodes()
+    return rows
 
 
 def _policy_folder(job: Job, mark: int) -> Path:
@@ -322,13 +352,40 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
     where = job.config(1).environment
     if judged is not None and "difficulty" in judged.env:
         where = changed_environment(job.study.task, where, judged.env)
-    environment = json.dumps(where, sort_keys=True, default=str) + task_content(job.study.task)
-    return hashlib.blake2b((said + method + environment).encode(), digest_size=4).hexdigest()
+    environment = json.dumps(older.options(where), sort_keys=True, default=str) + task_content(job.study.task)
+    told = said + method + environment + older.task(job.study.task)
+    if "{seed}" not in job.study.folder:
+        told += f"seed {job.seed}"
+    return hashlib.blake2b(told.encode(), digest_size=4).hexdigest()
 
 
 def _evaluated(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
     """Rows of held-out episodes, from the file where they are known already."""
-    return cached(_evaluated_file(job, mark, judged), lambda: _evaluate(job, mark, judged))
+    file = _evaluated_file(job, mark, judged)
+    _refuse_other_rows(job, file, judged)
+
+    def evaluated() -> pd.DataFrame:
+        rows = _evaluate(job, mark, judged)
+        if "{digest}" not in judged.file:
+            write_atomically(_says_of_what(file), _digest(job, judged).encode())
+        return rows
+
+    return cached(file, evaluated)
+
+
+def _says_of_what(file: Path) -> Path:
+    """What stands beside a table of episodes whose name doesn't say which they are."""
+    return file.with_name(f".{file.name}.digest")
+
+
+def _refuse_other_rows(job: Job, file: Path, judged: JudgedOn) -> None:
+    """Another study's rows of the same name are not taken for these."""
+    says = _says_of_what(file)
+    if "{digest}" not in judged.file and says.exists() and says.read_text() != _digest(job, judged):
+        raise InputError(
+            f"{file} holds episodes of another study, or of other settings: name another folder with --out, or write "
+            "{digest} into the file's name"
+        )
 
 
 def _evaluated_file(job: Job, mark: int, judged: JudgedOn) -> Path:

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from guiderail.tools.report.statistics import wilson_of_each
-from guiderail.tools.studies.declaration import Study
+from guiderail.tools.studies.declaration import Study, Sweep
 from guiderail.tools.viewing.style import legend, new_figure, save_figure
+
+STYLES = ("-", "--", ":")  # of the first ten methods, the next ten, …
+BREAKS = 0.9  # success below which a method counts as broken
+NEVER, AT_ONCE = "not within the sweep", "from the easiest on"
 
 
 def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
     """Draws a panel for each sweep: success against the quantity, the mean of all seeds.
 
     The band goes from the lowest to the highest end of the seeds' own 95 % intervals.
+
+    What is harder is to the right. Where a method that began above `BREAKS` falls below it, there is a cross.
 
     Args:
         study: whose sweeps are drawn.
@@ -24,19 +32,62 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
     """
     figure, axes = new_figure(1, len(study.sweeps), (4.4 * len(study.sweeps), 3.6))
     for axis, sweep in zip(axes.flat, study.sweeps, strict=True):
-        values = sorted(sweep.at)
-        for name in study.methods:
-            points = [_success(rows, name, sweep.judged_on(value).name) for value in values]
-            there = [k for k, point in enumerate(points) if point is not None]
-            if not there:
+        for index, name in enumerate(study.methods):
+            values, points = curve(sweep, rows, name)
+            if not values:
                 continue
-            x = np.array([values[k] for k in there])
-            rate, low, high = np.array([points[k] for k in there], dtype=float).T
-            (line,) = axis.plot(x, rate, "o-", markersize=3, label=name.replace("_", " "))
+            x = np.array(values)
+            rate, low, high = np.array(points, dtype=float).T
+            style = STYLES[index // 10 % len(STYLES)]
+            (line,) = axis.plot(
+                x, rate, f"o{style}", color=f"C{index % 10}", markersize=3, label=name.replace("_", " ")
+            )
             axis.fill_between(x, low, high, color=line.get_color(), alpha=0.12, linewidth=0)
+            at = breaking_point(values, rate.tolist())
+            if isinstance(at, float):
+                axis.plot(at, BREAKS, "x", color=line.get_color(), markersize=9, markeredgewidth=2)
+        axis.axhline(BREAKS, color="0.7", linewidth=0.7, linestyle=":")
         axis.set(xlabel=sweep.quantity, ylabel="success", ylim=(-0.03, 1.03))
+        easiest, *_, hardest = sweep.at
+        if easiest > hardest:
+            axis.invert_xaxis()
     legend(figure, axes.flat[0])
     return save_figure(figure, path)
+
+
+def broken(study: Study, rows: pd.DataFrame) -> dict[str, str]:
+    """Where each method breaks, in words: the quantity at which its success falls below `BREAKS`."""
+    found = {}
+    for sweep in study.sweeps:
+        for name in study.methods:
+            values, points = curve(sweep, rows, name)
+            if values:
+                at = breaking_point(values, [rate for rate, _, _ in points])
+                words = at if isinstance(at, str) else f"{at:.3g}"
+                found[f"{name}, below {BREAKS:.0%} at {sweep.quantity}"] = words
+    return found
+
+
+def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], list[tuple[float, float, float]]]:
+    """At which values of the quantity a method was judged, the easiest first, and its success with its interval."""
+    points = {value: _success(rows, name, sweep.judged_on(value).name) for value in sweep.at}
+    known = {value: point for value, point in points.items() if point is not None}
+    return list(known), list(known.values())
+
+
+def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | str:
+    """Where success falls below `BREAKS` for the first time, on a straight line between two values; or that it doesn't.
+
+    Args:
+        values: of the quantity, the easiest first.
+        rates: success at each.
+    """
+    if rates[0] < BREAKS:
+        return AT_ONCE
+    for (v0, r0), (v1, r1) in itertools.pairwise(zip(values, rates, strict=True)):
+        if r1 < BREAKS:
+            return float(v0 + (v1 - v0) * (r0 - BREAKS) / (r0 - r1))
+    return NEVER
 
 
 def _success(rows: pd.DataFrame, method: str, judged: str) -> tuple[float, float, float] | None:

@@ -3,6 +3,7 @@
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -12,10 +13,12 @@ from matplotlib.figure import Figure
 
 from guiderail.tools.files import check_picture, write_atomically
 
+LAYOUT: str | None = "constrained"  # labels get the room that they need
+
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
     """A figure without a window, whatever the machine has; axes (rows, columns)."""
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=size, layout=cast(Any, LAYOUT))
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat:

@@ -181,12 +181,12 @@ def test_arms_have_the_same_ports_and_a_reset_is_exact(robot):
 
 
 def test_a_robot_is_chosen_by_name_where_an_environment_is_made():
-    env = make_env("BncConnector", station="arm", robot="ur5e")
+    env = make_env("GridClamp", station="arm", robot="ur5e")
     assert env.task.diagram.GetSubsystemByName("station").plant.HasBodyNamed("ur5e_forearm")
     with pytest.raises(InputError, match="did you mean ur5e"):
-        make_env("BncConnector", station="arm", robot="ur5")
+        make_env("GridClamp", station="arm", robot="ur5")
     with pytest.raises(InputError, match="no option 'robot' here: it is one of station='arm'"):
-        make_env("BncConnector", robot="panda")
+        make_env("GridClamp", robot="panda")
 
 
 def test_refuses_a_robot_whose_model_moves_by_more_than_its_joints():

@@ -26,38 +26,40 @@ def run(times, z_mm, yaw_deg, *, time_step=0.005, impedance=None, prepare=None):
     return drive_along(station, times, motion, prepare)
 
 
-def after_locking(times, z_mm, yaw_deg, **options):
-    """Goes on from the locked pose; returns the recording from there on."""
+def lock_and(times, z_mm, yaw_deg):
+    """What was recorded until the plug was locked, and from there on, along more poses."""
     lock_times, lock_poses = insert_and_lock()
     t = np.concatenate([lock_times, lock_times[-1] + np.array(times)])
     z = np.concatenate([lock_poses[:, 2] / MM, z_mm])
     yaw = np.concatenate([np.rad2deg(lock_poses[:, 3]), yaw_deg])
-    driven, recording = run(t, z, yaw, **options)
-    start = round(lock_times[-1] / 0.02)
-    return driven, {name: signal[start:] for name, signal in recording.signals.items()}
+    signals, end = run(t, z, yaw)[1].signals, round(lock_times[-1] / 0.02)
+    return tuple({name: signal[part] for name, signal in signals.items()} for part in (slice(end), slice(end, None)))
 
 
 @pytest.fixture(scope="module")
-def locked():
-    times, motion = insert_and_lock()
-    return drive_along(RailsStation(WORKCELL), times, motion)
+def locked_and_pulled():
+    pull = 40.0 / STIFFNESS / MM + 5.0  # beyond the effort limit, which is what pulls
+    return lock_and([0.5, 1.0], [pull, pull], [0, 0])
+
+
+@pytest.fixture(scope="module")
+def locked(locked_and_pulled):
+    return locked_and_pulled[0]
 
 
 def test_known_pose_inserts_and_locks(locked):
-    _, recording = locked
-    final = recording["pose"][-1]
+    final = locked["pose"][-1]
     assert np.abs(final[:3]).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
-    assert recording["contact_force"].max() < 15.0
-    assert not recording["saturation"].any()
+    assert locked["contact_force"].max() < 15.0
+    assert not locked["saturation"].any()
 
 
 def test_the_sensor_feels_what_the_impedance_pushes_with(locked):
     """At rest on the seat, and while turning slowly, the two are one force."""
-    _, recording = locked
     turning = slice(250, 330)
     np.testing.assert_allclose(
-        np.linalg.norm(recording["wrench"][turning, :3], axis=1), recording["contact_force"][turning, 0], atol=0.6
+        np.linalg.norm(locked["wrench"][turning, :3], axis=1), locked["contact_force"][turning, 0], atol=0.6
     )
 
 
@@ -78,9 +80,8 @@ def test_rotation_is_blocked_in_the_entry_slot(lug_depth_in_slot):
     assert abs(recording["wrench"][-1, 5]) > 1.0
 
 
-def test_pulling_after_locking_holds():
-    pull = 40.0 / STIFFNESS / MM + 5.0  # beyond the effort limit, which is what pulls
-    _, recording = after_locking([1.0, 2.0], [pull, pull], [0, 0])
+def test_pulling_after_locking_holds(locked_and_pulled):
+    _, recording = locked_and_pulled
     assert recording["saturation"][-1, 0] == 1.0
     assert recording["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
     assert recording["pose"][-1, 2] < 0.5 * MM
@@ -88,7 +89,7 @@ def test_pulling_after_locking_holds():
 
 def test_the_detent_has_a_break_out_torque():
     """Turning back without a push is resisted by the ramp's apex, and possible with enough torque."""
-    _, recording = after_locking([2.0, 2.2], [0, 0], [80, 80])
+    _, recording = lock_and([1.5, 1.7], [0, 0], [80, 80])
     resistance = np.abs(recording["wrench"][:, 5])
     in_detent = np.rad2deg(recording["pose"][:, 3]) < 8.0
     assert 0.02 < resistance[in_detent].max() < 2.0
@@ -117,7 +118,7 @@ def test_the_lugs_do_not_tunnel_when_turned_at_the_effort_limit():
 def test_halving_the_plant_step_changes_the_locked_pose_little(locked):
     times, motion = insert_and_lock()
     _, recording = drive_along(RailsStation(WORKCELL, time_step=0.0025), times, motion)
-    difference = recording["pose"][-1] - locked[1]["pose"][-1]
+    difference = recording["pose"][-1] - locked["pose"][-1]
     assert np.abs(difference[:3]).max() < 0.1 * MM
     assert np.abs(np.rad2deg(difference[3:])).max() < 0.5
 

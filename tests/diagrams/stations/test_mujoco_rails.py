@@ -144,7 +144,7 @@ def test_a_clamp_beside_its_holes_stands_still_on_the_table():
 def episode(env, seed):
     observation, _ = env.reset(seed=seed)
     seen, rng = [observation], np.random.default_rng(seed)
-    for _ in range(6):
+    for _ in range(4):
         observation, reward, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
         seen.append(np.append(observation, reward))
         if terminated or truncated:

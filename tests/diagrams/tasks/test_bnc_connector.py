@@ -1,5 +1,7 @@
 """The BNC task as a policy meets it."""
 
+from functools import cache
+
 import gymnasium
 import numpy as np
 import pytest
@@ -60,7 +62,7 @@ def test_spaces(skgrl):
     assert observation[0] == -1.0
 
 
-@pytest.mark.parametrize("offset", [(0.3, 0.0), (0.0, -0.3), (-0.2, 0.2)])
+@pytest.mark.parametrize("offset", [(0.3, 0.0), (-0.2, -0.2)])
 def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
     _, info, total, _ = play(kmp, still(kmp), seed=0, options={"offset": np.array(offset) * MM})
     assert info["termination"] == "success"
@@ -69,19 +71,19 @@ def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
 
 
 def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
-    """On the whole at most one in five; here, none of two."""
-    assert evaluate_policy(skgrl, still(skgrl), episodes=2, options=NEW_RUN)["success"].sum() == 0
+    """On the whole at most one in five; here, not once."""
+    assert evaluate_policy(skgrl, still(skgrl), episodes=1, options=NEW_RUN)["success"].sum() == 0
 
 
 def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
-    rows = evaluate_policy(skgrl, reactive_rule, episodes=2, options=NEW_RUN)
-    assert rows["success"].sum() == 2
+    rows = evaluate_policy(skgrl, reactive_rule, episodes=1, options=NEW_RUN)
+    assert rows["success"].sum() == 1
     assert rows["worst_violation"].max() <= 1e-9
 
 
 def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
-    rows = evaluate_policy(kgrl, reactive_rule, episodes=2, options=NEW_RUN)
-    assert rows["success"].sum() == 2
+    rows = evaluate_policy(kgrl, reactive_rule, episodes=1, options=NEW_RUN)
+    assert rows["success"].sum() == 1
     assert rows["worst_violation"].max() <= 1e-9
 
 
@@ -98,14 +100,25 @@ def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
     assert "simulation_failure" not in info
 
 
-def test_half_a_turn_of_everything_is_the_same_task(kmp):
+@pytest.fixture(scope="module")
+def felt(kmp):
+    """What is observed while the plug stands on the rim, by where the jack is [mm]."""
+
+    @cache
+    def felt(x_mm, y_mm):
+        observation, _ = kmp.reset(seed=0, options={"offset": (x_mm * MM, y_mm * MM)})
+        seen = [observation]
+        for _ in range(13):
+            seen.append(kmp.step(np.zeros(2))[0])
+        return np.mean(seen[6:], axis=0)
+
+    return felt
+
+
+def test_half_a_turn_of_everything_is_the_same_task(kmp, felt):
     signs = np.diag(kmp.task.symmetry.observations[0])
     across = signs < 0
-    felt = []
-    for side in (1.0, -1.0):
-        observations = play(kmp, still(kmp), options={"offset": (side * 1.0 * MM, side * 0.5 * MM)})[3]
-        felt.append(observations[6:14].mean(axis=0))  # while the plug stands on the rim
-    seen, other = felt[0], signs * felt[1]
+    seen, other = felt(1.0, 0.5), signs * felt(-1.0, -0.5)
     torques = slice(10, 12)
     towards = np.array([0.5, -1.0]) / np.hypot(0.5, 1.0)  # what a push from where the jack is turns about
     # Not exactly the same: the demonstrations lean, and the crescent's end on that side bears the plug.
@@ -165,12 +178,10 @@ def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
     assert gained == pytest.approx(ALIGNMENT_REWARD * nearer / MM, abs=0.5)
 
 
-def test_the_same_policy_drives_rails_and_arm():
-    """One rule object, both stations; the arm is slower to follow, and locks too."""
-    for station in ("rails", "arm"):
-        env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", station=station)
-        _, info, _, _ = play(env, reactive_rule, seed=4, options={"offset": (0.0009, -0.0008)})
-        assert info["is_success"], station
+def test_the_policy_of_the_rails_drives_the_arm_too():
+    """The arm is slower to follow, and locks too."""
+    env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", station="arm")
+    assert play(env, reactive_rule, seed=4, options={"offset": (0.0009, -0.0008)})[1]["is_success"]
 
 
 def test_a_push_moves_the_robot(kgrl):
@@ -236,16 +247,12 @@ def test_refuses_what_makes_no_sense(wrong):
         make_env("BncConnector", **wrong)
 
 
-def test_on_the_rim_a_quarter_turn_of_everything_feels_the_same(kmp):
+def test_on_the_rim_a_quarter_turn_of_everything_feels_the_same(kmp, felt):
     """Not exactly so: the demonstrations search the rim one way round."""
     near = kmp.task.near_symmetry
     assert len(near.actions) == 7
     quarter = near.observations[0]
-    felt = []
-    for offset in ((1.0 * MM, 0.5 * MM), (-0.5 * MM, 1.0 * MM)):
-        observations = play(kmp, still(kmp), options={"offset": offset})[3]
-        felt.append(observations[6:14].mean(axis=0))  # while the plug stands on the rim
-    seen, turned = felt
+    seen, turned = felt(1.0, 0.5), felt(-0.5, 1.0)
     torques = slice(10, 12)
     expected = (quarter @ seen)[torques]
     assert np.linalg.norm(expected - turned[torques]) < 0.5 * np.linalg.norm(expected)

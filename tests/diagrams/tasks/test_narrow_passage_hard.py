@@ -18,12 +18,11 @@ def env(request):
 
 
 def test_the_rule_passes_and_the_demonstrations_do_not(env):
-    for seed in range(2):
-        row = rollout(env, slalom, seed=seed, held_out=True)
-        assert row["success"]
-        assert row["worst_violation"] <= 1e-9
-        row = rollout(env, still(env), seed=seed, held_out=True)
-        assert row["termination"] == "collision"
+    row = rollout(env, slalom, seed=0, held_out=True)
+    assert row["success"]
+    assert row["worst_violation"] <= 1e-9
+    row = rollout(env, still(env), seed=0, held_out=True)
+    assert row["termination"] == "collision"
 
 
 def test_no_constant_side_is_right(env):

@@ -1,5 +1,6 @@
 """A task folder written by hand: a plug above a plate, and what is asked of the numbers in its file."""
 
+import gymnasium
 import numpy as np
 import pytest
 import yaml
@@ -9,6 +10,7 @@ from guiderail.diagrams.make import make_env, resolve
 from guiderail.diagrams.options import validated
 from guiderail.diagrams.tasks.part_file import Bounds
 from guiderail.diagrams.tasks.part_insertion import load_task_folder
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.models.objects.triangle_mesh import lathe
 from guiderail.models.primitives import Demonstrations
@@ -19,6 +21,16 @@ BY_PHASE = {
     "upper": [[0.002, 0.002, None, None, None, None], [0.001, 0.001, None, None, None, None]],
     "phases": [0.0, 0.5],
 }
+
+
+@pytest.fixture(autouse=True)
+def registered():
+    """What was registered here is nobody else's."""
+    before = set(TASKS.names())
+    yield
+    for name in set(TASKS.names()) - before:
+        del TASKS._entries[name]
+        gymnasium.registry.pop(environment_id(name), None)
 
 
 def part(name, **changes):
@@ -49,7 +61,7 @@ def write(folder, **changes):
 
 def test_bounds_that_change_on_the_way_hold_at_every_step(tmp_path):
     folder = write(tmp_path / "by_phase", bounds=BY_PHASE)
-    env = make_env(str(folder), hold=10)
+    env = make_env(str(folder), hold=10, horizon=4)
     env.reset(seed=0)
     done = False
     while not done:

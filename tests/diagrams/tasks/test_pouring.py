@@ -57,16 +57,16 @@ def test_a_persons_three_axes_pour_and_the_constraints_are_why(env, unconstraine
     assert total > 200.0
     assert info["ledger"]["worst_commanded_violation"] <= 1e-9
     assert info["ledger"]["collisions"] == 0.0
-    # The very same inputs, and then the very same person, who may react: it doesn't depend on which is meant.
+    # The very same inputs, or the very same person, who may react: it doesn't depend on which is meant.
     replay = iter([*actions, *[actions[-1]] * 150])
-    for again in (lambda observation: next(replay), person):
-        info, _, _ = run(unconstrained, again, seed=1, options={"start": start})
-        assert info["termination"] in ("collision", "spill")
+    again = person if STARTS.index(start) % 2 else lambda observation: next(replay)
+    info, _, _ = run(unconstrained, again, seed=1, options={"start": start})
+    assert info["termination"] in ("collision", "spill")
 
 
 @pytest.mark.parametrize("adversary", ADVERSARIES)
 def test_nobody_can_collide_or_leave_the_constraints(env, adversary):
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng([7, list(ADVERSARIES).index(adversary)])
     tilts, worst = [], []
 
     def watch(env, info):
@@ -76,9 +76,8 @@ def test_nobody_can_collide_or_leave_the_constraints(env, adversary):
         tilts.append((state, np.hypot(turn[0], turn[1])))
         worst.append(info["constraint_violation"])
 
-    for _ in range(2):
-        info, _, _ = run(env, ADVERSARIES[adversary](rng), seed=int(rng.integers(2**31)), limit=35, watch=watch)
-        assert info["termination"] not in ("collision", "spill")
+    info, _, _ = run(env, ADVERSARIES[adversary](rng), seed=int(rng.integers(2**31)), limit=35, watch=watch)
+    assert info["termination"] not in ("collision", "spill")
     assert max(worst) <= 1e-9
     # Upright until the tilt is allowed, as far as the arm's drives track.
     assert max((tilt for state, tilt in tilts if state == 0), default=0.0) < np.deg2rad(3.0)
@@ -150,7 +149,7 @@ def test_an_episode_repeats_to_the_last_bit(env):
         return np.array(seen)
 
     first = episode()
-    run(env, person, seed=9)
+    run(env, person, seed=9, limit=12)
     np.testing.assert_array_equal(episode(), first)
 
 

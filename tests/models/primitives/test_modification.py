@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from guiderail.models.errors import InputError
@@ -139,6 +139,7 @@ def test_where_demonstrations_say_nothing_the_motion_goes_through_the_actions():
     assert np.abs(moved).max() < 1e-3
 
 
+@settings(max_examples=settings().max_examples // 2)  # each takes a tenth of a second
 @given(SEEDS)
 def test_the_whole_motion_keeps_the_constraints_everywhere(seed):
     """Whatever is asked for, anywhere: bounds that differ from step to step, and actions beyond any reason."""

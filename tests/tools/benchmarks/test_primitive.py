@@ -2,7 +2,8 @@ from guiderail.tools.benchmarks.primitive import REGIMES, SIZES, measure
 
 
 def test_reports_what_it_measured_and_every_command_kept_its_bound(monkeypatch):
-    monkeypatch.setattr("guiderail.tools.benchmarks.primitive.SIZES", SIZES[:1])
+    for name, few in (("SIZES", SIZES[:1]), ("DENSE_SECONDS", 0.1), ("_MOTION", 100)):
+        monkeypatch.setattr(f"guiderail.tools.benchmarks.primitive.{name}", few)
     (parts,) = measure(steps=400).values()
     assert set(parts["predict"]) == {*REGIMES, "together"}
     for row in parts["predict"].values():

@@ -1,8 +1,5 @@
 """The gradient step against Stable-Baselines3's own, from the same parameters, batches and random draws."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -140,7 +137,7 @@ def test_layers_whose_gradient_is_not_written_out_are_refused():
         Other("MlpPolicy", Vector(), policy_kwargs={"activation_fn": torch.nn.GELU})
 
 
-def test_learning_does_not_wait_for_pytorchs_compiler():
+def test_learning_does_not_wait_for_pytorchs_compiler(forks):
     code = """
 import sys
 from guiderail.tools.learning.ensemble import EnsembleSac, EnsembleTqc
@@ -151,4 +148,4 @@ for algorithm in (EnsembleSac, EnsembleTqc):
     algorithm("MlpPolicy", Vector())
 sys.exit("torch._dynamo" in sys.modules)
 """
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+    assert forks.run("-c", code).returncode == 0

@@ -9,7 +9,7 @@ from guiderail.tools.learning.student import Student
 from guiderail.tools.rollouts.rollout import Decision
 
 
-def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never():
+def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(forkserver):
     space = gymnasium.Env()
     space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
     space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)

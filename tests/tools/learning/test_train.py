@@ -159,7 +159,7 @@ def test_a_run_that_is_killed_learning_on_has_no_policy_of_fewer_episodes(bead_c
     assert Policy.load(folder.path).description == before, "of a finished one nothing is removed"
 
 
-def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path, forkserver):
     """Whatever was not learned yet when it stopped is learned then."""
     plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
     config = replace(plain, learner=replace(plain.learner, pipelined=True))

@@ -10,6 +10,7 @@ import yaml
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
+from guiderail.tools.viewing import replay
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -25,7 +26,7 @@ def call(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The simplest of the six; `tests/tools/onboard/parts.py` onboards all of them."""
+    """The simplest of the six; `learn_parts.py` beside this onboards and learns all of them."""
     where = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(where)
     call("onboard", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
@@ -48,7 +49,8 @@ def test_what_was_measured_is_what_was_drawn(folder):
     assert len(page) > 100_000
 
 
-def test_it_is_a_task(folder, tmp_path, capsys):
+def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(replay, "EPISODES", 1)
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
     call("evaluate", tmp_path / "run", "--episodes", 1, "--beside", "none", "--json")

@@ -12,40 +12,123 @@ import sys
 import tempfile
 import threading
 import urllib.request
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import websockets
 
-from guiderail.tools.operate.teach import Teaching
+from guiderail.diagrams.stations.station import CONTROL_PERIOD as PERIOD
+from guiderail.models.objects.bnc_motion import RIM, SEARCH_PUSH, SEAT_COMMAND
+from guiderail.tools.operate.teach import SLIDERS, Teaching
 from guiderail.tools.tasks import task_named
 
 PORT = 9333
-COUNT = 3
+COUNT = 5
 
 
 class Page:
     """A tab, by Chromium's own protocol."""
 
     def __init__(self, socket):
-        self._socket, self._number = socket, 0
+        self._socket, self._number, self._asking = socket, 0, asyncio.Lock()
 
     async def call(self, method, **parameters):
-        self._number += 1
-        await self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
-        while True:
-            answer = json.loads(await self._socket.recv())
-            if answer.get("id") == self._number:
-                return answer.get("result", answer)
+        async with self._asking:
+            self._number += 1
+            await self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+            while True:
+                answer = json.loads(await self._socket.recv())
+                if answer.get("id") == self._number:
+                    return answer.get("result", answer)
+
+    async def press(self, code):
+        key = code.removeprefix("Key").lower()
+        for kind in ("keyDown", "keyUp"):
+            await self.call("Input.dispatchKeyEvent", type=kind, code=code, key=key)
+
+
+class Person:
+    """Who sits before the page, looks at where the robot is, and presses keys one after the other."""
+
+    def __init__(self, page, session, seed):
+        self.page, self.session, self.random = page, session, np.random.default_rng(seed)
 
     async def press(self, code, times=1):
         for _ in range(times):
-            key = code.removeprefix("Key").lower()
-            for kind in ("keyDown", "keyUp"):
-                await self.call("Input.dispatchKeyEvent", type=kind, code=code, key=key)
-            await asyncio.sleep(0.03)
+            await self.page.press(code)
+            await asyncio.sleep(self.random.uniform(0.02, 0.06))
+
+    async def look(self, seconds):
+        """Waits for so much of the simulation's time."""
+        until = self.session.steps * PERIOD + seconds
+        while self.session.steps * PERIOD < until:
+            await asyncio.sleep(0.02)
+
+    async def settle(self):
+        """Waits until the page has taken all keys in: a slow one does so seconds later."""
+        seen = None
+        while not np.array_equal(seen, self.session.wanted):
+            seen = self.session.wanted.copy()
+            await asyncio.sleep(0.4)
+            await self.look(0.1)
+
+    async def bring(self, output, to):
+        """Presses keys until a slider on the page says that an output of the command is to be there [m, rad]."""
+        *_, step, lower, higher, unit = list(SLIDERS.values())[output]
+        for _ in range(5):
+            said = self.session.start[output] + self.session.wanted[output]
+            left = round((to - said) / (step * unit))
+            if left == 0:
+                return
+            await self.press(higher if left > 0 else lower, abs(left))
+            await self.settle()
+
+    async def wander(self, seconds):
+        """Searches the rim: half a millimetre here, half a millimetre there, and back at last."""
+        until = self.session.steps * PERIOD + seconds
+        while self.session.steps * PERIOD < until:
+            for output, there in enumerate(self.random.integers(-3, 4, size=2)):
+                await self.bring(output, 0.5e-3 * there)
+        await self.bring(0, 0.0)
+        await self.bring(1, 0.0)
+
+    async def demonstrate(self, motion):
+        """One demonstration of an insertion: to the rim, a search on it, in, a turn where there is one, and at rest."""
+        await self.look(0.3)
+        await self.bring(2, motion.rim - motion.press)
+        await self.look(0.3)
+        await self.wander(1.5)
+        await self.bring(2, -motion.push)
+        await self.look(0.9)
+        if motion.turn:
+            await self.bring(3, self.session.start[3] + np.deg2rad(motion.turn))
+            await self.bring(2, -motion.push - 2e-3)
+            await self.look(0.9)
+        await self.bring(2, 0.0)
+        await self.look(0.6)
+        await self.press("Enter")
 
 
-async def person(url, session, travel, picture):
+@dataclass(frozen=True)
+class Insertion:
+    """What the person knows of the task: heights [m], and a turn [degrees]."""
+
+    rim: float
+    press: float
+    push: float
+    turn: float
+
+
+def known(session):
+    """Of the connector, or of a task folder."""
+    file = getattr(session.task, "file", None)
+    if file is None:
+        return Insertion(RIM, SEARCH_PUSH, -SEAT_COMMAND, -90.0)
+    return Insertion(file.motion.rim, file.motion.press, file.motion.push, file.motion.turn)
+
+
+async def person(url, session, connected, picture):
     target = next(
         tab for tab in json.load(urllib.request.urlopen(f"http://localhost:{PORT}/json")) if tab["type"] == "page"
     )
@@ -53,22 +136,31 @@ async def person(url, session, travel, picture):
         page = Page(socket)
         await page.call("Page.enable")
         await page.call("Page.navigate", url=url)
-        while session.meshcat.GetNumActiveConnections() == 0:
+        while not connected.is_set():
             await asyncio.sleep(0.2)
         await asyncio.sleep(2.0)
+        await page.press("KeyM")  # slow motion: keys take their time
         for number in range(COUNT):
-            await page.press(("KeyD", "KeyA", "KeyW")[number % 3], 1)
-            await page.press("KeyF", round(0.6 * travel / 0.5e-3))
-            await asyncio.sleep(1.0)
-            await page.press(("KeyA", "KeyD", "KeyS")[number % 3], 1)
-            await page.press("KeyF", round(0.4 * travel / 0.5e-3) + 6)
-            await asyncio.sleep(3.0)
+            kept = len(session.kept)
+            whoever = Person(page, session, number)
+            await whoever.page.press("Backspace")  # from the start, as nothing was shown yet
+            await asyncio.sleep(0.5)
+            shown = asyncio.create_task(whoever.demonstrate(known(session)))
             if picture is not None and number == 0:
-                shot = await page.call("Page.captureScreenshot", format="png")
-                picture.write_bytes(base64.b64decode(shot["data"]))
-            await page.press("Enter")
-            await asyncio.sleep(1.0)
+                while session.steps * PERIOD < 5.0:
+                    await asyncio.sleep(0.1)
+                await shoot(page, picture)
+            await shown
+            while len(session.kept) == kept:
+                await asyncio.sleep(0.1)
+        if picture is not None:
+            await shoot(page, picture.with_stem(picture.stem + "-end"))
         await page.press("Escape")
+
+
+async def shoot(page, picture):
+    shot = await page.call("Page.captureScreenshot", format="png")
+    picture.write_bytes(base64.b64decode(shot["data"]))
 
 
 def main(task, out, picture=None):
@@ -91,11 +183,14 @@ def main(task, out, picture=None):
             except OSError:
                 threading.Event().wait(0.5)
         session.begin()
-        travel = float(session.start[2])
-        at_page = person(session.meshcat.web_url(), session, travel, None if picture is None else Path(picture))
+        connected = threading.Event()
+        at_page = person(session.meshcat.web_url(), session, connected, None if picture is None else Path(picture))
         hands = threading.Thread(target=asyncio.run, args=(at_page,))
         hands.start()
-        session.run(print, most_steps=20_000)
+        while session.meshcat.GetNumActiveConnections() == 0:  # Meshcat answers the thread that made it, no other
+            threading.Event().wait(0.1)
+        connected.set()
+        session.run(print, most_steps=100_000)
         hands.join()
         print(json.dumps(session.learned()))
     finally:

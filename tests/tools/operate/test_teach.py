@@ -36,6 +36,12 @@ class Page:
     def GetGamepad(self):
         return self.gamepad
 
+    def SetProperty(self, path, name, value):
+        pass
+
+    def SetCameraPose(self, eye, target):
+        self.lines["camera"] = np.array([eye, target])
+
     def SetLine(self, path, vertices, width, colour):
         self.lines[path] = vertices
 
@@ -121,6 +127,26 @@ def test_a_gamepad_pushes_the_sliders(session):
         session.step()
     assert session.meshcat.sliders["x [mm]"] == pytest.approx(10.0)
     assert session.meshcat.sliders["y [mm]"] == 0.0
+
+
+def test_whoever_rests_does_not_demonstrate_resting(session):
+    session.begin()
+    lead(session, "x [mm]", 2.0, 60)
+    lead(session, "y [mm]", 2.0, 60)
+    assert "2.4 s, 0.3 s of them without rests" in session.keep()
+    times, commands = session.kept[0]
+    np.testing.assert_allclose(np.diff(times), 0.02)
+    np.testing.assert_allclose(commands[-1] - session.start, [2e-3, 2e-3, 0, 0, 0, 0])
+
+
+def test_the_page_opens_before_the_part(session):
+    eye, target = session.meshcat.lines["camera"]
+    assert np.linalg.norm(target - session.task.world().X_WT.translation()) < 0.05
+    assert np.linalg.norm(eye - target) < 0.3
+
+
+def test_a_real_page_is_opened(tmp_path):
+    assert Teaching("BncConnector", {}, tmp_path / "shown.npz").meshcat.web_url().startswith("http://localhost:")
 
 
 def test_every_key_is_one_things(session):

@@ -5,8 +5,6 @@ import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import train
 from guiderail.tools.robustness import axes
 from guiderail.tools.robustness.axes import AXES, Axis, chosen_axes, points
 from guiderail.tools.robustness.robustness import breaks, robustness
@@ -17,10 +15,9 @@ WALL = Axis("wall", "wall [m]", (-0.5, 1.0), 1.0, lambda environment, value: {"w
 
 
 @pytest.fixture
-def run(bead_config, tmp_path, monkeypatch):
+def run(bead_run, monkeypatch):
     monkeypatch.setattr(axes, "AXES", (WALL,))
-    train(RunFolder(tmp_path / "run"), bead_config)
-    return tmp_path / "run"
+    return bead_run
 
 
 def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):

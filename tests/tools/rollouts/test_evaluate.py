@@ -5,9 +5,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.errors import InputError
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import train
-from guiderail.tools.rollouts.evaluate import COMPARED, cached, evaluate, evaluate_policy
+from guiderail.tools.rollouts.evaluate import COMPARED, cached, claim, evaluate, evaluate_policy
 from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
 from guiderail.tools.tasks import make_environment
 
@@ -38,33 +36,49 @@ def test_what_is_known_is_not_evaluated_again(tmp_path):
     assert len(asked) == 1
 
 
-def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_config, tmp_path, capsys):
-    train(RunFolder(tmp_path / "run"), bead_config)
-    result = evaluate(tmp_path / "run", episodes=3)
+def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_run, capsys):
+    result = evaluate(bead_run, episodes=3)
     said = capsys.readouterr().err
     assert "held-out episodes 3/3" in said
     assert "demonstration alone 3/3" in said
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
-    elsewhere = evaluate(tmp_path / "run", episodes=3, environment={"wall": -0.5})
+    elsewhere = evaluate(bead_run, episodes=3, environment={"wall": -0.5})
     assert elsewhere["success_rate"] == elsewhere["demonstration_success_rate"] == 0.0
     assert elsewhere["mean_return"] != result["mean_return"]
 
 
-def test_what_learned_nothing_meets_the_same_episodes_once(bead_config, tmp_path, capsys):
-    train(RunFolder(tmp_path / "run"), bead_config)
+def test_what_learned_nothing_meets_the_same_episodes_once(bead_run, capsys):
     policies = {
         "zero": still,
         "white": partial(NullPolicy, white),
         "other": lambda env: lambda observation: np.zeros(7),
     }
-    first = evaluate(tmp_path / "run", episodes=3, beside=policies)
+    first = evaluate(bead_run, episodes=3, beside=policies)
     assert first["beside"] == ["demonstration", "zero", "white"]
     for name in COMPARED:
         assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
     assert first["white_mean_return"] != first["zero_mean_return"]
     assert "white 3/3" in capsys.readouterr().err
-    again = evaluate(tmp_path / "run", episodes=3, beside=policies)
+    again = evaluate(bead_run, episodes=3, beside=policies)
     assert "white" not in capsys.readouterr().err
     assert again == first
-    assert evaluate(tmp_path / "run", episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
+    assert evaluate(bead_run, episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
+
+
+def test_a_policy_for_one_offset_and_one_for_any_are_two_claims(bead_run):
+    one = claim("BncConnector", {"uncertainty": "calibration"}, fresh=False)
+    for_any = claim("BncConnector", {"uncertainty": "calibration"}, fresh=True)
+    assert "the one offset that is hidden in this run" in one
+    assert for_any == claim("GridClamp", {"uncertainty": "disc"}, fresh=False) != one
+    assert evaluate(bead_run, episodes=1)["claim"] == "a policy for starts that training never drew"
+    with pytest.raises(InputError, match="hides nothing that could be drawn anew: leave --fresh out"):
+        evaluate(bead_run, episodes=1, fresh=True)
+
+
+def test_what_is_hidden_in_a_run_is_drawn_anew_only_where_that_is_asked_for():
+    env = make_environment("BncConnector", {"uncertainty": "calibration"})
+    env.reset(seed=3)
+    for options, places in (({}, 1), ({"new_run": True}, 3)):
+        drawn = [env.reset(seed=seed, options={"held_out": True} | options)[1]["jack_offset"] for seed in (7, 8, 9)]
+        assert len({tuple(offset) for offset in drawn}) == places

@@ -18,9 +18,14 @@ def test_every_way_to_explore_has_a_name_of_its_own():
         assert any(kind in name for name in names), kind
 
 
+@pytest.fixture(scope="module")
+def quiet():
+    return quiet_commands()
+
+
 @pytest.mark.parametrize("name", ["KGRL", "residual white"])
-def test_every_way_to_explore_has_the_same_rms(name):
+def test_every_way_to_explore_has_the_same_rms(name, quiet):
     (method,) = [method for method in methods() if method.name == name]
-    free, contact = measure(method, (0, 1, 2, 3, 4, 5), quiet_commands(), episodes=1, kappa=0.5, seed=0)
+    free, contact = measure(method, (0, 1, 2, 3, 4, 5), quiet, episodes=1, kappa=0.5, seed=0)
     assert (free["place"], contact["place"]) == ("free", "connector")
     assert free["rms_in_deviations"] == pytest.approx(0.5, rel=0.05)

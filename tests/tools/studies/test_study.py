@@ -5,15 +5,18 @@ import pandas as pd
 import pytest
 import yaml
 
+from guiderail.diagrams.make import resolve
 from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.tools.command import main
+from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import evaluate_policy
 from guiderail.tools.rollouts.metrics import STATISTICS
 from guiderail.tools.rollouts.null_policies import always
 from guiderail.tools.studies.declaration import JudgedOn, Smoothness, Study, load_study, shipped_studies
 from guiderail.tools.studies.engines.engine import make_engine
-from guiderail.tools.studies.study import Job, _check, each, ratio, run_study, study_command
+from guiderail.tools.studies.study import Job, _check, differences_of, differing, each, ratio, run_study, study_command
+from guiderail.tools.studies.sweep import AT_ONCE, NEVER, breaking_point
 from guiderail.tools.tables import read_table
 from guiderail.tools.tasks import make_environment
 
@@ -142,6 +145,57 @@ def test_other_episodes_of_the_same_name_are_not_taken_for_these(tmp_path):
     assert not other["mean_return"].isin(near["mean_return"]).any()
 
 
+def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
+    """By the seed where a folder's name doesn't say it, by the task, and by a sentence where a file's name is given."""
+    (tmp_path / "pearl.py").write_text(
+        "import bead, gymnasium\n"
+        "if 'guiderail/Twin-v0' not in gymnasium.registry:\n"
+        "    gymnasium.register('guiderail/Twin-v0', entry_point=bead.Bead)\n"
+    )
+    white = {"methods": {"anything": {"policy": "white"}}, "folder": "{method}", "seeds": [5]}
+    out = tmp_path / "out"
+    for changed in ({}, {"seeds": [6]}, {"task": "Twin", "imports": [str(tmp_path / "pearl.py")]}):
+        run(study(**(white | changed)), out)
+    assert len(list((out / "anything").glob("held_out-0-*.csv"))) == 3
+    named = {"judged on": [{"episodes": 3, "file": "held_out.csv"}]}
+    run(study(**white, **named), out)
+    before = written(out)
+    run(study(**white, **named), out)
+    assert written(out) == before
+    for changed in ({"env": {"wall": -0.5}}, {"seeds": [6]}, {"judged on": [{"episodes": 4, "file": "held_out.csv"}]}):
+        with pytest.raises(InputError, match="episodes of another study"):
+            run(study(**(white | named | changed)), out)
+    assert written(out) == before
+
+
+def test_a_study_says_in_what_its_methods_differ_from_the_thesis():
+    study = load_study("connector_hard").only(["kgrl", "skgrl", "white", "rule"])
+    told = differing(study)
+    assert "reward aligned (thesis: sparse)" in told["all methods"]
+    assert any(words.startswith("difficulty 'hard', which is ours") for words in told["all methods"])
+    assert any("checkpoint selection" in words for words in told["kgrl"])
+    assert any("ρ" in words for words in told["skgrl"])
+    assert not any("checkpoint selection" in words for words in differences_of(study, "white"))
+    for method in study.methods:
+        own = [one for methods, words in told.items() if method in methods.split(", ") for one in words]
+        assert sorted([*told["all methods"], *own]) == sorted(differences_of(study, method))
+
+
+def test_where_a_method_breaks_lies_on_a_line_between_two_values():
+    assert breaking_point([1.0, 2.0, 3.0], [1.0, 1.0, 0.8]) == pytest.approx(2.5)
+    assert breaking_point([30.0, 20.0, 10.0], [1.0, 0.9, 0.0]) == pytest.approx(20.0)
+    assert breaking_point([1.0, 2.0], [0.89, 1.0]) == AT_ONCE
+    assert breaking_point([1.0, 2.0], [1.0, 0.9]) == NEVER
+
+
+def test_results_that_are_older_than_an_option_are_of_its_default():
+    assert older.options({"wall": 1.0, "impedance_control": "joint"}) == {"wall": 1.0}
+    assert older.options({"impedance_control": "cartesian"}) == {"impedance_control": "cartesian"}
+    for name, value in older.OPTIONS.items():
+        options = [resolve(task, {}).values for task in older.TASKS]
+        assert [one[name] for one in options if name in one].count(value) == sum(name in one for one in options) > 0
+
+
 def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_path):
     run(study(seeds=[5], marks=[2]), tmp_path)
     before = written(tmp_path)
@@ -175,12 +229,12 @@ def test_sampled_arguments_stay_in_their_range_and_change_every_few_episodes(tmp
     assert [group["episode"].tolist() for _, group in rows.groupby("wall", sort=False)] == [[0, 1], [2, 3], [4]]
 
 
-def test_two_processes_find_what_one_does(tmp_path):
+def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
     declared = Study.model_validate(
         {
             "name": "passage",
             "task": "NarrowPassage",
-            "methods": {"nothing": {"policy": "zero"}, "anything": {"policy": "white"}},
+            "methods": {"anything": {"policy": "white"}},
             "seeds": [0],
             "judged on": [{"episodes": 1}],
         }
@@ -197,6 +251,7 @@ def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
     said = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
     assert result["learner after 2 episodes, held out, success of each seed"] == said
     assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
+    assert result["differs_from_thesis"] == {"all methods": ["it has no task Bead"]}
     err = capsys.readouterr().err
     assert "1/2 learner, seed 5: held out" in err
     assert "2/2 learner, seed 6: held out" in err
@@ -314,5 +369,6 @@ def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
     assert rows["judged_on"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
     assert rows[rows["judged_on"] == "wall [m] -0.5"]["success_rate"].eq(0).all()
     assert found["picture"] == str(tmp_path / "beads.png")
+    assert found["nothing, below 90% at wall [m]"] == "from the easiest on"
     assert (tmp_path / "beads.png").stat().st_size > 10_000
     assert run_study(one, tmp_path, make_engine(processes=1))["judged_on"].tolist() == rows["judged_on"].tolist()

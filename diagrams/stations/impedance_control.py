@@ -1,0 +1,93 @@
+"""A Cartesian impedance controller in a station: of an arm, or of the rails."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+
+from guiderail.diagrams.stations.station import Impedance, export_station_ports, force_first
+from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
+from guiderail.systems.impedance_monitor import ImpedanceMonitor
+
+
+class KnownRobot(Protocol):
+    """A robot as its controller knows it: with what it carries, without the fixture and without offsets."""
+
+    @property
+    def plant(self) -> MultibodyPlant:
+        """The robot and nothing else."""
+
+    @property
+    def target(self) -> Frame:
+        """T."""
+
+    @property
+    def tool_centre(self) -> Frame:
+        """P."""
+
+    @property
+    def posture(self) -> np.ndarray:
+        """Joint positions that the null space returns to, (n,)."""
+
+
+def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains:
+    """The station's impedance, which is ordered as a pose is, as the controller wants it."""
+    return ImpedanceGains(
+        stiffness=np.diag(force_first(impedance.stiffness)),
+        wrench_limits=force_first(impedance.limits),
+        posture=posture,
+        damping_ratio=impedance.damping_ratio,
+    )
+
+
+def add_controller(
+    builder: DiagramBuilder, known: KnownRobot, impedance: Impedance, period: float, *, compensate_gravity: bool
+) -> tuple[CartesianImpedanceController, ImpedanceMonitor]:
+    """Adds a robot's controller, sampled once in `period` [s], and what watches its wrench; the caller wires both."""
+    controller = builder.AddNamedSystem(
+        "controller",
+        CartesianImpedanceController(
+            known.plant,
+            known.target,
+            known.tool_centre,
+            impedance_gains(impedance, known.posture),
+            period=period,
+            compensate_gravity=compensate_gravity,
+        ),
+    )
+    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
+    return controller, monitor
+
+
+def add_impedance_control(
+    builder: DiagramBuilder,
+    known: KnownRobot,
+    impedance: Impedance,
+    period: float,
+    *,
+    state: OutputPort,
+    wrench: OutputPort,
+    compensate_gravity: bool = True,
+) -> OutputPort:
+    """Adds the controller of a robot whose joints are at `state`, and exports a station's ports; returns the torque.
+
+    Its watchdog checks commands once in `period` [s].
+    """
+    controller, monitor = add_controller(builder, known, impedance, period, compensate_gravity=compensate_gravity)
+    builder.Connect(state, controller.get_state_input_port())
+    builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+    export_station_ports(
+        builder,
+        controller.get_desired_pose_input_port(),
+        controller.get_command_time_input_port(),
+        pose=controller.get_pose_output_port(),
+        wrench=wrench,
+        contact_force=monitor.get_contact_force_output_port(),
+        saturation=controller.get_saturation_output_port(),
+        holding=controller.get_holding_output_port(),
+    )
+    return controller.get_torque_output_port()

@@ -1,0 +1,37 @@
+"""The solver of the constrained primitive is an option of the environment, and of no consequence but its time."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.make import make_env
+from guiderail.models.errors import InputError
+from guiderail.tools.command import _environment
+from guiderail.tools.tasks import check_environment
+
+
+def commands(**options):
+    """Whatever is asked for, towards the zone: the constraint is active."""
+    env = make_env("NarrowPassage", guidance="skgrl", kappa=3.0, **options)
+    env.reset(seed=0)
+    violations = []
+    for _ in range(12):
+        info = env.step(np.array([1.0, 0.0]))[-1]
+        violations.append(info["constraint_violation"])
+    path = np.array(env.trace.commanded)
+    env.close()
+    return path, np.array(violations)
+
+
+def test_every_solver_commands_the_same_and_keeps_the_constraint():
+    expected, violations = commands()
+    assert violations.max() > -1e-6, "the constraint is met"
+    for solver in ("osqp", "piqp"):
+        path, violations = commands(solver=solver)
+        np.testing.assert_allclose(path, expected, atol=1e-5)
+        assert violations.max() <= 1e-9
+
+
+def test_the_solver_is_chosen_from_the_shell_and_another_word_is_refused():
+    assert check_environment("BncConnector", _environment(["solver=osqp"]))["solver"] == "osqp"
+    with pytest.raises(InputError, match="there is no solver 'osq': did you mean osqp"):
+        check_environment("NarrowPassage", _environment(["solver=osq"]))

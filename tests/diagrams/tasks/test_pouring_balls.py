@@ -1,0 +1,66 @@
+"""Pouring that asks for some of several balls."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.make import make_env, resolve
+from guiderail.diagrams.stations.pouring import PouringConfig
+from guiderail.diagrams.tasks.pouring_conditions import conditions
+from guiderail.models.errors import InputError
+from guiderail.models.objects.vessels import Ball
+from guiderail.tools.studies.aiming_person import aiming_person
+
+CONFIG = PouringConfig(ball=Ball(diameter=0.026), num_balls=6)
+IN, FALLEN, KEPT = [0.0, 0.0, -0.05], [0.3, 0.0, -0.2], [0.3, 0.0, 0.1]  # in the frame of the mug's tip
+
+
+def judged(in_mug, fallen):
+    """Whether so many of six balls mean success, or a spill, where five are needed; the others are in the thermos."""
+    places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
+    balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
+    _, success, spill = conditions(CONFIG, needed=5)
+    return success.holds(balls), spill.holds(balls, balls)
+
+
+@pytest.mark.parametrize(
+    ("in_mug", "fallen", "expected"),
+    [
+        (6, 0, (True, False)),
+        (5, 0, (True, False)),
+        (4, 0, (False, False)),
+        (5, 1, (True, False)),
+        (4, 1, (False, False)),
+        (4, 2, (False, True)),
+        (0, 6, (False, True)),
+    ],
+)
+def test_five_of_six_are_enough_and_two_that_fell_are_too_many(in_mug, fallen, expected):
+    assert judged(in_mug, fallen) == expected
+
+
+@pytest.mark.parametrize(("number", "diameter"), [(2, 0.04), (3, 0.04), (6, 0.026), (8, 0.02)])
+def test_balls_lie_in_the_thermos_and_not_in_each_other(number, diameter):
+    config = PouringConfig(ball=Ball(diameter=diameter), num_balls=number)
+    places = config.stack()
+    apart = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(number, dtype=bool)]
+    assert apart.min() >= diameter - 1e-9
+    assert all(config.thermos.contains(place) for place in places)
+    assert np.abs(places[:, 0]).max() + diameter / 2 <= config.thermos.inner_diameter / 2 + 1e-9
+
+
+def test_what_does_not_go_together_is_refused():
+    with pytest.raises(InputError, match="balls_in must be at most balls, which is 2, not 3"):
+        resolve("Pouring", {"balls_in": 3})
+    with pytest.raises(InputError, match="6 balls of 0\\.04 m don't go into the thermos"):
+        resolve("Pouring", {"balls": 6})
+
+
+def test_who_aims_pours_enough_of_them():
+    env = make_env("Pouring", difficulty="hard", balls=6, balls_in=5, ball_diameter=0.026)
+    observation, _ = env.reset(seed=1, options={"mug_error": (0.045, 0.0)})
+    ended = False
+    while not ended:
+        observation, _, terminated, truncated, info = env.step(aiming_person(observation))
+        ended = terminated or truncated
+    assert info["termination"] == "success"
+    assert info["ledger"]["worst_commanded_violation"] <= 1e-9
