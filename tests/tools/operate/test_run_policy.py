@@ -36,7 +36,7 @@ def operated(monkeypatch):
             patch.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS)
         task = resolve("BncConnector", OPTIONS).task
-        monkeypatch.setattr(type(task), "num_steps", num_steps)
+        monkeypatch.setattr(task, "num_steps", num_steps)
         pace = Together(task.world(), lcm, start, deputy)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
         return Operation(task, skill, pace, is_stopped), pace

@@ -31,7 +31,7 @@ OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "r
 def make(patch, start):
     """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
     lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
-    patch.setattr(type(resolved.task), "num_steps", 10)
+    patch.setattr(resolved.task, "num_steps", 10)
     with patch.context() as bus:
         bus.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
         station = make_station(resolved)
