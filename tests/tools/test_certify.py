@@ -6,9 +6,8 @@ from guiderail.models.errors import InputError
 from guiderail.tools.certify import certify_skill
 
 
-@pytest.mark.parametrize("guidance", ["kgrl", "skgrl"])
-def test_a_tasks_certificate_is_written_and_accepted(tmp_path, guidance):
-    found = certify_skill("NarrowPassage", {"guidance": guidance}, out=tmp_path)
+def test_a_tasks_certificate_is_written_and_accepted(tmp_path):
+    found = certify_skill("NarrowPassage", {"guidance": "skgrl"}, out=tmp_path)
     assert found["checker"] == "yes"
     assert found["always_upper"][0] <= found["while_free_upper"][0]
     assert found["steps"] >= found["steps_that_constraints_can_touch"]
@@ -22,9 +21,10 @@ def test_demonstrations_alone_are_certified_too(tmp_path):
 
 
 def test_an_attack_says_how_tight_the_bounds_are(tmp_path):
-    found = certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=4000)
+    found = certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=2000)
     rows = found["attack"]
-    assert found["attack_steps"] >= 4000
+    assert found["checker"] == "yes"
+    assert found["attack_steps"] >= 2000
     assert {row["quantity"] for row in rows} == {"pose", "speed", "acceleration"}
     assert all(row["left"] == 0 for row in rows)
     assert all(row["ratio"] < 1.2 for row in rows if row["constraint"] == "never active")
