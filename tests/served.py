@@ -80,6 +80,7 @@ def begin_forkserver() -> None:
 
 def child(arguments: list[str], folder: str, environment: dict[str, str], out: int, err: int) -> None:
     """Becomes the program; never returns."""
+    forkserver._forkserver._forkserver_pid = None  # another process's child
     os.dup2(out, 1)
     os.dup2(err, 2)
     sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))  # noqa: SIM115

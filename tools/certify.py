@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -14,18 +15,31 @@ import numpy as np
 from guiderail.diagrams.make import known
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
-from guiderail.models.certificate.bounds import Bounds, Skill, certify
+from guiderail.models.certificate.adversary import QUANTITIES, Adversary
+from guiderail.models.certificate.bounds import Certified, certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files
+from guiderail.models.certificate.loop import Bounds, Skill
+from guiderail.models.certificate.prices import Budget
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import changed_environment, check_environment
 
-CERTIFIED = {"kgrl": False, "skgrl": True}  # guidance whose law this is, and whether it has a history
+CERTIFIED = ("kmp", "kgrl", "skgrl")  # guidance whose law this is
+SEARCH = 100_000  # steps of the adversary whose worst corrections make the budgets
+MARGIN = 1.5  # of the budgets, over what it found
+ALIKE = 1.0 + 1e-6  # rounding, where an adversary reaches a bound that is exact
+LEAST_EXCESS = ((0.01,), (0.1,))  # of them, in actions: at one step, and in all
 
 
 def certify_skill(
-    of: str, environment: Mapping[str, Any], *, out: Path | None = None, start_within: float | None = None
+    of: str,
+    environment: Mapping[str, Any],
+    *,
+    out: Path | None = None,
+    start_within: float | None = None,
+    attack: int = 0,
 ) -> dict[str, Any]:
     """Writes a certificate and has it checked, in a process of its own.
 
@@ -35,9 +49,12 @@ def certify_skill(
         out: the folder that is written; `certificate` in the run unless given.
         start_within: how far beside its start, in any output, the robot may begin, in the outputs' units; what the
             environment draws unless given.
+        attack: how many steps an adversary tries to leave the bounds; none for 0. What it found is written beside
+            them, in `attack.csv`.
 
     Returns:
-        Numbers of both regimes, the files' folder, and the checker's word.
+        Numbers of the regimes, the files' folder, and the checker's word; of an attack the table's rows, and which
+        part of its budgets corrections spent.
 
     Raises:
         InputError: if there is no such run or task, or its guidance follows no law that is certified.
@@ -45,10 +62,12 @@ def certify_skill(
     task, arguments, about = _what(of, environment)
     options = check_environment(task, arguments)
     guidance = str(options["guidance"])
+    if attack < 0:
+        raise InputError(f"an attack has a number of steps, not {attack}")
     if guidance not in CERTIFIED or options.get("adaptive_history") or options.get("history_source") == "measured":
         raise InputError(
             f"guidance={guidance!r} follows no law that is certified: it takes {' or '.join(CERTIFIED)}, with a "
-            "history of commands and of one length"
+            "history of commands and of one length (neither adaptive_history nor history_source=measured)"
         )
     if out is None:
         if not Path(of).is_dir():
@@ -56,19 +75,24 @@ def certify_skill(
         out = Path(of) / "certificate"
     demonstrated = known(task, **options).demonstrations
     assert demonstrated is not None  # both kinds of guidance need them
-    primitive = demonstrated.primitive(history=CERTIFIED[guidance])
+    acted = guidance != "kmp"
+    primitive = demonstrated.primitive(history=guidance == "skgrl", constrained=acted)
     start = primitive.constraints.nearest(primitive.reference.means[0])
     within = float(options.get("start_beside", 0.0)) if start_within is None else start_within
     if not (np.isfinite(within) and within >= 0.0):
         raise InputError(f"the robot begins within a distance that is not negative, not {within}")
     skill = Skill(
         primitive,
-        demonstrated.null_space_gains(primitive),
+        demonstrated.null_space_gains(primitive) if acted else np.zeros(primitive.num_outputs),
         demonstrated.control_period,
         start,
         np.full(primitive.num_outputs, within),
     )
-    certified = certify(skill)
+    budget = None
+    if primitive.history:
+        spent = Adversary(skill, np.ones(primitive.num_steps, bool), seed=SEARCH, spends=True).attack(SEARCH)
+        budget = Budget(MARGIN * spent.excess + np.array(LEAST_EXCESS), MARGIN * spent.residue)
+    certified = certify(skill, budget)
     pushes = Impedance() if primitive.num_outputs == len(Impedance().stiffness) else None
     stiffness = None if pushes is None else options.get("stiffness_factor", 1.0) * np.array(pushes.stiffness)
     limits = None if pushes is None else np.array(pushes.limits)
@@ -81,11 +105,63 @@ def certify_skill(
         "steps": primitive.num_steps,
         "steps_that_constraints_can_touch": int(certified.touched.sum()),
     }
-    for regime, bounds in (("while_free", certified.free), ("always", certified.always)):
+    regimes = {"while_free": certified.free, "always": certified.always}
+    if certified.budgeted is not None:
+        regimes["budgeted"] = certified.budgeted.bounds
+    for regime, bounds in regimes.items():
         found |= {f"{regime}_{name}": value for name, value in _largest(bounds).items()}
     if limits is not None:
         found["force"] = float(np.linalg.norm(limits[:3]))
+    if attack:
+        found |= _attacked(skill, certified, attack, out)
     return found
+
+
+def _attacked(skill: Skill, certified: Certified, steps: int, out: Path) -> dict[str, Any]:
+    """What an adversary came to against each bound, as a table in the folder."""
+    can_be_corrected = corrected_steps(skill, certified)
+    adversary = Adversary(skill, can_be_corrected)
+    worst = adversary.attack(steps)
+    bounds = certified.always if certified.budgeted is None else certified.budgeted.bounds
+    claimed = {
+        "pose": np.maximum(bounds.upper - adversary.middle, adversary.middle - bounds.lower),
+        "speed": bounds.speed,
+        "acceleration": bounds.acceleration,
+    }
+    rows: list[dict[str, Any]] = []
+    for quantity, constrained, output in itertools.product(QUANTITIES, (False, True), range(len(skill.gains))):
+        at = can_be_corrected == constrained
+        if at.any():
+            bound, most = claimed[quantity][at, output].max(), worst.most[quantity][at, output].max()
+            rows.append(
+                {
+                    "quantity": quantity,
+                    "output": output,
+                    "constraint": "can be active" if constrained else "never active",
+                    "bound": float(bound),
+                    "worst_found": float(most),
+                    "ratio": float(bound / most) if most > 0.0 else None,
+                    "left": int((worst.most[quantity][at, output] > claimed[quantity][at, output] * ALIKE).sum()),
+                }
+            )
+    write_table(out / "attack", rows)
+    found = {"attack": rows, "attack_steps": worst.steps, "attack_corrected": worst.corrected}
+    if certified.budgeted is not None:
+        budget = certified.budgeted.budget
+        found["budget_spent"] = float(max(_part(worst.excess, budget.excess), _part(worst.residue, budget.residue)))
+    return found
+
+
+def corrected_steps(skill: Skill, certified: Certified) -> np.ndarray:
+    """(N,), at which steps a command, its speed or its acceleration can depend on a correction."""
+    touched = certified.touched
+    if skill.primitive.history:
+        return np.logical_or.accumulate(touched)
+    return touched | np.append(False, touched[:-1]) | np.append([False, False], touched[:-2])
+
+
+def _part(found: np.ndarray, budget: np.ndarray) -> float:
+    return float(np.max(np.divide(found, budget, out=np.zeros_like(found), where=budget > 0.0), initial=0.0))
 
 
 def _what(of: str, environment: Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:

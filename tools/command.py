@@ -273,7 +273,7 @@ def evaluate(
 
 @command("robustness runs/connector --env station=mujoco --episodes 50")
 def robustness(
-    run: Run,
+    runs: Annotated[list[Path], _arg("Folders of runs of one task, which are compared.", "RUN...")],
     episodes: Annotated[int, _opt("How many held-out episodes, for each who at each place.")] = 30,
     seed: Seed = 1_000_000,
     axes: Annotated[str | None, _opt("What is changed, comma-separated: {axes}.  [default: all]")] = None,
@@ -281,35 +281,39 @@ def robustness(
     beside: Annotated[
         str | None, _opt("Who else meets the same episodes, or none.  [default: white actions, and the rule]")
     ] = None,
-    out: Annotated[Path | None, _opt("The folder to write.  [default: robustness/STATION in the run]")] = None,
+    out: Annotated[
+        Path | None, _opt("The folder to write, which several runs need.  [default: robustness/STATION in the run]")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Judge a run's policy where friction, stiffness, sensors, commands or the clock are other than it learned with.
+    """Judge runs' policies where friction, stiffness, sensors, commands or the clock are other than they learned with.
 
-    One thing is changed at a time. What is done is kept: started again, it goes on where it was interrupted.
+    One thing is changed at a time; one table and one picture hold all runs. What is done is kept: started again, it
+    goes on where it was interrupted, and a further run costs only its own episodes.
     """
     from guiderail.tools.robustness.robustness import breaks
     from guiderail.tools.robustness.robustness import robustness as judge
 
     environment = _environment(env)
-    others = _beside(run, environment, beside)
+    others = _beside(runs[0], environment, beside)
     if beside is None:
         others = {name: acts for name, acts in others.items() if name != "constant"}
     found = judge(
-        run, episodes=episodes, seed=seed, environment=environment, axes=axes, beside=others, out=out, tell=_say
+        runs, episodes=episodes, seed=seed, environment=environment, axes=axes, beside=others, out=out, tell=_say
     )
     if as_json:
         typer.echo(json.dumps({"table": str(found["table"]), "picture": str(found["picture"]), "rows": found["rows"]}))
         return
     for line in found["table"].with_suffix(".md").read_text(encoding="utf-8").splitlines():
         typer.echo(line)
-    for name, values in breaks(found["rows"], "policy").items():
-        typer.echo(f"{name}: below 90 % at {', '.join(f'{value:.3g}' for value in values) or 'no place'}")
+    for who in found["policies"]:
+        for name, values in breaks(found["rows"], who).items():
+            typer.echo(f"{who}, {name}: below 90 % at {', '.join(f'{value:.3g}' for value in values) or 'no place'}")
     typer.echo(found["table"])
     typer.echo(found["picture"])
 
 
-@command("certify runs/passage")
+@command("certify runs/passage --attack 1000000")
 def certify(
     of: Annotated[str, _arg("The folder of a run; or a task, with --out: {tasks}.", "RUN or TASK")],
     env: Env = None,
@@ -317,22 +321,30 @@ def certify(
     start_within: Annotated[
         float | None, _opt("How far beside its start the robot may begin, in the outputs' units.")
     ] = None,
+    attack: Annotated[int, _opt("How many steps an adversary tries to leave the bounds.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Bound what a skill can command for all actions, and have the bounds checked by a program that knows no guiderail.
 
-    The certificate lists what it assumes. Check it anywhere: python checker.py FOLDER, with NumPy alone.
+    The certificate lists what it assumes. Check it anywhere: python checker.py FOLDER, with NumPy alone. An attack
+    says how tight it is: the bounds beside the worst that an adversary found, straight through the primitive.
     """
     from guiderail.tools.certify import certify_skill
 
-    found = certify_skill(of, _environment(env), out=out, start_within=start_within)
+    found = certify_skill(of, _environment(env), out=out, start_within=start_within, attack=attack)
+    rows = found.get("attack", [])
     if as_json:
         typer.echo(json.dumps(found))
     else:
         for name, value in found.items():
+            if name == "attack":
+                continue
             words = ", ".join("–" if x is None else f"{x:.4g}" for x in value) if isinstance(value, list) else value
             typer.echo(f"{name.replace('_', ' ')}: {words}")
-    if found["checker"] != "yes":
+        if rows:
+            table = Path(found["certificate"]).with_name("attack.md")
+            typer.echo(table.read_text(encoding="utf-8"))
+    if found["checker"] != "yes" or any(row["left"] for row in rows):
         raise typer.Exit(1)
 
 
@@ -722,6 +734,13 @@ def run(
     scenario: Scenario = None,
     yes: Yes = False,
     out: Annotated[Path | None, _opt("The folder of what is recorded.  [default: hardware in the run]")] = None,
+    episodes: Annotated[
+        int | None, _opt("So many episodes as in training, one after the other, instead: how often does it succeed?")
+    ] = None,
+    policy: Annotated[
+        str | None, _opt("Of episodes: who acts instead of the run's policy, such as rule, zero or constant.")
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """Run a policy on a robot.
 
@@ -734,6 +753,18 @@ def run(
 
     there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
     other = Other.in_scenario(scenario, **there)
+    if episodes is not None:
+        from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
+
+        others = _beside(run, {}, "none" if policy is None else policy)
+        acting = None if policy is None else others[policy]
+        found = evaluate_on_robot(
+            run, other, episodes, station=station, policy=policy or "", acting=acting, yes=yes, out=out, say=_say
+        )
+        _print(found, as_json)
+        return
+    if policy is not None:
+        raise InputError("another policy than the run's acts in episodes alone: give --episodes too")
     raise typer.Exit(run_policy(run, other, station=station, yes=yes, out=out, say=_tell))
 
 

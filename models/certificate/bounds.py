@@ -1,7 +1,7 @@
 """Bounds on what a primitive commands, for all sequences of actions in [−1, 1].
 
 Where no constraint is active the loop history → next command is affine: its reachable set is a zonotope, whose
-generators are the impulse responses, and the largest value along any direction is the sum of their sizes. Two regimes
+generators are the impulse responses, and the largest value along any direction is the sum of their sizes. Three regimes
 are certified.
 
 - *free*: for all sequences, as long as no constraint had to be enforced. Exact.
@@ -12,6 +12,11 @@ are certified.
   corner's multipliers bound ‖v‖ from below (weak duality). So a command is between the corners' by that radius times
   the output's size. With a history corrections feed back, and an output that no constraint caps, and that is tied to
   one that is constrained, has no bound in this regime.
+- *budgeted*, with a history: for all sequences in which corrections keep a budget. A correction moves the executed
+  point as another action would, and by a residue in the outputs that no action moves. What such actions exceed ±1 by
+  has a budget, at one step and added up over the sequence, and so has the residue: both are small, as a correction
+  takes back what an action asked for. They are worst where the response to them is largest. That they are kept is
+  assumed, not proved.
 """
 
 from __future__ import annotations
@@ -21,43 +26,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from guiderail.models.certificate.loop import Bounds, Skill, caps, reach
+from guiderail.models.certificate.prices import Budget, Budgeted, budgeted
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 CELLS = {1: 16, 2: 12, 3: 3}  # along each action, by how many actions there are; one for more
 MOST_ACTIONS = 6  # of which all corners are looked at
 ROUNDING = 1e-6  # of a squared correction: a radius below its root is none
-
-
-@dataclass(frozen=True)
-class Skill:
-    """A primitive in its loop.
-
-    Attributes:
-        primitive: of the skill.
-        gains: (O,), what an action of one is worth; zero for outputs that no action moves.
-        period: between two commands [s].
-        start, start_within: (O,) each, where the robot is when it begins, and how far beside.
-    """
-
-    primitive: LcNsKmp
-    gains: np.ndarray
-    period: float
-    start: np.ndarray
-    start_within: np.ndarray
-
-
-@dataclass(frozen=True)
-class Bounds:
-    """Of a regime: lower and upper (N, O) of the command, largest speed and acceleration (N, O) in its units per s, s².
-
-    A speed is that of the step before; infinite where nothing is known. The first commands have none.
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    speed: np.ndarray
-    acceleration: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -69,30 +45,37 @@ class Certified:
         touched: (N,), whether a constraint can be active in a step's window, whatever the actions before.
         multipliers: at the steps that are touched, for every corner of a cell of the actions (T, (K+1)^A, H+1, F):
             what proves how far commands go; empty with a history.
+        budgeted: the third regime; None where there is none.
     """
 
     free: Bounds
     always: Bounds
     touched: np.ndarray
     multipliers: np.ndarray
+    budgeted: Budgeted | None = None
 
 
-def certify(skill: Skill) -> Certified:
-    """The bounds of a skill.
+def certify(skill: Skill, budget: Budget | None = None) -> Certified:
+    """The bounds of a skill; of the budgeted regime as well, with a budget and where a history feeds corrections back.
 
     Raises:
         InputError: if a primitive without a history has more actions than whose corners can be looked at.
     """
     primitive = skill.primitive
-    middle, generators = _reach(skill)
+    middle, generators = reach(skill)
     free = _of_zonotope(middle, generators, skill)
     touched = _touched(skill, middle, generators)
     if primitive.history:
         unknown = np.logical_or.accumulate(touched)[:, None] & _coupled(primitive)
-        reach, multipliers = np.where(unknown, np.inf, np.nan) * np.array([-1.0, 1.0])[:, None, None], _none(primitive)
+        corrected = np.where(unknown, np.inf, np.nan) * np.array([-1.0, 1.0])[:, None, None]
+        multipliers = _none(primitive)
     else:
-        reach, multipliers = _cellwise(skill, touched)
-    return Certified(free, _always(skill, free, reach), touched, multipliers)
+        corrected, multipliers = _cellwise(skill, touched)
+    always = _always(skill, free, corrected)
+    if budget is None or not primitive.history or not touched.any():
+        return Certified(free, always, touched, multipliers)
+    first = int(np.argmax(touched))
+    return Certified(free, always, touched, multipliers, budgeted(skill, free, middle, generators, first, budget))
 
 
 def nodes(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
@@ -108,32 +91,12 @@ def nodes(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
     places = list(itertools.product(range(along + 1), repeat=len(moved)))
     number = {place: i for i, place in enumerate(places)}
     raw = np.zeros((len(places), len(gains)))
-    raw[:, moved] = (2.0 * np.array(places).reshape(-1, len(moved)) / along - 1.0) * gains[moved]
+    raw[:, moved] = (2.0 * np.array(places).reshape(len(places), len(moved)) / along - 1.0) * gains[moved]
     cells = [
         [number[tuple(np.add(first, step))] for step in itertools.product((0, 1), repeat=len(moved))]
         for first in itertools.product(range(along), repeat=len(moved))
     ]
     return raw, cells
-
-
-def _reach(skill: Skill) -> tuple[np.ndarray, np.ndarray]:
-    """The motion without actions (P + N, O), the start before it, and the generators around it (P + N, O, B)."""
-    primitive, past = skill.primitive, skill.primitive.history
-    steps, outputs = primitive.num_steps, primitive.num_outputs
-    moved = np.flatnonzero(skill.gains)
-    batch = steps * len(moved) + (outputs if past else 0)
-    middle, generators = np.zeros((past + steps, outputs)), np.zeros((past + steps, outputs, batch))
-    if past:
-        middle[:past] = skill.start
-        generators[:past, :, batch - outputs :] = np.diag(skill.start_within)
-    for n in range(steps):
-        of_history, of_action, offset = primitive.linear_response(n)
-        middle[past + n] = offset
-        if past:
-            middle[past + n] += of_history @ middle[n : past + n].ravel()
-            generators[past + n] = of_history @ generators[n : past + n].reshape(past * outputs, batch)
-        generators[past + n, :, n * len(moved) : (n + 1) * len(moved)] += of_action[:, moved] * skill.gains[moved]
-    return middle, generators
 
 
 def _of_zonotope(middle: np.ndarray, generators: np.ndarray, skill: Skill) -> Bounds:
@@ -165,7 +128,7 @@ def _touched(skill: Skill, middle: np.ndarray, generators: np.ndarray) -> np.nda
 def _cellwise(skill: Skill, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest commands (2, N, O) at touched steps, NaN at others, and the multipliers that prove them."""
     primitive = skill.primitive
-    reach, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
+    reached, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
     actions, cells = nodes(skill.gains)
     for n in map(int, np.flatnonzero(touched)):
         found = [primitive.predict(n, action) for action in actions]
@@ -179,8 +142,8 @@ def _cellwise(skill: Skill, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray
             least = [_least_sizes(found[k].signed_multipliers, free[cell], lower, upper, corrections[k]) for k in cell]
             radius = sizes * np.sqrt(min(_squared_radius(corrections[cell], one) for one in least))
             ranges.append([outputs[cell].min(axis=0) - radius, outputs[cell].max(axis=0) + radius])
-        reach[0, n], reach[1, n] = np.min(ranges, axis=0)[0], np.max(ranges, axis=0)[1]
-    return reach, np.array(multipliers) if multipliers else _none(primitive)
+        reached[0, n], reached[1, n] = np.min(ranges, axis=0)[0], np.max(ranges, axis=0)[1]
+    return reached, np.array(multipliers) if multipliers else _none(primitive)
 
 
 def _least_sizes(
@@ -216,27 +179,11 @@ def _coupled(primitive: LcNsKmp) -> np.ndarray:
     return reached
 
 
-def caps(skill: Skill) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest value (N, O) that the constraints on a single output leave it."""
-    primitive = skill.primitive
-    G, c = primitive.constraints.window(np.arange(primitive.num_steps))
-    lower, upper = np.full((2, primitive.num_steps, primitive.num_outputs), [[[-np.inf]], [[np.inf]]])
-    for n, row in itertools.product(range(primitive.num_steps), range(G.shape[1])):
-        alone = np.flatnonzero(G[n, row])
-        if len(alone) == 1:
-            o, bound = alone[0], c[n, row] / G[n, row, alone[0]]
-            if G[n, row, o] > 0.0:
-                lower[n, o] = max(lower[n, o], bound)
-            else:
-                upper[n, o] = min(upper[n, o], bound)
-    return lower, upper
-
-
-def _always(skill: Skill, free: Bounds, reach: np.ndarray) -> Bounds:
-    corrected = ~np.isnan(reach[0])
+def _always(skill: Skill, free: Bounds, reached: np.ndarray) -> Bounds:
+    corrected = ~np.isnan(reached[0])
     least, greatest = caps(skill)
-    lower = np.where(corrected, np.maximum(reach[0], least), free.lower)
-    upper = np.where(corrected, np.minimum(reach[1], greatest), free.upper)
+    lower = np.where(corrected, np.maximum(reached[0], least), free.lower)
+    upper = np.where(corrected, np.minimum(reached[1], greatest), free.upper)
     speed, acceleration = free.speed.copy(), free.acceleration.copy()
     begin = np.broadcast_to([skill.start - skill.start_within, skill.start + skill.start_within], (2, *lower.shape[1:]))
     for n in range(len(lower)):

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.certificate.bounds import Bounds, Certified, Skill
+from guiderail.models.certificate.bounds import Certified
+from guiderail.models.certificate.loop import Bounds, Skill
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.kernels import SquaredExponential
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"
-FORMAT = "guiderail certificate 1"
+FORMAT = "guiderail certificate 2"
 ASSUMPTIONS = (
     "actions are numbers in [-1, 1], as the environment and the skill's diagram clip them, held for any time",
     "the skill is executed from its first step to its last, at the period given, and begins at rest within the start",
@@ -23,6 +24,11 @@ ASSUMPTIONS = (
     "the quadratic program is solved whenever it must be: a fallback repeats the last command, and is counted",
     "the impedance saturates at its limits and has the stiffness given; forces are what it pushes with, not impacts",
     "`rest_force` holds while the robot is between the least and the greatest of the commands, and at rest",
+)
+BUDGET = (
+    "`budgeted` holds for sequences whose corrections keep two budgets, each at one step and in all: what they exceed "
+    "actions of [-1, 1] by, and what else they do to outputs that no action moves. An adversary found no more than two "
+    "thirds of them: that they are kept is not proved"
 )
 
 
@@ -66,7 +72,7 @@ def certificate_files(
     files = {
         PRIMITIVE: _npz(numbers),
         CONSTRAINTS: _npz({"G": constraints.G, "c": constraints.c}),
-        WITNESS: _npz({"touched": certified.touched, "multipliers": certified.multipliers}),
+        WITNESS: _npz({"touched": certified.touched, "multipliers": certified.multipliers} | _prices(certified)),
     }
     claims: dict[str, Any] = {
         "format": FORMAT,
@@ -77,14 +83,26 @@ def certificate_files(
         "free": _bounds(certified.free),
         "always": _bounds(certified.always),
     }
+    regimes = {"always": certified.always}
+    if certified.budgeted is not None:
+        regimes["budgeted"] = certified.budgeted.bounds
+        budget = certified.budgeted.budget
+        assumed = {"excess": budget.excess.tolist(), "residue": budget.residue.tolist()}
+        claims["budgeted"] = _bounds(certified.budgeted.bounds) | assumed
+        claims["assumes"].append(BUDGET)
     if stiffness is not None and limits is not None:
         claims |= {"stiffness": list(map(float, stiffness)), "limits": list(map(float, limits))}
-        ranges = certified.always.upper.max(axis=0) - certified.always.lower.min(axis=0)
-        at_rest = np.minimum(limits, np.asarray(stiffness) * ranges)
         claims["force"] = float(np.linalg.norm(limits[:3]))
-        claims["rest_force"] = float(np.linalg.norm(at_rest[:3]))
+        for name, bounds in regimes.items():
+            at_rest = np.minimum(limits, np.asarray(stiffness) * (bounds.upper.max(axis=0) - bounds.lower.min(axis=0)))
+            claims[name]["rest_force"] = float(np.linalg.norm(at_rest[:3]))
     claims["digest"] = digest(claims)
     return {**files, CERTIFICATE: json.dumps(claims).encode()}
+
+
+def _prices(certified: Certified) -> dict[str, np.ndarray]:
+    found = certified.budgeted
+    return {} if found is None else {"at": found.steps, "of": found.outputs, "prices": found.prices}
 
 
 def digest(claims: Mapping[str, Any]) -> str:

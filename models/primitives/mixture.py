@@ -51,19 +51,17 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
     Args:
         times: (N,), the common clock.
         outputs: (M, N, O).
-        components: C; the number of least Bayesian information criterion up to 20 unless given.
+        components: C; unless given, the number of least Bayesian information criterion among 1 to 20, of which no
+            more are tried once two have not been better than the best before.
         seed: of scikit-learn's generator.
 
     Raises:
         InputError: if there are fewer points than components need.
     """
-    data, center, scale = _scaled(times, outputs)
+    _, center, scale = _scaled(times, outputs)
     most = min(_MOST_COMPONENTS, len(times) // 2)
     candidates = [components] if components is not None else range(1, most + 1)
-    _check_components(times, candidates)
-    slices = _slices(times, outputs)
-    fits = [_fit(data, slices, count, seed) for count in candidates]
-    best = min(fits, key=lambda fit: fit.bic(data)) if len(fits) > 1 else fits[0]
+    best, _ = min(_fits(times, outputs, candidates, seed).values(), key=lambda fit: fit[1])
     return Mixture(best.weights_, best.means_, best.covariances_, center, scale)
 
 
@@ -85,13 +83,22 @@ def information_criteria(
     Raises:
         InputError: if there are fewer points than components need.
     """
+    return {count: criterion for count, (_, criterion) in _fits(times, outputs, candidates, seed).items()}
+
+
+def _fits(
+    times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
+) -> dict[int, tuple[GaussianMixture, float]]:
+    """Fits and their criteria, until two more have not been better than the best before."""
     _check_components(times, candidates)
     data, _, _ = _scaled(times, outputs)
     slices = _slices(times, outputs)
-    found: dict[int, float] = {}
+    found: dict[int, tuple[GaussianMixture, float]] = {}
     for count in candidates:
-        found[count] = float(_fit(data, slices, count, seed).bic(data))
-        if len(found) > 2 and min(list(found.values())[-2:]) > min(list(found.values())[:-2]):
+        fit = _fit(data, slices, count, seed)
+        found[count] = fit, float(fit.bic(data))
+        criteria = [criterion for _, criterion in found.values()]
+        if len(criteria) > 2 and min(criteria[-2:]) > min(criteria[:-2]):
             break
     return found
 

@@ -50,7 +50,7 @@ def by_study(out):
     "ask",
     [
         lambda run: evaluate.evaluate(run, environment=HARD),
-        lambda run: robustness(run, environment=HARD, axes="friction"),
+        lambda run: robustness([run], environment=HARD, axes="friction"),
         by_study,
     ],
     ids=["evaluate", "robustness", "study"],

@@ -11,6 +11,7 @@ import pandas as pd
 from guiderail.tools.viewing.style import legend, new_figure, save_figure
 
 COLUMNS = 4
+APART = 0.06  # of the distance between two places, from one who to the next
 COLOURS = ("#1f5fbf", "#8a8a8a", "#c0504d", "#4f9d55", "#8064a2", "#d98b2b", "#3aa6a6")
 
 
@@ -24,14 +25,18 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     axes = list(dict.fromkeys(table["axis"]))
     columns = min(COLUMNS, len(axes))
     bands = -(-len(axes) // columns)
-    figure, panels = new_figure(2 * bands, columns, (max(3.2 * columns, 6.4), 3.6 * bands + 0.5))
+    figure, panels = new_figure(
+        2 * bands, columns, (max(3.2 * columns, 6.4, 1.6 * table["who"].nunique()), 3.6 * bands + 0.5)
+    )
     colours = dict(zip(dict.fromkeys(table["who"]), COLOURS * 9, strict=False))
+    order = {who: place for place, who in enumerate(colours)}
     for number, name in enumerate(axes):
         success, force = (panels[2 * (number // columns) + part, number % columns] for part in (0, 1))
         of_axis = table[table["axis"] == name]
         places = {value: place for place, value in enumerate(dict.fromkeys(of_axis["value"]))}
         for who, points in of_axis.groupby("who", sort=False):
-            x = [places[value] for value in points["value"]]
+            # Beside each other: several who always succeed would be one line, and nobody could tell whose.
+            x = [places[value] + APART * (order[who] - (len(order) - 1) / 2) for value in points["value"]]
             rate, colour = points["success_rate"], colours[who]
             bars = [rate - points["success_low"], points["success_high"] - rate]
             success.errorbar(x, rate, yerr=bars, color=colour, marker="o", markersize=3, capsize=2, label=who)

@@ -1,10 +1,11 @@
-"""`guiderail robustness`: a policy judged where it never trained, beside policies that know nothing."""
+"""`guiderail robustness`: policies judged where they never trained, beside policies that know nothing."""
 
 from __future__ import annotations
 
 import hashlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,10 @@ import pandas as pd
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.guidance import is_demonstrated
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.guidance import is_demonstrated, label
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.report.statistics import wilson
-from guiderail.tools.robustness.axes import Point, chosen_axes, points
+from guiderail.tools.robustness.axes import Axis, Point, chosen_axes, points
 from guiderail.tools.robustness.picture import draw
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, judged_once
 from guiderail.tools.rollouts.null_policies import still
@@ -27,13 +28,32 @@ from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import changed_environment
 
 EPISODES = 30  # of each who at each place
-POLICY, DEMONSTRATION = "policy", "demonstration"
+POLICY, DEMONSTRATION = "policy", "demonstration"  # names in the table
 
 Acts = Callable[[gymnasium.Env], Act]
 
 
+@dataclass(frozen=True)
+class _Who:
+    """Somebody who acts, in a run's environment.
+
+    Attributes:
+        name: in the table.
+        acts: for an environment.
+        config: of the run.
+        environment: its arguments, with those that are other ones throughout.
+        about: what its episodes depend on beside its name.
+    """
+
+    name: str
+    acts: Acts
+    config: RunConfig
+    environment: Mapping[str, Any]
+    about: str | None = None
+
+
 def robustness(
-    run: Path,
+    runs: Sequence[Path],
     *,
     episodes: int = EPISODES,
     seed: int = HELD_OUT_SEED,
@@ -43,54 +63,99 @@ def robustness(
     out: Path | None = None,
     tell: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Any]:
-    """Judges a run's policy along each axis by itself, the rest being as it was where the policy learned.
+    """Judges runs' policies along each axis by itself, the rest being as it was where each of them learned.
 
-    Every place's episodes are kept in the folder, so that whoever is interrupted goes on.
+    Every place's episodes are kept in the folder, so that whoever is interrupted goes on, and a further run costs
+    only its own episodes.
 
     Args:
-        run: the run's folder.
+        runs: folders of runs of one task. Whoever else acts does so through the guidance of the first.
         episodes: held-out ones, the same for all who act, at each place.
         seed: of the first.
         environment: arguments of the environment that are other ones throughout, such as the station.
         axes: names of axes, comma-separated; all unless given.
         beside: who else acts, by name.
-        out: the folder that is written; in the run, named as its station, unless given.
-        tell: is told which places are left out, and how far it has come.
+        out: the folder that is written; in the run, named as its station, unless given. Several runs need it.
+        tell: is told in what runs differ, which places are left out, and how far it has come.
 
     Returns:
-        `table` and `picture`, the files; `rows`, the table's.
+        `table` and `picture`, the files; `rows`, the table's; `policies`, what the runs' policies are called.
 
     Raises:
-        InputError: if there is no trained run, or an argument makes no sense.
+        InputError: if there is no trained run, runs are of different tasks, or an argument makes no sense.
     """
     if episodes < 1:
         raise InputError(f"robustness needs at least one episode at each place, not {episodes}")
-    folder = RunFolder(run)
-    config, policy = folder.config(), Policy.load(folder.path)
-    where = changed_environment(config.task, config.environment, environment or {})
-    places, left_out = points(config.task, where, chosen_axes(axes))
-    for sentence in left_out:
-        tell(sentence)
-    who: dict[str, Acts] = {POLICY: partial(as_learned, policy)}
-    if is_demonstrated(where.get("guidance")):
-        who[DEMONSTRATION] = still
-    who |= {name: acts for name, acts in (beside or {}).items() if name != "zero" or DEMONSTRATION not in who}
-    out = folder.path / "robustness" / str(where.get("station", "")) if out is None else out
-    about = {POLICY: hashlib.blake2b((folder.path / "policy.safetensors").read_bytes(), digest_size=8).hexdigest()}
+    policies = _policies(runs, dict(environment or {}), tell)
+    if out is None and len(runs) > 1:
+        raise InputError("say with --out where the table and the picture of several runs go")
+    first = policies[0]
+    who = list(policies)
+    if is_demonstrated(first.environment.get("guidance")):
+        who.append(_Who(DEMONSTRATION, still, first.config, first.environment))
+    for name, acts in (beside or {}).items():
+        if name != "zero" or len(who) == len(policies):
+            who.append(_Who(name, acts, first.config, first.environment))
+    out = runs[0] / "robustness" / str(first.environment.get("station", "")) if out is None else out
+    places = _places(who, chosen_axes(axes), tell)
     rows: list[dict[str, Any]] = []
-    for number, place in enumerate(places, start=1):
-        for name, acts in who.items():
-            words = f"{number}/{len(places)} {place.axis.name} {place.value:.3g} {name}"
-            judged = judged_once(
-                out / "episodes", name, config, acts, place.environment,
-                about=about.get(name), episodes=episodes, seed=seed, words=words,
-            )  # fmt: skip
-            if judged is not None:
-                rows.append(_row(place, name, judged))
+    for number, (one, place) in enumerate(places, start=1):
+        words = f"{number}/{len(places)} {place.axis.name} {place.value:.3g} {one.name}"
+        judged = judged_once(
+            out / "episodes", one.name, one.config, one.acts, place.environment,
+            about=one.about, episodes=episodes, seed=seed, words=words,
+        )  # fmt: skip
+        if judged is not None:
+            rows.append(_row(place, one.name, judged))
     if not rows:
         raise InputError("none of these axes can be changed here: choose others with --axes")
     table = write_table(out / f"{_called(axes, environment or {})}.csv", rows).with_suffix(".csv")
-    return {"table": table, "picture": draw(table.with_suffix(".png"), rows), "rows": rows}
+    picture = draw(table.with_suffix(".png"), rows)
+    return {"table": table, "picture": picture, "rows": rows, "policies": [one.name for one in policies]}
+
+
+def _policies(runs: Sequence[Path], environment: Mapping[str, Any], tell: Callable[[str], None]) -> list[_Who]:
+    """The runs' policies: one is called so, several by their guidance, and by their folder where that is the same."""
+    if not runs:
+        raise InputError("robustness needs the folder of a run")
+    folders = [RunFolder(run) for run in runs]
+    configs = [folder.config() for folder in folders]
+    tasks = sorted({config.task for config in configs})
+    if len(tasks) > 1:
+        raise InputError(f"runs that are compared are of one task, not of {' and '.join(tasks)}")
+    kinds = [label(str(config.environment.get("guidance"))) for config in configs]
+    names = [POLICY] if len(runs) == 1 else kinds if len(set(kinds)) == len(kinds) else [run.name for run in runs]
+    if len(set(names)) < len(names):
+        raise InputError("runs that are compared are different ones, in folders of different names")
+    where = [changed_environment(config.task, config.environment, environment) for config in configs]
+    asked: list[dict[str, Any]] = [{"seed": config.seed, **one} for config, one in zip(configs, where, strict=True)]
+    everything = sorted({key for one in asked for key in one})
+    differing = [key for key in everything if any(one.get(key) != asked[0].get(key) for one in asked)]
+    if differing:
+        tell(f"the runs differ in {', '.join(differing)}")
+    return [
+        _Who(name, partial(as_learned, Policy.load(folder.path)), config, one, _digest(folder))
+        for name, folder, config, one in zip(names, folders, configs, where, strict=True)
+    ]
+
+
+def _digest(folder: RunFolder) -> str:
+    return hashlib.blake2b((folder.path / "policy.safetensors").read_bytes(), digest_size=8).hexdigest()
+
+
+def _places(who: Sequence[_Who], axes: Sequence[Axis], tell: Callable[[str], None]) -> list[tuple[_Who, Point]]:
+    """Who is judged where, place by place, so that a table that is not finished compares all who act."""
+    told: set[str] = set()
+    found: list[list[tuple[_Who, Point]]] = []
+    for one in who:
+        where, left_out = points(one.config.task, one.environment, axes)
+        found.append([(one, point) for point in where])
+        for sentence in left_out:
+            if sentence not in told:
+                tell(sentence)
+            told.add(sentence)
+    order = {(axis.name, value): i for i, (axis, value) in enumerate((a, v) for a in axes for v in a.values)}
+    return sorted((pair for pairs in found for pair in pairs), key=lambda pair: order[pair[1].axis.name, pair[1].value])
 
 
 def _called(axes: str | None, environment: Mapping[str, Any]) -> str:

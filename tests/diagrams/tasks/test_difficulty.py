@@ -77,7 +77,7 @@ WRONG = [
     ("BncConnector", {"friction": np.nan}, "friction"),
     ("BncConnector", {"jack_turn": -1.0}, "jack_turn must be at least 0"),
     ("BncConnector", {"start_beside": 0.01}, "start_beside must be at most"),
-    ("BncConnector", {"demonstrations": "none"}, "there is no demonstrations 'none'"),
+    ("BncConnector", {"demonstrations": "none"}, "demonstrations cannot be 'none'"),
     ("BncConnector", {"difficulty": "harder"}, "did you mean hard"),
     ("GridClamp", {"force_limit": 100.0}, "force_limit must be at most 60"),
     ("GridClamp", {"start_height": (0.03, 0.02)}, "the lower one first"),

@@ -5,14 +5,19 @@ import hashlib
 import io
 import json
 import sys
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from guiderail.models.certificate import checker
-from guiderail.models.certificate.bounds import Skill, certify
+from guiderail.models.certificate.adversary import Adversary
+from guiderail.models.certificate.bounds import certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files, digest
+from guiderail.models.certificate.loop import Skill, reach
+from guiderail.models.certificate.prices import Budget, _Market, _of_residue
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
 
@@ -44,10 +49,25 @@ CASES = {
 }
 
 
+def certified(made):
+    """With budgets of half as much again as an adversary needs."""
+    seen = Adversary(made, np.ones(STEPS, bool)).attack(30 * STEPS)
+    return certify(made, Budget(1.5 * seen.excess + 0.01, 1.5 * seen.residue))
+
+
+@cache
+def constrained():
+    """Through a history, which is the case that takes longest."""
+    made = skill(*CASES["sKGRL, constrained"], tied=0.5)
+    return made, certified(made)
+
+
 @pytest.fixture(scope="module", params=CASES)
 def case(request):
+    if request.param == "sKGRL, constrained":
+        return constrained()
     made = skill(*CASES[request.param], tied=0.5)
-    return made, certify(made)
+    return made, certified(made)
 
 
 def executed(made, actions, start):
@@ -106,6 +126,45 @@ def test_what_corrections_can_reach_through_a_history_has_no_bound():
     assert np.isinf(tied.upper[-1, 1])
     assert np.isfinite(alone.upper).all()
     assert np.abs(tied.upper[:, 0]).max() <= 0.25 + 1e-9 or tied.upper[:, 0].max() < 0.3
+
+
+def test_an_adversary_leaves_no_bound_where_corrections_keep_their_budget():
+    """Constrained through a history: there are bounds on everything, near what other sequences reach."""
+    made, found = constrained()
+    budget, bounds = found.budgeted.budget, found.budgeted.bounds
+    seen = Adversary(made, np.ones(STEPS, bool), seed=1).attack(80 * STEPS)
+    assert seen.corrected > 100
+    assert (seen.excess <= budget.excess).all()
+    assert (seen.residue <= budget.residue).all()
+    assert (seen.lower >= bounds.lower - 1e-9).all()
+    assert (seen.upper <= bounds.upper + 1e-9).all()
+    for quantity, claimed in (("speed", bounds.speed), ("acceleration", bounds.acceleration)):
+        assert (seen.most[quantity] <= claimed * (1.0 + 1e-6)).all()
+        assert (claimed.max(axis=0) <= 2.0 * seen.most[quantity].max(axis=0)).all()
+    assert np.isinf(found.always.upper[:, 1]).any()
+
+
+def test_nothing_is_spent_where_there_is_no_constraint():
+    seen = Adversary(skill(4, None, tied=0.5), np.ones(STEPS, bool)).attack(10 * STEPS)
+    assert seen.corrected == 0
+    assert not seen.excess.any()
+    assert not seen.residue.any()
+
+
+@pytest.mark.parametrize("price", [0.0, 0.3, -2.0])
+def test_any_price_proves_a_bound(price):
+    """Prices are multipliers of a linear program: bad ones only make a bound wider."""
+    made, found = constrained()
+    worse = replace(found.budgeted, prices=found.budgeted.prices + price * (found.budgeted.prices != 0.0))
+    middle, generators = reach(made)
+    first = int(np.argmax(found.touched))
+    seen = Adversary(made, np.ones(STEPS, bool), seed=2).attack(40 * STEPS)
+    generators = np.concatenate([generators, _of_residue(made, first)], axis=2)
+    market = _Market(made, middle, generators, first, worse.budget)
+    for n in range(first, STEPS):
+        at, of, prices = (a[0, 0, n] for a in (worse.steps, worse.outputs, worse.prices))
+        highest = middle[4 + n] + market.worst(generators[4 + n], at, of, prices)
+        assert (seen.upper[n] <= highest + 1e-9).all()
 
 
 def files(made, found):
@@ -193,10 +252,41 @@ def honest():
     return files(made, certify(made))
 
 
+@pytest.fixture(scope="module")
+def budgeted():
+    return files(*constrained())
+
+
 @pytest.mark.parametrize("what", TAMPERED)
 def test_what_was_tampered_with_is_rejected(honest, tmp_path, what):
     with pytest.raises((checker.Rejected, ValueError)):
         checker.check(write(tmp_path, TAMPERED[what](honest)))
+
+
+BUDGETED = {
+    "a bound": lambda c: signed(c, budgeted__upper=at((50, 1), plus=-0.05)),
+    "a speed": lambda c: signed(c, budgeted__speed=at((50, 0), factor=0.9)),
+    "the force at rest": lambda c: signed(c, budgeted__rest_force=lambda force: 0.9 * force),
+    "the excess": lambda c: signed(c, budgeted__excess=lambda rows: [[0.5 * x for x in row] for row in rows]),
+    "the residue": lambda c: signed(c, budgeted__residue=lambda rows: [[0.5 * x for x in row] for row in rows]),
+    "a budget below zero": lambda c: signed(c, budgeted__residue=lambda rows: [[-x for x in row] for row in rows]),
+    "a price": lambda c: signed(altered(c, "witness.npz", prices=lambda p: 1.1 * p)),
+    "the regime": lambda c: signed(
+        c, budgeted=lambda claims: c and json.loads(c[CERTIFICATE])["always"] | claims_of(c)
+    ),
+}
+
+
+def claims_of(contents):
+    """The budgets of a certificate."""
+    claims = json.loads(contents[CERTIFICATE])["budgeted"]
+    return {name: claims[name] for name in ("excess", "residue")}
+
+
+@pytest.mark.parametrize("what", BUDGETED)
+def test_what_was_tampered_with_in_the_third_regime_is_rejected(budgeted, tmp_path, what):
+    with pytest.raises((checker.Rejected, ValueError)):
+        checker.check(write(tmp_path, BUDGETED[what](budgeted)))
 
 
 def test_the_checker_is_short_and_knows_numpy_alone():

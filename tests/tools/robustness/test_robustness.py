@@ -1,3 +1,5 @@
+import shutil
+from dataclasses import replace
 from functools import partial
 
 import pandas as pd
@@ -5,6 +7,8 @@ import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
 from guiderail.tools.robustness import axes
 from guiderail.tools.robustness.axes import AXES, Axis, chosen_axes, points
 from guiderail.tools.robustness.robustness import breaks, robustness
@@ -23,47 +27,79 @@ def run(bead_run, monkeypatch):
 def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):
     told = []
     how = {"episodes": 3, "beside": {"white": partial(NullPolicy, white)}, "tell": told.append}
-    first = robustness(run, **how)
+    first = robustness([run], **how)
     assert {row["who"] for row in first["rows"]} == {"policy", "demonstration", "white"}
     assert [row["value"] for row in first["rows"] if row["who"] == "policy"] == [-0.5, 1.0]
     assert all(row["success_low"] <= row["success_rate"] <= row["success_high"] for row in first["rows"])
-    assert "2/2 wall 1 policy 3/3" in capsys.readouterr().err
-    assert robustness(run, **how)["rows"] == first["rows"]
+    assert "4/6 wall 1 policy 3/3" in capsys.readouterr().err
+    assert robustness([run], **how)["rows"] == first["rows"]
     assert "policy 3/3" not in capsys.readouterr().err
     assert len(pd.read_csv(first["table"])) == 6
     assert first["picture"].stat().st_size > 10_000
-    assert robustness(run, **{**how, "episodes": 2})["rows"] != first["rows"]
+    assert robustness([run], **{**how, "episodes": 2})["rows"] != first["rows"]
 
 
 def test_another_question_leaves_the_answer_to_the_first(run):
     asked = [{}, {"axes": "wall"}, {"environment": {"hold": 2}}]
-    tables = [robustness(run, episodes=1, **one)["table"] for one in asked]
+    tables = [robustness([run], episodes=1, **one)["table"] for one in asked]
     assert [table.name for table in tables] == ["robustness.csv", "robustness-wall.csv", "robustness-hold=2.csv"]
     for table in tables:
         assert all(table.with_suffix(kind).is_file() for kind in (".csv", ".md", ".png"))
 
 
 def test_a_place_where_the_policy_fails_is_named(run):
-    found = robustness(run, episodes=2)
+    found = robustness([run], episodes=2)
     assert -0.5 in breaks(found["rows"], "policy")["wall"]
 
 
 def test_another_policy_in_the_folder_is_judged_anew(run, capsys):
-    robustness(run, episodes=2)
+    robustness([run], episodes=2)
     policy = Policy.load(run)
     policy._layers[0][0][0, 0] += 0.1
     policy.save(run)
     capsys.readouterr()
-    robustness(run, episodes=2)
+    robustness([run], episodes=2)
     said = capsys.readouterr().err
     assert "policy 2/2" in said
     assert "demonstration 2/2" not in said
 
 
+def test_several_runs_are_in_one_table_and_a_further_one_costs_only_its_own_episodes(
+    run, bead_config, tmp_path, capsys
+):
+    other = replace(bead_config, environment={**bead_config.environment, "guidance": "kmp"})
+    train(RunFolder(tmp_path / "other"), other)
+    told, out = [], tmp_path / "both"
+    robustness([run], episodes=2, out=out)
+    capsys.readouterr()
+    with pytest.raises(InputError, match="--out"):
+        robustness([run, tmp_path / "other"], episodes=2)
+    found = robustness([run, tmp_path / "other"], episodes=2, out=out, tell=told.append)
+    said = capsys.readouterr().err
+    assert found["policies"] == ["sKGRL", "demonstration alone"]
+    assert told == ["the runs differ in guidance"]
+    assert "demonstration 2/2" not in said
+    assert "demonstration alone 2/2" in said
+    assert [row["who"] for row in found["rows"]] == ["sKGRL", "demonstration alone", "demonstration"] * 2
+    assert robustness([run, tmp_path / "other"], episodes=2, out=out)["rows"] == found["rows"]
+    assert capsys.readouterr().err == ""
+
+
+def test_runs_of_different_tasks_or_the_same_folder_twice_are_refused(run, tmp_path):
+    with pytest.raises(InputError, match="different ones"):
+        robustness([run, run], out=tmp_path)
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    config = (copy / "config.yaml").read_text()
+    (copy / "config.yaml").write_text(config.replace("task: Bead", "task: NarrowPassage"))
+    with pytest.raises(InputError, match="of one task, not of Bead and NarrowPassage"):
+        robustness([run, copy], out=tmp_path)
+
+
 @pytest.mark.parametrize("wrong", [{"episodes": 0}, {"axes": "frictoin"}])
 def test_what_makes_no_sense_is_refused(run, wrong):
     with pytest.raises(InputError):
-        robustness(run, **wrong)
+        robustness([run], **wrong)
 
 
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp"])
