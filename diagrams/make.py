@@ -16,7 +16,7 @@ from guiderail.diagrams.disturbances import Disturbances
 from guiderail.diagrams.env import GuidedEnv, check_render_mode
 from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.registry import GUIDANCE, build_guidance, check_guidance, possible_guidance
-from guiderail.diagrams.options import Integer, Options, PrimitiveOptions, TemplateOptions, choose, validated
+from guiderail.diagrams.options import STANDARD, Integer, Options, PrimitiveOptions, TemplateOptions, choose, validated
 from guiderail.diagrams.pool import Pool
 from guiderail.diagrams.stations.disturbed import disturbed
 from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
@@ -24,7 +24,7 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of, randomizes
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
-from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
+from guiderail.diagrams.tasks.task import Choice, Task
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 

@@ -11,6 +11,9 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 
+STANDARD = "standard"
+"""The difficulty of every task unless another one is asked for."""
+
 
 class Options(BaseModel):
     """Options by name; what is not declared is refused, and so is a number that is none."""

@@ -19,26 +19,30 @@ from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 
 # Entries of the state besides the last readable status itself.
-_CLOCK, _TIME, _OFFSET, _HEARD_AT, _BELIEVED_AT, _FAULT, _FAULT_AT, _DOUBTED_AT, _KNOWN_TIME, _KNOWN_OFFSET = range(10)
+_CLOCK, _TOLD, _TIME, _OFFSET, _HEARD_AT, _FAULT, _FAULT_AT, _DOUBTED_AT, _KNOWN_TIME, _KNOWN_OFFSET = range(10)
 _SOUND = (Fault.NONE, Fault.LATE)  # what is no fault of the status itself
 # After the first three the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of
 # long ago drives an arm. So does damping by the inertia of another posture. Only a status that agrees with what was
 # known before is as good as any.
 _DOUBTFUL = (Fault.STALE, Fault.OUT_OF_ORDER, Fault.FUTURE, Fault.POSITION_JUMP)
 _FRESH = 0.5  # of the greatest age: speeds no older than that are damped without swinging
-_FORGOTTEN = (0.0, np.nan, 0.0, 0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, np.nan, 0.0)
+# A status that comes earlier than the clocks' offset says was delayed less than those that the offset is from. If that
+# were taken over at once, a single one from elsewhere would make all others late.
+_SOONER = 0.2
+_FORGOTTEN = (0.0, np.nan, np.nan, 0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, np.nan, 0.0)
 
 
 @dataclass(frozen=True)
 class _Verdict:
-    """Of the newest status: what is wrong with it, whether it is new and believed, what is believed then, (3n,), and by
-    which clock's offset [s] it was judged.
+    """Of the newest status: what is wrong with it, whether it is new and believed, what is believed then, (3n,), how
+    old that is [s], and by which clock's offset [s] it was judged.
     """
 
     fault: Fault
     is_new: bool
     is_believed: bool
     believed: np.ndarray
+    age: float
     offset: float
 
 
@@ -47,11 +51,12 @@ class StatusWatchdog(LeafSystem):
 
     `judge_status` names the fault. A fault is reported until statuses have been sound for the settling time, so that
     after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
-    when the first status comes, slowly after that, and anew after a fault or a silence: then the next status is judged
-    by the one that was at fault, if its numbers were sound. Where the clock on the wall is told, this program's own
-    delays are no robot's fault, and one that is too long is a fault of its own. After a silence or a jump, of a clock
-    or a position, nothing is believed before the settling time is over, but what agrees with the clock and the
-    positions as they were before: a single status from elsewhere blinds nobody.
+    when the first status comes, after that by the statuses that come soonest, slowly where all come later, and anew
+    after a fault or a silence: then the next status is judged by the one that was at fault, if its numbers were sound.
+    Where the clock on the wall is told, this program's own delays are no robot's fault, and one that is too long is a
+    fault of its own. After a silence or a jump, of a clock or a position, nothing is believed before the settling time
+    is over, but what agrees with the clock and the positions as they were before: a single status from elsewhere blinds
+    nobody.
 
     .. pydrake_system::
 
@@ -64,11 +69,13 @@ class StatusWatchdog(LeafSystem):
         - external_torque
         - fault
         - age
+        - is_new
 
     ``status`` is an abstract value: the newest `JointStatus`, or None. ``clock`` is (1,), the time on the wall at this
     check [s]; unconnected, each check is a period after the one before. ``state`` is (2n,), positions and velocities
     [rad, rad/s], and ``external_torque`` (n,) [Nm], both of the last sound status and zero before it. ``fault`` is
-    (1,), a code of `Fault`. ``age`` is (1,), for how long no new sound status has come [s].
+    (1,), a code of `Fault`. ``age`` is (1,), how old the last sound status is, by the soonest that came [s], and
+    ``is_new`` (1,) is 1 at the check at which it came.
     """
 
     def __init__(self, limits: StatusLimits, *, period: float):
@@ -107,7 +114,8 @@ class StatusWatchdog(LeafSystem):
         self._fault_port = self.DeclareVectorOutputPort(
             "fault", 1, self._calc_fault, prerequisites_of_calc=verdict | tickets
         )
-        self._age_port = self.DeclareVectorOutputPort("age", 1, self._calc_age, prerequisites_of_calc=verdict | tickets)
+        self._age_port = self.DeclareVectorOutputPort("age", 1, self._calc_age, prerequisites_of_calc=verdict)
+        self._is_new_port = self.DeclareVectorOutputPort("is_new", 1, self._calc_is_new, prerequisites_of_calc=verdict)
         self.DeclareInitializationDiscreteUpdateEvent(self._forget)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
 
@@ -132,16 +140,24 @@ class StatusWatchdog(LeafSystem):
         return self._fault_port
 
     def get_age_output_port(self) -> OutputPort:
-        """For how long no new sound status has come, (1,) [s]."""
+        """How old the last sound status is, (1,) [s]."""
         return self._age_port
+
+    def get_is_new_output_port(self) -> OutputPort:
+        """1 where a sound status has just come, (1,)."""
+        return self._is_new_port
 
     def _memory_of(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._memory).value()
 
     def _now(self, context: Context) -> float:
+        memory = self._memory_of(context)
         if self._clock_port.HasValue(context):
-            return float(self._clock_port.Eval(context)[0])
-        return float(self._memory_of(context)[_CLOCK])
+            told = float(self._clock_port.Eval(context)[0])
+            # What was told for the last check is no time for the status that came after it.
+            if told != memory[_TOLD]:
+                return told
+        return float(memory[_CLOCK])
 
     def _judge(self, context: Context) -> _Verdict:
         status: JointStatus | None = self._status_port.Eval(context)
@@ -155,13 +171,18 @@ class StatusWatchdog(LeafSystem):
         fault = judge_status(status, last, now, self._limits)
         if not fault and now - memory[_CLOCK] > self._limits.max_gap:
             fault = Fault.LATE
+        since = memory[_KNOWN_TIME] + memory[_KNOWN_OFFSET]
+        age = max(now - since, 0.0) if np.isfinite(since) else now
         if status is None or fault in (Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE):
-            return _Verdict(fault, False, False, believed, last.offset)
+            return _Verdict(fault, False, False, believed, age, last.offset)
         newest = status.values()
         is_overtaken = status.time <= last.time and not fault
         is_new = not is_overtaken and (status.time != last.time or not np.array_equal(newest, last.values))
         is_believed = is_new and fault in _SOUND and is_known
-        return _Verdict(fault, is_new, is_believed, newest if is_believed else believed, last.offset)
+        if is_believed:
+            believed = newest
+            age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0
+        return _Verdict(fault, is_new, is_believed, believed, age, last.offset)
 
     def _agrees(self, status: JointStatus, known: Heard, now: float) -> bool:
         """Whether a status is sound and fresh by what was known."""
@@ -183,15 +204,17 @@ class StatusWatchdog(LeafSystem):
             is_in_step = verdict.fault in _SOUND and np.isfinite(memory[_TIME])
             is_late = verdict.fault == Fault.STALE and now - memory[_HEARD_AT] <= self._limits.max_age
             if is_in_step or is_late:
-                drift = self._limits.clock_drift * self._period
-                wanted = verdict.offset + np.clip(wanted - verdict.offset, -drift, drift)
+                later = wanted - verdict.offset
+                slowly = self._limits.clock_drift * self._period
+                wanted = verdict.offset + (min(later, slowly) if later > 0.0 else _SOONER * later)
             memory[_TIME], memory[_OFFSET], memory[_HEARD_AT] = status.time, wanted, now
             discrete_state.set_value(self._last, status.values())
             if verdict.is_believed:
-                memory[_BELIEVED_AT], memory[_KNOWN_TIME], memory[_KNOWN_OFFSET] = now, status.time, wanted
+                memory[_KNOWN_TIME], memory[_KNOWN_OFFSET] = status.time, wanted
                 discrete_state.set_value(self._believed, verdict.believed)
         # Added up instead of read, so that what is remembered can be carried over to a diagram with another clock.
         memory[_CLOCK] = now + self._period
+        memory[_TOLD] = self._clock_port.Eval(context)[0] if self._clock_port.HasValue(context) else np.nan
         if verdict.fault:
             memory[_FAULT], memory[_FAULT_AT] = verdict.fault, now
         elif memory[_CLOCK] - memory[_FAULT_AT] > self._limits.settling:
@@ -213,5 +236,7 @@ class StatusWatchdog(LeafSystem):
         output.SetAtIndex(0, float(self._verdict.Eval(context).fault or self._memory_of(context)[_FAULT]))
 
     def _calc_age(self, context: Context, output: BasicVector) -> None:
-        verdict, memory = self._verdict.Eval(context), self._memory_of(context)
-        output.SetAtIndex(0, 0.0 if verdict.is_believed else max(self._now(context) - memory[_BELIEVED_AT], 0.0))
+        output.SetAtIndex(0, self._verdict.Eval(context).age)
+
+    def _calc_is_new(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(self._verdict.Eval(context).is_believed))

@@ -81,8 +81,9 @@ class TorqueGuard(LeafSystem):
 
         τ = clip(a f τ_wanted + (1 − a) τ_damping)
 
-    a is the authority, which grows from 0 to 1 in the ramp time. f is 1 for a new status, and 0 for one that is two
-    periods old: what was wanted of an arm that isn't seen would drive it ever faster. τ_damping (`damping_torque`)
+    a is the authority, which grows from 0 to 1 in the ramp time. f is 1 for a status that is a period
+    old at most, and 0 for one that is two periods old: what was wanted of an arm that isn't seen, or is seen too late,
+    would drive it ever faster. τ_damping (`damping_torque`)
     takes away all joints' speed with the decay time; where no status comes any more, what was seen last is taken away
     once, and with it what the arm was given since: a period of what was wanted is more than standstill allows.
 
@@ -104,6 +105,7 @@ class TorqueGuard(LeafSystem):
         - desired_pose
         - status_fault
         - status_age
+        - status_is_new
         - holding
         output_ports:
         - safe_torque
@@ -114,8 +116,8 @@ class TorqueGuard(LeafSystem):
         - not_following
 
     ``torque`` and ``safe_torque`` are (n,) [Nm], ``state`` (2n,), ``external_torque`` (n,) [Nm], ``wrench`` (6,), force
-    first. ``pose`` and ``desired_pose`` are (6,), of which the positions are watched. ``status_fault`` and
-    ``status_age`` are (1,), a `StatusWatchdog`'s. ``holding`` is (1,): 1 while a command watchdog holds.
+    first. ``pose`` and ``desired_pose`` are (6,), of which the positions are watched. ``status_fault``, ``status_age``
+    and ``status_is_new`` are (1,), a `StatusWatchdog`'s. ``holding`` is (1,): 1 while a command watchdog holds.
 
     ``fault`` is (1,), a code of `Fault`: why the arm is stopped, or 0. ``phase`` is (1,), a number of `Phase`, and
     ``authority`` (1,). ``sending`` is (1,): 1 while commands may go out. ``not_following`` is (1,): 1 while the arm
@@ -150,6 +152,7 @@ class TorqueGuard(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
+        self._status_is_new_port = self.DeclareVectorInputPort("status_is_new", 1)
         self._holding_port = self.DeclareVectorInputPort("holding", 1)
         self._memory = self.DeclareDiscreteState(4)
         self._given = self.DeclareDiscreteState(num_joints)  # momentum since the last status [Nms]
@@ -182,7 +185,8 @@ class TorqueGuard(LeafSystem):
             prerequisites_of_calc=found
             | memory
             | fault
-            | {self._torque_port.ticket(), self._state_port.ticket(), self._status_age_port.ticket()}
+            | {self._torque_port.ticket(), self._state_port.ticket()}
+            | {self._status_age_port.ticket(), self._status_is_new_port.ticket()}
             | {self.discrete_state_ticket(self._given)},
         )
         self._fault_port = self.DeclareVectorOutputPort(
@@ -232,6 +236,10 @@ class TorqueGuard(LeafSystem):
     def get_status_age_input_port(self) -> InputPort:
         """How old the status is, (1,) [s]."""
         return self._status_age_port
+
+    def get_status_is_new_input_port(self) -> InputPort:
+        """1 where a status has just come, (1,)."""
+        return self._status_is_new_port
 
     def get_holding_input_port(self) -> InputPort:
         """1 while a command watchdog holds, (1,)."""
@@ -368,7 +376,7 @@ class TorqueGuard(LeafSystem):
 
     def _given_until_now(self, context: Context) -> np.ndarray:
         """What the arm was given since the last status, (n,) [Nms]: nothing where that one is new."""
-        is_new = self._status_age_port.Eval(context)[0] == 0.0
+        is_new = self._status_is_new_port.Eval(context)[0] > 0.0
         return np.zeros(self._num_joints) if is_new else context.get_discrete_state(self._given).value().copy()
 
     def _damping_torque(self, context: Context, damped: float) -> np.ndarray:

@@ -734,6 +734,13 @@ def run(
     scenario: Scenario = None,
     yes: Yes = False,
     out: Annotated[Path | None, _opt("The folder of what is recorded.  [default: hardware in the run]")] = None,
+    episodes: Annotated[
+        int | None, _opt("So many episodes as in training, one after the other, instead: how often does it succeed?")
+    ] = None,
+    policy: Annotated[
+        str | None, _opt("Of episodes: who acts instead of the run's policy, such as rule, zero or constant.")
+    ] = None,
+    as_json: Json = False,
 ) -> None:
     """Run a policy on a robot.
 
@@ -746,6 +753,18 @@ def run(
 
     there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
     other = Other.in_scenario(scenario, **there)
+    if episodes is not None:
+        from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
+
+        others = _beside(run, {}, "none" if policy is None else policy)
+        acting = None if policy is None else others[policy]
+        found = evaluate_on_robot(
+            run, other, episodes, station=station, policy=policy or "", acting=acting, yes=yes, out=out, say=_say
+        )
+        _print(found, as_json)
+        return
+    if policy is not None:
+        raise InputError("another policy than the run's acts in episodes alone: give --episodes too")
     raise typer.Exit(run_policy(run, other, station=station, yes=yes, out=out, say=_tell))
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from guiderail.diagrams.tasks.task import STANDARD
+from guiderail.diagrams.options import STANDARD
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.units import MM
 from guiderail.tools.learning.presets import PRESETS, Preset, decision_discount

@@ -109,6 +109,8 @@ class Deputy:
             return  # another one overtook it
         if self.duty == Duty.WATCHING and (status.time < self._now or not np.isfinite(self._now)):
             self._commanded_at = status.time  # the robot's clock went back, or only began
+            if self._now - status.time > self._silence and self._has_torque:
+                self.duty, self._since = Duty.DAMPING, status.time  # a torque may be on its way that is of another time
         self._now = status.time
         self._act(status)
         self._words += 1

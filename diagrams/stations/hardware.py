@@ -13,7 +13,7 @@ from pydrake.manipulation import BuildIiwaControl, IiwaDriver
 from pydrake.multibody.parsing import ModelDirective
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, SerializerInterface
 from pydrake.systems.primitives import MatrixGain
@@ -277,6 +277,7 @@ class HardwareStation(Station):
             (words.get_output_port(), deputy.get_word_input_port()),
             (deputy.get_fault_output_port(), guard.get_status_fault_input_port()),
             (status.get_age_output_port(), guard.get_status_age_input_port()),
+            (status.get_is_new_output_port(), guard.get_status_is_new_input_port()),
             (watchdog.get_holding_output_port(), guard.get_holding_input_port()),
             (guard.get_safe_torque_output_port(), publisher.get_torque_input_port()),
             (guard.get_sending_output_port(), publisher.get_sending_input_port()),
@@ -454,6 +455,17 @@ class SimulatedIiwa(Diagram):
             self.known.plant,
         )
         builder.BuildInto(self)
+
+    def simulator(self) -> Simulator:
+        """Runs it, not initialized.
+
+        All that is continuous in it is the driver's low-pass filter. Each time at which an integrator asks how that
+        changes, the contact is solved anew, which costs more than all else: once in a step is enough.
+        """
+        simulator = Simulator(self)
+        ResetIntegratorFromFlags(simulator, "explicit_euler", self.plant.time_step())
+        simulator.get_mutable_integrator().set_fixed_step_mode(True)
+        return simulator
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""

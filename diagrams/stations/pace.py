@@ -6,13 +6,15 @@ import os
 import struct
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 import numpy as np
-from pydrake.lcm import DrakeLcm, DrakeLcmInterface, Subscriber
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
+from guiderail.diagrams.stations.deputy import word_channel
 from guiderail.diagrams.stations.driver import MICROSECOND, STATUS_PERIOD, Driver
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import MISSED
@@ -203,15 +205,19 @@ class StepByStep:
         self._lcm.Publish(self._answers, self._taken)
 
 
-def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, patience: float) -> float:
+def serve(
+    simulator: Simulator, within: DrakeLcm, lcm: DrakeLcm, driver: Driver, seconds: float, patience: float
+) -> float:
     """Runs a simulated arm for another process: one step, then it waits until its status was answered.
 
     So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
-    has taken this very status in; where no word ever came, it is a command.
+    has taken this very status in; where no word ever came, it is a command. The arm has a bus of its own, so that
+    nothing reaches it in the midst of a step: what was sent by then counts for the next one, whoever was faster.
 
     Args:
         simulator: of the arm, initialized.
-        lcm: its bus.
+        within: the arm's own bus, and its deputy's, in memory.
+        lcm: the bus that it has with the other process.
         driver: that it has.
         seconds: of simulated time to run.
         patience: how long to wait for each answer, and ten times as long for the first [s of wall clock].
@@ -219,20 +225,35 @@ def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, p
     Returns:
         The simulated time at which it ended: less than `seconds` if answers stopped.
     """
-    commands = Subscriber(lcm, driver.command_channel, driver.command_type)
-    words = NewMessages(lcm, driver.status_channel + TAKEN)
+    words, commands = NewMessages(lcm, driver.status_channel + TAKEN), list[bytes]()
+    lcm.Subscribe(driver.command_channel, commands.append)
+    # What the deputy says of a status goes out before it, so that who waits for the status has both.
+    said = dict.fromkeys((word_channel(driver.command_channel), driver.status_channel), b"")
+    for channel in said:
+        within.Subscribe(channel, partial(said.__setitem__, channel))
     steps, repeats = 0, max(1, round(patience / REPEAT))
 
     def is_answered() -> bool:
         if not words.count:
-            return commands.count > commanded
+            return bool(commands)
         if len(words.last) != HEAD:
             return False
-        said = struct.unpack(HEAD_FORMAT, words.last)[1]
-        return abs(said * MICROSECOND - steps * driver.period) < 0.5 * driver.period
+        taken = struct.unpack(HEAD_FORMAT, words.last)[1]
+        return abs(taken * MICROSECOND - steps * driver.period) < 0.5 * driver.period
 
+    def settle() -> None:
+        while within.HandleSubscriptions(0):
+            pass
+
+    def say() -> None:
+        for channel, message in said.items():
+            if message:
+                lcm.Publish(channel, message)
+
+    simulator.get_system().ForcedPublish(simulator.get_context())
+    settle()
+    say()
     while steps * driver.period < seconds:
-        commanded = commands.count
         for _ in range(repeats if steps else 10 * repeats):
             # A command comes before the word that belongs to it.
             while lcm.HandleSubscriptions(round(1000 * REPEAT)) and not is_answered():
@@ -240,11 +261,17 @@ def serve(simulator: Simulator, lcm: DrakeLcm, driver: Driver, seconds: float, p
             if is_answered():
                 break
             # A datagram may be lost, and before its first answer the other side may not have been listening.
-            simulator.get_system().ForcedPublish(simulator.get_context())
+            say()
         else:
             break
+        for message in commands:
+            within.Publish(driver.command_channel, message)
+        commands.clear()
+        settle()
         steps += 1
         simulator.AdvanceTo(steps * driver.period)
+        settle()
+        say()
     return steps * driver.period
 
 

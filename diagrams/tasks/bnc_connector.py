@@ -13,6 +13,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import STANDARD
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.bnc_workcell import HALF_TURN, BncWorkcell
 from guiderail.diagrams.stations.station import Station
@@ -30,7 +31,7 @@ from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring
 from guiderail.diagrams.tasks.own_demonstrations import reference_of_file
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import STANDARD, Choice, Threshold
+from guiderail.diagrams.tasks.task import Choice, Threshold
 from guiderail.models.demonstrations import bnc_connector as inserting
 from guiderail.models.demonstrations import bnc_search as searching
 from guiderail.models.insertion import LEAST_FORCE, REPEATED, RHO

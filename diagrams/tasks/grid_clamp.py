@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.cameras import Camera, look_from_front
 from guiderail.diagrams.guidance.known import Approach, Template
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import STANDARD
 from guiderail.diagrams.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
@@ -20,7 +21,7 @@ from guiderail.diagrams.tasks.grid_clamp_rewards import REWARDS, reward_terms
 from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import STANDARD, Choice, Threshold
+from guiderail.diagrams.tasks.task import Choice, Threshold
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.skills import Skill, load_skill
 from guiderail.models.units import MM

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from guiderail.diagrams.cameras import Camera
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import STANDARD
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import Station
@@ -21,7 +22,7 @@ from guiderail.diagrams.tasks.narrow_passage_options import HARD, NarrowPassageO
 from guiderail.diagrams.tasks.narrow_passage_rewards import reward_terms
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import STANDARD, Choice, Task
+from guiderail.diagrams.tasks.task import Choice, Task
 from guiderail.models.demonstrations import narrow_passage as demonstrations
 from guiderail.models.errors import InputError
 from guiderail.models.keep_out import KeepOut

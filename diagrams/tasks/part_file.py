@@ -149,7 +149,7 @@ class Recommended(Options):
     environment: dict[str, Any] = Field(
         {
             "uncertainty": "disc",
-            "offset_range": (1.0 * MM, 1.5 * MM),
+            "offset_range": (1.5 * MM, 2.0 * MM),  # as far off as a straight insertion must fail, and as bounds allow
             "observation": "lever",
             "reward": "aligned",
             "hold": 5,

@@ -13,6 +13,7 @@ from guiderail.diagrams.cameras import Camera, look_at
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.known import Template
 from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.options import STANDARD
 from guiderail.diagrams.scene import Scene, in_frame, viewpoint
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, vessel_or_refuse
 from guiderail.diagrams.stations.station import Station
@@ -24,7 +25,7 @@ from guiderail.diagrams.tasks.pouring_options import HARD, MAX_MUG_ERROR, MAX_MU
 from guiderail.diagrams.tasks.pouring_rewards import reward_terms
 from guiderail.diagrams.tasks.pouring_template import SPARSE_INPUT_SPEED, frames_of, make_aimed_skill, make_skill
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import STANDARD, Choice, Task, Threshold
+from guiderail.diagrams.tasks.task import Choice, Task, Threshold
 from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import transform_to_pose
 from guiderail.systems.episode_monitor import Condition

@@ -23,8 +23,6 @@ from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
 
-STANDARD = "standard"
-
 
 @dataclass(frozen=True)
 class Threshold:
@@ -79,7 +77,7 @@ class Task(ABC):
     rewards: ClassVar[tuple[str, ...]] = ("sparse",)
     observations: ClassVar[tuple[str, ...]] = ("state",)
     defaults: ClassVar[Mapping[str, Any]] = {}
-    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}}
+    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {declared.STANDARD: {}}
     learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "robust"}
     num_steps: int
     clip: ClassVar[float] = 3.0

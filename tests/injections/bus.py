@@ -75,7 +75,7 @@ class Bus:
         self.near_robot.Subscribe(WORDS, self._words.append)
         self.near_robot.Subscribe(IIWA_DRIVER.command_channel, self._arrive)
         self.near_station.Subscribe(IIWA_DRIVER.command_channel, self._commands.append)
-        self.robot_simulator = Simulator(self.robot)
+        self.robot_simulator = self.robot.simulator()
         self._pristine = self.robot.CreateDefaultContext()
         self.robot_time = 0  # steps since it was started
         self.start_robot()

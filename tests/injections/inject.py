@@ -1,7 +1,7 @@
 """Lets everything that can happen on a bus happen to a moving arm, and checks the robot's side: `make injections`.
 
 No part of the test suite, which has one of each kind. In turn and not by the wall's clock, so that the same seed gives
-the same injections and the same torques, bit for bit.
+the same injections; a round has one of each kind, and `--first` goes on with a later round than the first.
 """
 
 import argparse
@@ -22,19 +22,21 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--injections", type=int, default=500, help="how many at least")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--first", type=int, default=0, help="round to begin with")
     arguments = parser.parse_args()
-    rng, bus = np.random.default_rng(arguments.seed), Bus()
+    bus = Bus()
     found: dict[str, list[tuple[Injection, Seen]]] = defaultdict(list)
-    started, total = time.monotonic(), 0
+    started, total, number = time.monotonic(), 0, arguments.first
     while total < arguments.injections:
-        for injection in all_kinds(rng):
+        wrongs = 0
+        for injection in all_kinds(np.random.default_rng([arguments.seed, number])):
             seen = injection.inject(bus)
             found[injection.kind].append((injection, seen))
-            total += 1
-            if total % 100 == 0:
-                table(found)
+            total, wrongs = total + 1, wrongs + bool(seen.wrong)
             for wrong in seen.wrong:
                 print(f"WRONG  {injection.kind}, {injection.words}: {wrong}", flush=True)
+        print(f"round {number}: {wrongs} wrong; {total} injections until now", flush=True)
+        number += 1
     wrong = table(found)
     print(f"in {time.monotonic() - started:.0f} s")
     return 1 if wrong else 0

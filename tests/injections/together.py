@@ -1,7 +1,5 @@
 """A simulated robot, its deputy and whoever drives it, stepped in turn in one process."""
 
-from pydrake.systems.analysis import Simulator
-
 from guiderail.diagrams.stations.deputy import Deputy
 from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa, safety_limits
 
@@ -14,7 +12,7 @@ class Together:
         plant = self.robot.known.plant
         if deputy:
             self.deputy = Deputy(lcm, IIWA_DRIVER, plant, safety_limits(plant, IIWA_DRIVER))
-        self.simulator = Simulator(self.robot)
+        self.simulator = self.robot.simulator()
         self.robot.set_pose(self.simulator.get_mutable_context(), start)
         self.simulator.Initialize()
         self.step, self.happens, self.is_silent = 0, {}, False

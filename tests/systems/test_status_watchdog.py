@@ -212,7 +212,44 @@ def test_by_the_clock_on_the_wall_a_status_that_stops_is_stale_however_few_check
     watched.check(last)
     gap = 0.7 * LIMITS.max_gap
     assert [watched.check(last, gap) for _ in range(2)] == [Fault.NONE, Fault.STALE]
-    assert watched.age == pytest.approx(2.0 * gap)
+    assert watched.age == pytest.approx(2.0 * gap + PERIOD)  # at the next check
+
+
+def test_what_came_after_a_check_is_not_judged_by_what_the_clock_showed_then():
+    watched = WithClock().settle()
+    early = replace(watched.sound(), time=watched.sound().time + LIMITS.max_lead - 0.5 * PERIOD)
+    watched.port.GetMutableData().set_value(early)
+    assert watched.fault == Fault.NONE
+    assert watched.check(early) == Fault.NONE
+
+
+def test_what_comes_soonest_tells_how_late_all_others_are():
+    """Statuses that were late when the clocks were synchronized don't make later ones pass for punctual."""
+    watched = Watched().settle()
+
+    def delayed(by):
+        return replace(watched.sound(), time=watched.sound().time - by * LIMITS.max_age)
+
+    last = watched.sound()
+    while watched.check(last) != Fault.STALE:
+        pass
+    for _ in range(2 * round(LIMITS.settling / PERIOD)):
+        watched.check(delayed(1.2))
+    assert watched.fault == Fault.NONE
+    for _ in range(20):
+        assert watched.check(delayed(0.4)) == Fault.NONE
+    assert {watched.check(delayed(1.2)) for _ in range(10)} == {Fault.NONE}
+    watched.port.GetMutableData().set_value(delayed(1.2))
+    assert watched.age == pytest.approx(0.8 * LIMITS.max_age, rel=0.05)
+    assert Fault.STALE in {watched.check(delayed(1.6)) for _ in range(10)}
+
+
+def test_a_single_status_that_is_a_little_early_makes_no_other_late():
+    watched = Watched().settle()
+    sound, lead = watched.sound(), 0.9 * LIMITS.max_lead
+    watched.check(replace(sound, time=sound.time + lead, positions=sound.positions + 0.1 * lead))
+    for _ in range(50):
+        assert watched.check(watched.sound()) == Fault.NONE
 
 
 def test_the_limits_follow_from_the_rate():

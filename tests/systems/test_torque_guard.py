@@ -41,6 +41,7 @@ class Guarded:
             "desired_pose": np.zeros(6),
             "status_fault": [0.0],
             "status_age": [0.0],
+            "status_is_new": [1.0],
             "holding": [0.0],
         }
         self.ports = {name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in ok.items()}
@@ -176,14 +177,14 @@ def test_damping_takes_away_exactly_what_the_arm_had_and_was_given_since(plant, 
     given, taken = np.zeros(n), np.zeros(n)
     for age in range(before):
         if age > 0:
-            guarded.set(status_age=[age * PERIOD])
+            guarded.set(status_age=[age * PERIOD], status_is_new=[0.0])
         seen = np.clip(2.0 - age, 0.0, 1.0)
         np.testing.assert_allclose(guarded["safe_torque"], seen * WANTED)
         given += PERIOD * seen * (WANTED + load)
         guarded.go(PERIOD)
     guarded.set(status_fault=[Fault.STALE])
     for step in range(round(LIMITS.damping_time / PERIOD)):
-        guarded.set(status_age=[(before + step) * PERIOD])
+        guarded.set(status_age=[(before + step) * PERIOD], status_is_new=[float(before + step == 0)])
         taken += PERIOD * guarded["safe_torque"]
         guarded.go(PERIOD)
     momentum = -guarded.damping() * PERIOD / (1.0 - np.exp(-PERIOD / LIMITS.decay_time))

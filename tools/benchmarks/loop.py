@@ -99,7 +99,7 @@ def _parts() -> list[Row]:
 def _stepped(lcm: DrakeLcm, station: HardwareStation, number: int) -> np.ndarray:
     """How long a station needs for each status of a robot in the same process."""
     robot = SimulatedIiwa(BncWorkcell(), lcm)
-    simulator, other = Simulator(station), Simulator(robot)
+    simulator, other = Simulator(station), robot.simulator()
     robot.set_pose(other.get_mutable_context(), START)
     other.Initialize()
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +14,7 @@ from guiderail.diagrams.stations.pace import Pace, RealTime, StepByStep
 from guiderail.models.errors import InputError
 from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.models.units import MM
+from guiderail.tools.operate.company import companion
 from guiderail.tools.operate.scenario import load_scenario
 
 PATIENCE = 20.0  # [s] of wall clock that a rehearsal in step waits for a status
@@ -93,20 +92,13 @@ class Other:
         }
 
     @contextmanager
-    def standing_in(self, task: str, url: str, offset: Sequence[float] | None = None) -> Iterator[None]:
-        """A simulated robot in front of a task's fixture, which may be off by (x, y) [m]; nobody, of a real robot."""
+    def standing_in(self, task: str, url: str) -> Iterator[None]:
+        """A simulated robot in front of a task's fixture; nobody, of a real robot."""
         if not self.rehearse:
             yield
             return
         arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300", "--seconds", str(LONGEST)]
         arguments += [] if self.lockstep else ["--rate", str(self.rate)]
-        arguments += [] if offset is None else ["--offset", ",".join(repr(float(value)) for value in offset)]
         arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]
-        call = f"from guiderail.tools.command import main; main({arguments!r})"
-        # Ctrl-C is meant for us: a robot that ends can't come to rest.
-        process = subprocess.Popen([sys.executable, "-c", call], start_new_session=True)
-        try:
+        with companion(f"from guiderail.tools.command import main; main({arguments!r})"):
             yield
-        finally:
-            process.terminate()
-            process.wait()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -65,6 +65,7 @@ class RobotEnv(GuidedEnv):
         keys: Keys,
         go_on: Callable[[str], None],
         say: Say,
+        places: Callable[[np.random.Generator, Mapping[str, Any]], dict[str, Any]] | None = None,
     ):
         """
         Args:
@@ -77,15 +78,18 @@ class RobotEnv(GuidedEnv):
             keys: of a person.
             go_on: called with why the arm is at rest; returns when it may move again, or raises.
             say: what a person is told.
+            places: called with random numbers and a reset's options when the arm is at the start: where the parts
+                are is drawn anew, as in a simulation, and returned.
         """
         super().__init__(task, hold=hold)
+        self._places = places
         self._skills, self._elsewhere, self._start, self._pace = station, elsewhere, start, pace
         self._keys, self._go_on, self._say = keys, go_on, say
         self._steps = round(task.control_period / station.period)
-        self._acting = elsewhere
+        self._acting, self._is_in_step = elsewhere, False
         self._moving = self._initialized()
         # A deputy may need a status or two to be heard; nothing is sent so soon.
-        pace.advance(self._moving, elsewhere, LISTENING)
+        self._pass(LISTENING)
         self._way_back: list[np.ndarray] = []
         self.fault = Fault.NONE
 
@@ -123,7 +127,7 @@ class RobotEnv(GuidedEnv):
             self.simulator = simulator
         else:
             self._moving = simulator
-        self._acting = station
+        self._acting, self._is_in_step = station, False
 
     def _elsewhere_acts(self) -> None:
         if self._acting is self._skills:
@@ -137,17 +141,18 @@ class RobotEnv(GuidedEnv):
         """Moves the arm to the start.
 
         Raises:
-            InputError: if it doesn't get there, or options are given: nothing of a robot can be drawn.
+            InputError: if it doesn't get there, or options are given where nothing can be drawn.
         """
-        if options:
+        if options and self._places is None:
             raise InputError("a reset of a robot takes no options: nothing of it can be drawn")
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
         self._return()
+        drawn = {} if self._places is None else self._places(self.np_random, options or {})
         simulator = Simulator(self.task.diagram)
         self._action_value = self.action_port.FixValue(simulator.get_mutable_context(), self._neutral)
         self._hand_over(simulator, self._skills)
-        self.fault, self.drawn = Fault.NONE, {}
+        self.fault, self.drawn = Fault.NONE, drawn
         return self._begun()
 
     def step(self, action):
@@ -174,12 +179,23 @@ class RobotEnv(GuidedEnv):
         self._try(lambda: self._hold(1))
 
     def rest(self) -> None:
-        """Brings the arm to rest because somebody asks for it."""
+        """Brings the arm to rest because somebody asks for it, or because something was raised in whatever it did."""
+        if self._is_in_step:
+            # Drake goes on with no simulator that was left in the midst of a step.
+            here, simulator = self.pose, Simulator(self._elsewhere)
+            self._elsewhere.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), here)
+            self._hand_over(simulator, self._elsewhere)
         self._acting.stop(self._root)
         self._come_to_rest()
 
+    def _pass(self, steps: int) -> None:
+        """So many statuses."""
+        self._is_in_step = True
+        self._pace.advance(self.simulator if self._acting is self._skills else self._moving, self._acting, steps)
+        self._is_in_step = False
+
     def _advance(self) -> None:
-        self._pace.advance(self.simulator if self._acting is self._skills else self._moving, self._acting, self._steps)
+        self._pass(self._steps)
         mine = self._mine
         phase, fault = (int(self._acting.GetOutputPort(name).Eval(mine)[0]) for name in ("phase", "fault"))
         if phase in (Phase.DAMPING, Phase.OFF):
@@ -258,9 +274,7 @@ class RobotEnv(GuidedEnv):
 
     def _come_to_rest(self) -> None:
         """Hears statuses until the arm has no torque."""
-        simulator = self.simulator if self._acting is self._skills else self._moving
-        seconds = self._acting.limits.damping_time + 0.1
-        self._pace.advance(simulator, self._acting, round(seconds / self._acting.period))
+        self._pass(round((self._acting.limits.damping_time + 0.1) / self._acting.period))
 
     def _resume(self) -> None:
         """Asks, and goes on, if the arm is at rest."""
@@ -271,13 +285,12 @@ class RobotEnv(GuidedEnv):
         self._keys.take_back()
         if self._acting is self._elsewhere:
             self._elsewhere.get_desired_pose_input_port().FixValue(self._moving.get_mutable_context(), self.pose)
-        simulator = self.simulator if self._acting is self._skills else self._moving
         for _ in range(round(PATIENCE / self.task.control_period)):
             try:
                 self._acting.resume(self._root)
             except InputError as error:
                 words = str(error)
-                self._pace.advance(simulator, self._acting, self._steps)
+                self._pass(self._steps)
             else:
                 break
         else:

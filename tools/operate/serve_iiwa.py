@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from pydrake.lcm import DrakeLcm
-from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.make import resolve
 from guiderail.diagrams.options import validated
@@ -14,6 +13,7 @@ from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa, saf
 from guiderail.diagrams.stations.pace import hurry, serve, serve_in_real_time
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.errors import InputError
+from guiderail.tools.operate.places import put
 from guiderail.tools.operate.scenario import load_scenario
 
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # the plug above the jack
@@ -57,13 +57,13 @@ def serve_iiwa(
     start = START if task == TASK else declared.start(np.random.default_rng(0)) + ASIDE
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm, driver = DrakeLcm(url), IIWA_DRIVER
+    # In real time, the deputy has ears of its own: beside a real driver it is another process.
+    within, ears = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, DrakeLcm(url))
     robot = SimulatedIiwa(
-        declared.world(), lcm, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
+        declared.world(), within, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
     )
-    simulator = Simulator(robot)
+    simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
-    # The deputy has ears of its own: beside a real driver it is another process.
-    ears = lcm if rate is None else DrakeLcm(url)
     Deputy(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
     if offset is not None:
         if len(offset) != 2:
@@ -72,9 +72,10 @@ def serve_iiwa(
             np.random.default_rng(0), validated(declared.Reset, {"offset": tuple(offset)}, "a robot")
         )
         declared.move(robot, simulator.get_mutable_context(), fixture, workpiece)
+    put(lcm if rate is None else ears, driver, declared, robot, simulator.get_mutable_context())
     simulator.Initialize()
     if rate is None:
-        return serve(simulator, lcm, driver, seconds, patience) >= seconds
+        return serve(simulator, within, lcm, driver, seconds, patience) >= seconds
     hurry()
 
     def attend() -> None:

@@ -52,6 +52,7 @@ SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGR
 SLOWLY = 0.25  # times real time
 SNAPSHOT = 1.0  # [s] that one undo takes back
 FORCE_LENGTH = 2.0 * MM  # of the arrow, for each newton
+FORCE_EVERY = 5  # control steps: a page that is sent more than it draws falls behind
 BAR = 30.0  # [N] a full bar
 LEAST_SAMPLES = 10
 REST = 0.1  # [s] for which the command may stay where it is in a demonstration
@@ -155,7 +156,8 @@ class Teaching:
         self.taken.commands.append(self.command.copy())
         self.steps += 1
         self.simulator.AdvanceTo(self.steps * self._period)
-        self._show_force()
+        if self.steps % FORCE_EVERY == 0:
+            self._show_force()
 
     def undo(self) -> None:
         """Takes the last second back: robot, parts, command and sliders."""

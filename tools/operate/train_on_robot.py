@@ -8,33 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import numpy as np
 import pandas as pd
-import torch
-from threadpoolctl import threadpool_limits
 
-from guiderail.diagrams.make import make_guidance, make_station, resolve
-from guiderail.diagrams.options import validated
-from guiderail.diagrams.stations.hardware import HardwareStation
-from guiderail.diagrams.stations.pace import hurry
-from guiderail.diagrams.tasks.assemble import assemble
-from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.configure import SUMMARY, configure, with_defaults
 from guiderail.tools.learning.learner import LEARNERS, arguments_of
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.student import Spaces, Student
-from guiderail.tools.operate.checks import confirm, read_out
-from guiderail.tools.operate.keys import Keys, listening, no_pauses
+from guiderail.tools.operate.at_robot import Say, at_robot
+from guiderail.tools.operate.keys import Keys, no_pauses
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
 from guiderail.tools.rollouts.ledger import ledger_file, table
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.progress import EpisodeProgress
 from guiderail.tools.rollouts.rollout import rollout
-
-Say = Callable[[str], None]
 
 UNSOUND = ("stopped", "did_not_hold", "simulation_failure")  # terminations of episodes that nobody should learn from
 NICENESS = 5  # of the gradient steps, beside whoever has to be in time
@@ -70,63 +59,19 @@ def train_on_robot(
     folder.refuse_existing()
     environment = {**environment, **other.environment(str(environment["station"]))}
     config = configure(task, environment, **with_defaults(task, {**given, "settings": settings}))
-    resolved = resolve(config.task, config.environment)
-    declared = resolved.task
-    if not isinstance(declared, InsertionTask) or declared.seen_by_robot() is None:
-        raise InputError(f"nobody wrote down how a robot tells that {config.task} is done: learn it in a simulation")
-    if declared.choice.reward in declared.simulated_rewards:
-        raise InputError(f"the reward {declared.choice.reward!r} is of what a simulation alone knows: choose another")
     if config.learner.demonstration_episodes:
         raise InputError("nobody demonstrates on a robot: leave the setting demonstration_episodes out")
-    threadpool_limits(1)
-    torch.set_num_threads(1)
-    station = make_station(resolved)
-    assert isinstance(station, HardwareStation)
-    diagram = assemble(declared, station, make_guidance(resolved, station))
-    start = declared.start(np.random.default_rng(0))
-    offset = _hidden_offset(declared, config.seed) if other.rehearse else None
-    with folder.locked(), other.standing_in(config.task, station.lcm_url, offset), listening() as keys:
-        pace, clock = other.paces(station)
-        say(f"waiting for {other.robot} on {station.lcm_url or 'LCM'}, channel {station.driver.status_channel}")
-
-        def go_on(words: str) -> None:
-            say(f"the arm is at rest: {words}")
-            if not (yes and other.rehearse):
-                confirm("Shall it go on from where it is?")
-
-        env = RobotEnv(
-            diagram,
-            station,
-            station.alike(declared.world()),
-            start,
-            pace,
-            hold=config.hold,
-            keys=keys,
-            go_on=go_on,
-            say=say,
-        )
-        read_out(env.checks(), say, is_confirmed=yes)
-        if not other.lockstep and not hurry():
-            say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
-        say("Enter or Ctrl-C stops the arm, p and Enter pauses it at the end of an episode")
+    with folder.locked(), at_robot(config, other, yes=yes, say=say) as robot:
         folder.write_config(config)
         with no_pauses(), EpisodeProgress(config.episodes, name=config.task) as progress:
-            rows = _learn(folder, config, env, keys, waits=other.lockstep, report=progress.update)
-        write_atomically(
-            folder.path / "hardware.json",
-            pd.Series(dict(other.timing(station, clock))).to_json(indent=2).encode() + b"\n",
-        )
+            rows = _learn(folder, config, robot.env, robot.keys, waits=other.lockstep, report=progress.update)
+        timing = pd.Series(dict(robot.timing()), dtype=object)
+        write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY), "not_learned_from": _unsound(rows)}
 
 
 def _unsound(rows: list[dict[str, Any]]) -> int:
     return sum(not row["learned_from"] for row in rows)
-
-
-def _hidden_offset(task: InsertionTask, seed: int) -> tuple[float, float]:
-    """Where a simulated robot's fixture is: what the first episode of a run with this seed would draw."""
-    fixture, _ = task.offsets.draw(np.random.default_rng(seed), validated(task.Reset, {}, "a robot"))
-    return float(fixture[0]), float(fixture[1])
 
 
 def _learn(

@@ -13,7 +13,7 @@ from guiderail.tools.report.statistics import wilson_of_each
 from guiderail.tools.studies.declaration import Study, Sweep
 from guiderail.tools.viewing.style import legend, new_figure, save_figure
 
-STYLES = ("-", "--", ":")  # of the first ten methods, the next ten, …
+STYLES = ("-", "--", "-.", ":")  # in turn, as those who always succeed, or never, lie on each other
 BREAKS = 0.9  # success below which a method counts as broken
 NEVER, AT_ONCE = "not within the sweep", "from the easiest on"
 
@@ -38,7 +38,7 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
                 continue
             x = np.array(values)
             rate, low, high = np.array(points, dtype=float).T
-            style = STYLES[index // 10 % len(STYLES)]
+            style = STYLES[index % len(STYLES)]
             (line,) = axis.plot(
                 x, rate, f"o{style}", color=f"C{index % 10}", markersize=3, label=name.replace("_", " ")
             )

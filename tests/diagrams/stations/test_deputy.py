@@ -123,6 +123,23 @@ def test_what_is_no_sound_message_neither_moves_it_nor_ends_it(known):
     assert bus.deputy.duty == Duty.DAMPING
 
 
+def test_a_robot_that_was_started_anew_is_brought_to_rest_at_once(known):
+    """What was on its way to the one before arrives at this one; statuses that were merely overtaken start nothing."""
+    bus = Bus(known)
+    bus.status(steps=5)
+    bus.command([1.0] * 7)
+    bus.time -= 3.5 * PERIOD
+    bus.status()
+    assert bus.deputy.duty == Duty.WATCHING
+    bus.heard.clear()
+    bus.time = 0.0
+    bus.status(velocities=0.1 * MOVING)
+    assert bus.deputy.duty == Duty.DAMPING
+    M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
+    share = -np.expm1(-PERIOD / bus.limits.decay_time)
+    np.testing.assert_allclose(bus.heard[-1], -(M @ (0.1 * MOVING)) * share / PERIOD, rtol=1e-6)
+
+
 def test_a_robots_clock_that_goes_back_does_not_make_it_wait(known):
     bus = Bus(known)
     bus.status()

@@ -44,7 +44,7 @@ class OneProcess:
         self.robot = SimulatedIiwa(WORKCELL, lcm)
         limits = replace(safety_limits(self.robot.known.plant, IIWA_DRIVER), damping_time=0.2, ramp_time=0.1)
         self.station = HardwareStation(WORKCELL, lcm, robot_timeout=1.0, limits=limits)
-        self.robot_simulator, self.simulator = Simulator(self.robot), Simulator(self.station)
+        self.robot_simulator, self.simulator = self.robot.simulator(), Simulator(self.station)
         self.robot.set_pose(self.robot_simulator.get_mutable_context(), START)
         self.context = self.simulator.get_mutable_context()
         self.desired = self.station.get_desired_pose_input_port().FixValue(self.context, START)

@@ -10,6 +10,7 @@ STATUS, COMMAND = "on_status", "on_command"
 INJECTIONS = [
     faults.lost(STATUS, 0.015),
     faults.lost(STATUS, 0.06),
+    faults.delayed(STATUS, 0.03),
     faults.delayed(STATUS, 0.05),
     faults.duplicated(STATUS, 0.02),
     faults.reordered(STATUS, 3),
@@ -25,6 +26,7 @@ INJECTIONS = [
     faults.controller_held_up(0.015),
     faults.controller_held_up(0.3),
     faults.controller_killed(0.06),
+    faults.robot_killed(0.05),
     faults.robot_killed(0.1),
     faults.deputy_killed(0.1),
 ]

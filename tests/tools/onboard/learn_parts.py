@@ -24,6 +24,7 @@ from oracles.parts import PARTS
 COMMAND = [sys.executable, "-c", "from guiderail.tools.command import main; main()"]
 COLUMNS = (
     "part", "real-time factor", "deepest [mm]", "allowed [mm]", "aligned", "1.5 mm off", "demonstrations alone",
+    "white",
     "held out", "converged after", "episodes", "minutes",
 )  # fmt: skip
 
@@ -75,7 +76,7 @@ def learned(name: str, out: Path, log: Path, episodes: int, seed: int) -> dict:
 
 def judged(name: str, out: Path, log: Path, episodes: int) -> dict:
     """Held-out places that training never drew."""
-    said = guiderail(log, "evaluate", out / "runs" / name, "--episodes", episodes, "--beside", "none", "--json")
+    said = guiderail(log, "evaluate", out / "runs" / name, "--episodes", episodes, "--beside", "white", "--json")
     return json.loads(said.strip().splitlines()[-1])
 
 
@@ -88,16 +89,16 @@ def all_of(name: str, out: Path, episodes: int, seed: int, held_out: int) -> lis
     row: list[object] = [name, measured["real_time_factor"], deepest, round(clearance / 2, 4), measured["inserted"]]
     row.append("/".join("in" if one else "stopped" for one in measured["inserted_1.5_mm_off"]))
     if not episodes:
-        return [*row, *[""] * 4, f"{measured['minutes']:.1f}"]
+        return [*row, *[""] * 5, f"{measured['minutes']:.1f}"]
     trained = finished(kept / f"{name}-learned.json", lambda: learned(name, out, log, episodes, seed))
     found = finished(kept / f"{name}-judged.json", lambda: judged(name, out, log, held_out))
     minutes = measured["minutes"] + trained["training_minutes"] + found["minutes"]
-    alone, success = (
-        f"{found[which] * found['episodes']:.0f}" for which in ("demonstration_success_rate", "success_rate")
-    )
+    whose = ("demonstration_success_rate", "white_success_rate", "success_rate")
+    alone, white, success = (f"{found[which] * found['episodes']:.0f}" for which in whose)
     return [
         *row,
         alone,
+        white,
         f"{success} of {found['episodes']}",
         found["converged_after"],
         trained["episodes"],

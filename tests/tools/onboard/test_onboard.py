@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import yaml
 
+from guiderail.diagrams.options import validated
+from guiderail.diagrams.tasks.part_file import PartTaskFile
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
@@ -57,6 +59,25 @@ def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
     found = json.loads(capsys.readouterr().out)
     assert found["worst_violation"] <= 1e-9
     assert (tmp_path / "run/replay.html").is_file()
+
+
+def test_it_is_learned_as_its_folder_recommends(folder):
+    from guiderail.diagrams.make import resolve
+    from guiderail.tools.learning.configure import configure, with_defaults
+    from guiderail.tools.tasks import task_named
+
+    name, _ = task_named(str(folder))
+    recommended = yaml.safe_load((folder / "task.yaml").read_text())["recommended"]
+    config = configure(name, {}, **with_defaults(name, {"settings": {"batch_size": 32}}))
+    for key, value in recommended["environment"].items():
+        assert config.environment[key] == (tuple(value) if isinstance(value, list) else value)
+    assert (config.learner.symmetry, config.learner.batch_size) == ("near", 32)
+    task = resolve(name, {}).task
+    assert task.symmetry().actions.shape == (7, 2, 2)  # a square has eight sides
+    changed = yaml.safe_load((folder / "task.yaml").read_text())
+    for wrong in ({"sides": ["upside down"]}, {"time_step": 0.003}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            validated(PartTaskFile, changed | wrong, "task.yaml")
 
 
 def test_its_options_are_listed(folder, capsys):

@@ -93,14 +93,19 @@ class Person:
         await self.bring(0, 0.0)
         await self.bring(1, 0.0)
 
-    async def demonstrate(self, motion):
-        """One demonstration of an insertion: to the rim, a search on it, in, a turn where there is one, and at rest."""
+    async def demonstrate(self, motion, picture=None):
+        """One demonstration of an insertion: to the rim, a search on it, in, a turn where there is one, and at rest.
+
+        The picture is taken while it is pushed in.
+        """
         await self.look(0.3)
         await self.bring(2, motion.rim - motion.press)
         await self.look(0.3)
         await self.wander(1.5)
         await self.bring(2, -motion.push)
         await self.look(0.9)
+        if picture is not None:
+            await shoot(self.page, picture)
         if motion.turn:
             await self.bring(3, self.session.start[3] + np.deg2rad(motion.turn))
             await self.bring(2, -motion.push - 2e-3)
@@ -145,12 +150,7 @@ async def person(url, session, connected, picture):
             whoever = Person(page, session, number)
             await whoever.page.press("Backspace")  # from the start, as nothing was shown yet
             await asyncio.sleep(0.5)
-            shown = asyncio.create_task(whoever.demonstrate(known(session)))
-            if picture is not None and number == 0:
-                while session.steps * PERIOD < 5.0:
-                    await asyncio.sleep(0.1)
-                await shoot(page, picture)
-            await shown
+            await whoever.demonstrate(known(session), picture if number == 0 else None)
             while len(session.kept) == kept:
                 await asyncio.sleep(0.1)
         if picture is not None:

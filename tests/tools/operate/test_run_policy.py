@@ -36,7 +36,7 @@ def operated(monkeypatch):
             patch.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS)
         task = resolve("BncConnector", OPTIONS).task
-        monkeypatch.setattr(type(task), "num_steps", num_steps)
+        monkeypatch.setattr(task, "num_steps", num_steps)
         pace = Together(task.world(), lcm, start, deputy)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
         return Operation(task, skill, pace, is_stopped), pace
@@ -125,6 +125,13 @@ def test_what_a_person_gave_wrong_ends_with_2(capsys, tmp_path):
         main(["run", str(tmp_path), "--rehearse"])
     assert end.value.code == 2
     assert "not a run" in capsys.readouterr().err
+
+
+def test_another_policy_acts_in_episodes_alone(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["run", "runs/none", "--policy", "rule"])
+    assert end.value.code == 2
+    assert "give --episodes" in capsys.readouterr().err
 
 
 def test_nobody_confirms_for_a_person(monkeypatch):

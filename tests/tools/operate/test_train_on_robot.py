@@ -1,9 +1,11 @@
 """Learning on a robot: episodes as motions, both sides of the bus in one process."""
 
 import gc
+from contextlib import contextmanager
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 from injections.together import Together
 from pydrake.lcm import DrakeLcm
@@ -12,6 +14,10 @@ from guiderail.diagrams.make import make_guidance, make_station, resolve
 from guiderail.diagrams.tasks.assemble import assemble
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.operate.at_robot import AtRobot
+from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
 from guiderail.tools.operate.keys import Keys
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
@@ -25,7 +31,7 @@ OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "r
 def make(patch, start):
     """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
     lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
-    patch.setattr(type(resolved.task), "num_steps", 10)
+    patch.setattr(resolved.task, "num_steps", 10)
     with patch.context() as bus:
         bus.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
         station = make_station(resolved)
@@ -50,6 +56,7 @@ def shared():
 
 @pytest.fixture
 def env(shared):
+    shared._try(lambda: None)  # the test before may have left the arm at rest
     shared.asked.clear()
     shared.keys.take_back()
     return shared
@@ -71,6 +78,29 @@ def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
         env.reset(options={"offset": (0.0, 0.0)})
 
 
+def test_in_a_rehearsal_a_reset_draws_what_a_simulations_does(env, monkeypatch):
+    monkeypatch.setattr(env, "_places", lambda rng, options: {"drawn": (float(rng.random()), options)})
+    _, info = env.reset(seed=3, options={"held_out": True})
+    assert info["drawn"] == (float(np.random.default_rng(3).random()), {"held_out": True})
+
+
+def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_path):
+    @contextmanager
+    def there(config, other, *, yes, say):
+        assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
+        yield AtRobot(env, env.keys, dict)
+
+    monkeypatch.setattr("guiderail.tools.operate.evaluate_on_robot.at_robot", there)
+    learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
+    RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
+    found = evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
+    assert (found["episodes"], found["success_rate"]) == (2, 0.0)
+    rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
+    assert rows["termination"].tolist() == ["time_limit"] * 2
+    with pytest.raises(InputError, match="at least one"):
+        evaluate_on_robot(tmp_path, Other(), 0)
+
+
 def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     env.reset()
     env.step(np.zeros(2))
@@ -84,6 +114,22 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     assert env.asked == []
     env.reset()
     assert env.asked == ["somebody asked for it"]
+
+
+def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought_to_rest(env):
+    def interrupt(context):
+        raise KeyboardInterrupt
+
+    env.reset()
+    env.step(np.ones(2))
+    env.simulator.set_monitor(interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        env.step(np.ones(2))
+    env.rest()
+    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.ASKED
+    plant = env.pace.robot.plant
+    velocities = plant.GetVelocities(plant.GetMyContextFromRoot(env.pace.simulator.get_context()))
+    assert np.abs(velocities).max() < 0.01
 
 
 def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(env):

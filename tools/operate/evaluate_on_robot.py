@@ -1,0 +1,85 @@
+"""`guiderail run RUN --episodes N`: how often a policy succeeds on a robot, or in a rehearsal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pandas as pd
+
+from guiderail.models.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.operate.at_robot import Say, at_robot
+from guiderail.tools.operate.keys import no_pauses
+from guiderail.tools.operate.rehearsal import Other
+from guiderail.tools.operate.run_policy import on_a_robot
+from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
+from guiderail.tools.rollouts.metrics import summary
+from guiderail.tools.rollouts.progress import EpisodeProgress
+from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.tables import table_text
+
+FOUND = ("episodes", "success_rate", "success_low", "success_high", "mean_return", "worst_violation", "peak_force")
+
+
+def evaluate_on_robot(
+    run: Path,
+    other: Other,
+    episodes: int,
+    *,
+    station: str = "hardware",
+    policy: str = "",
+    acting: Callable[[gymnasium.Env], Act] | None = None,
+    yes: bool = False,
+    out: Path | None = None,
+    say: Say = print,
+) -> Mapping[str, Any]:
+    """Runs episodes one after the other, and writes a row for each; returns what came of them, in a few numbers.
+
+    In a rehearsal they are those that `guiderail evaluate` has: conditions that training never met, and the run's own
+    for what is hidden in it.
+
+    Args:
+        run: the folder of a run.
+        other: the other end of the bus.
+        episodes: how many.
+        station: a real one.
+        policy: what acts instead of the run's own policy is called so.
+        acting: what that is, for an environment.
+        yes: what is asked is answered so.
+        out: the folder of the rows; `hardware` in the run unless given.
+        say: what a person is told.
+
+    Raises:
+        InputError: for what can't be run, where no robot answers, or a check fails or isn't confirmed.
+    """
+    if episodes < 1:
+        raise InputError(f"a number of episodes is at least one, not {episodes}")
+    folder = RunFolder(run)
+    config = folder.config()
+    learned = Policy.load(folder.path) if acting is None else None
+    environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
+    config = replace(config, environment=environment)
+    path = (out or run / "hardware") / f"episodes{'-' * bool(policy)}{policy}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    with at_robot(config, other, yes=yes, say=say) as robot:
+        env = robot.env
+        act = learned if acting is None else acting(env)
+        assert act is not None
+        with no_pauses(), EpisodeProgress(episodes, name=policy or config.task) as progress:
+            try:
+                for index in range(episodes):
+                    rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.rehearse))
+                    env.idle()
+                    write_atomically(path, table_text(pd.DataFrame(rows)).encode())
+                    env.idle()
+                    progress.update(rows[-1])
+            finally:
+                env.rest()
+    return {"rows": str(path), **summary(pd.DataFrame(rows), FOUND)}
