@@ -135,10 +135,8 @@ class _Market:
     def worst(self, along: np.ndarray, at: np.ndarray, of: np.ndarray, prices: np.ndarray) -> np.ndarray:
         """(O,), how far commands can go along directions at such prices."""
         left = along - np.einsum("or,orc->oc", prices, self._generators[self._past + at, of])
-        room = self._rooms[(prices > 0.0).astype(int), at, of]
-        value = np.abs(left[:, : self._free]).sum(axis=1) + np.where(prices == 0.0, 0.0, np.abs(prices) * room).sum(
-            axis=1
-        )
+        room = np.where(prices == 0.0, 0.0, self._rooms[(prices > 0.0).astype(int), at, of])
+        value = np.abs(left[:, : self._free]).sum(axis=1) + (np.abs(prices) * room).sum(axis=1)
         late = self._steps - self._first
         excess = left[:, self._actions - late * self._budgets[0].shape[1] : self._actions]
         for response, (at_once, in_all) in zip((excess, left[:, self._free :]), self._budgets, strict=True):
