@@ -136,6 +136,15 @@ def test_a_reset_forgets():
     watched.check(START, holding=1)
 
 
+@pytest.mark.parametrize(("age", "holding"), [(0.5 * TIMEOUT, 0), (2.0 * TIMEOUT, 1), (-2.0 * PERIOD, 1)])
+def test_started_between_two_checks_it_judges_by_the_time_of_the_start(age, holding):
+    watched, start = Watched(FIRST), 5.0 + 0.5 * PERIOD
+    watched.context.SetTime(start)
+    watched.command(FIRST, time=start - age)
+    watched.simulator.Initialize()
+    watched.check(START if holding else FIRST, holding)
+
+
 def test_between_two_checks_nothing_is_computed_anew():
     """Python that runs at every step of a plant is what makes a simulation slow."""
     calls = []
