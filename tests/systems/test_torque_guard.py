@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -7,7 +9,7 @@ from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
 from guiderail.models.robots.robot import DEFAULT_ROBOT, find_robot
-from guiderail.systems.torque_guard import Phase, SafetyLimits, TorqueGuard
+from guiderail.systems.torque_guard import OLDEST_SPEED, Phase, SafetyLimits, TorqueGuard
 
 PERIOD = 1.0 / 256.0
 n = 7
@@ -202,7 +204,7 @@ def test_a_robot_that_was_started_anew_is_not_driven_by_the_speed_that_it_had(pl
     assert guarded.phase == (Phase.DAMPING if has_torque else Phase.OFF)
 
 
-@pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (0.2, False)])
+@pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (OLDEST_SPEED, True), (0.2, False)])
 def test_a_speed_of_long_ago_is_not_damped(plant, age, has_torque):
     """Whoever was held up himself: somebody else may have stopped the arm meanwhile."""
     guarded = Guarded(plant)
@@ -240,11 +242,13 @@ def test_a_silent_robot_is_sent_no_torque_and_then_nothing(plant):
 def test_stops_when_asked(plant):
     guarded = Guarded(plant)
     guarded.system.stop(guarded.context)
-    assert (guarded.phase, guarded.fault) == (Phase.DAMPING, Fault.ASKED)
+    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (Phase.DAMPING, Fault.ASKED, 0.0)
     with pytest.raises(InputError):
         guarded.system.resume(guarded.context)
     guarded.go(LIMITS.damping_time + 2 * PERIOD)
     assert guarded.phase == Phase.OFF
+    guarded.system.stop(guarded.context)
+    assert (guarded.phase, guarded.fault) == (Phase.OFF, Fault.ASKED)
 
 
 def test_only_a_stopped_arm_goes_on(plant):
@@ -253,18 +257,100 @@ def test_only_a_stopped_arm_goes_on(plant):
         guarded.system.resume(guarded.context)
 
 
+def test_the_limits_unless_others_are_given():
+    limits = SafetyLimits(velocity=(1.0,), torque=(1.0,), external_torque=(1.0,))
+    assert (limits.force, limits.lower, limits.upper) == (60.0, (-0.2, -0.2, -0.1), (0.2, 0.2, 0.3))
+    assert (limits.damping_time, limits.decay_time, limits.ramp_time) == (0.2, 0.02, 0.5)
+
+
 @pytest.mark.parametrize(
     "wrong",
-    [{"velocity": (1.0,)}, {"torque": (0.0,) * n}, {"force": np.nan}, {"lower": (1.0, 1.0, 1.0)}, {"ramp_time": 0.0}],
+    [
+        {"velocity": (1.0,) * 6},
+        {"torque": (20.0,) * 8},
+        {"external_torque": (10.0,) * 6},
+        {"velocity": (0.0,) * n},
+        {"torque": (np.inf,) * n},
+        {"external_torque": (-1.0,) * n},
+        {"force": np.nan},
+        {"damping_time": 0.0},
+        {"decay_time": 0.0},
+        {"ramp_time": 0.0},
+        {"lower": (-0.2, -0.2, 0.3)},
+    ],
 )
 def test_refuses_limits_that_make_no_sense(wrong):
     with pytest.raises(InputError):
-        SafetyLimits(**({"velocity": (1.0,) * n, "torque": (1.0,) * n, "external_torque": (1.0,) * n} | wrong))
+        replace(LIMITS, **wrong)
 
 
-def test_refuses_another_number_of_joints_and_a_stop_that_is_too_fast(plant):
-    ones = (1.0,)
+def test_refuses_an_arm_that_the_limits_do_not_fit(plant):
     with pytest.raises(InputError, match="7 joints"):
-        TorqueGuard(plant, SafetyLimits(ones, ones, ones), period=PERIOD)
-    with pytest.raises(InputError, match="come to rest"):
-        TorqueGuard(plant, LIMITS, period=LIMITS.decay_time)
+        TorqueGuard(plant, SafetyLimits((1.0,) * 6, (1.0,) * 6, (1.0,) * 6), period=PERIOD)
+    TorqueGuard(plant, LIMITS, period=0.5 * LIMITS.decay_time)
+    with pytest.raises(InputError, match="rest"):
+        TorqueGuard(plant, LIMITS, period=0.51 * LIMITS.decay_time)
+    with pytest.raises(InputError):
+        TorqueGuard(plant, LIMITS, period=0.0)
+
+
+def test_what_is_exactly_at_a_limit_is_within_it_and_of_the_wrench_the_force_counts(plant):
+    guarded = Guarded(plant)
+    for at_limit in (
+        {"state": [*POSTURE, *[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]]},
+        {"pose": [*LIMITS.lower, 9.0, 9.0, 9.0], "desired_pose": [*LIMITS.upper, 9.0, 9.0, 9.0]},
+        {"pose": [*LIMITS.upper, 9.0, 9.0, 9.0], "desired_pose": [*LIMITS.lower, 9.0, 9.0, 9.0]},
+        {"wrench": [0.0, -60.0, 0.0, 99.0, 99.0, 99.0]},
+        {"external_torque": [10.0, -10.0] * 3 + [10.0]},
+    ):
+        guarded.set(**at_limit)
+        assert guarded.fault == Fault.NONE, at_limit
+
+
+def test_outputs_have_the_sizes_that_they_say_and_depend_at_once_on_no_more(plant):
+    system = TorqueGuard(plant, LIMITS, period=PERIOD)
+    outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
+    assert {port.get_name(): port.size() for port in outputs} == {
+        **{"safe_torque": n, "fault": 1, "phase": 1, "authority": 1, "sending": 1, "not_following": 1}
+    }
+    at_once = {
+        port.get_name(): {
+            system.get_input_port(i).get_name()
+            for i in range(system.num_input_ports())
+            if system.HasDirectFeedthrough(i, port.get_index())
+        }
+        for port in outputs
+    }
+    measured = {"state", "external_torque", "wrench", "pose", "desired_pose", "torque"}
+    assert at_once == {
+        "safe_torque": measured | {"status_fault", "status_age", "status_is_new"},
+        "fault": measured | {"status_fault"},
+        "phase": set(),
+        "authority": set(),
+        "sending": {"status_fault"},
+        "not_following": {"holding"},
+    }
+
+
+def test_before_it_is_initialized_it_waits_and_sends_nothing(plant):
+    guarded = Guarded(plant, running=False)
+    assert (guarded.phase, guarded["sending"][0], guarded["not_following"][0]) == (Phase.WAITING, 0.0, 1.0)
+    np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
+
+
+def test_while_it_takes_over_it_damps_the_speed_that_is_seen_and_nothing_that_it_gave(plant):
+    guarded = Guarded(plant, running=False)
+    guarded.simulator.Initialize()
+    guarded.go(LIMITS.ramp_time / 2)
+    assert guarded.phase == Phase.RAMPING
+    guarded.set(status_age=[PERIOD], status_is_new=[0.0])
+    guarded.go(PERIOD)
+    share = guarded["authority"][0]
+    expected = share * WANTED + (1.0 - share) * guarded.damping(age=PERIOD)
+    np.testing.assert_allclose(guarded["safe_torque"], np.clip(expected, -20.0, 20.0), atol=1e-12)
+
+
+def test_while_a_watchdog_holds_the_arm_is_not_following(plant):
+    guarded = Guarded(plant)
+    guarded.set(holding=[1.0])
+    assert (guarded.phase, guarded["not_following"][0]) == (Phase.RUNNING, 1.0)
