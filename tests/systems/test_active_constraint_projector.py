@@ -66,6 +66,7 @@ def test_ports():
     system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD)
     names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
     assert names == ["desired_pose", "last_desired_pose", "fallback", "commanded_violation", "measured_violation"]
+    assert [system.get_output_port(i).size() for i in range(5)] == [6, 6, 1, 1, 1]
 
 
 def test_the_last_command_never_feeds_through():
@@ -130,6 +131,8 @@ def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
         desired, fallback = rig.step(np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0]), measured=START)
     assert fallback == 1.0
     assert 0.02 < desired[0] < 0.02 + 2 * 0.5 * PERIOD
+    # What asks for no more than the last command brings the robot no nearer either.
+    assert rig.step(desired)[1] == 1.0
     # It may always come back.
     desired, fallback = rig.step(START)
     assert fallback == 0.0

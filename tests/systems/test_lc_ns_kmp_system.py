@@ -148,6 +148,37 @@ def test_first_fallback_is_within_the_constraints():
     assert system.get_output_output_port().Eval(context)[0] <= -0.5 + 1e-9
 
 
+def test_the_history_length_selects_the_primitive_which_gets_the_newest_part():
+    longest, short = primitive(history=3), primitive(history=1)
+    gains = {3: np.array([3.0, 5.0]), 1: np.array([7.0, -2.0])}
+    system = LcNsKmpSystem(longest, gains[3], PERIOD, shorter=[(short, gains[1])])
+    assert names(system, "input") == ["null_space_action", "history", "history_length"]
+    assert system.get_history_length_input_port().size() == 1
+    past, action = longest.reference.means[2:5], np.array([0.5, -1.0])
+    context = system.CreateDefaultContext()
+    system.get_null_space_action_input_port().FixValue(context, action)
+    system.get_history_input_port().FixValue(context, past.ravel())
+    for p in (longest, short, longest):
+        system.get_history_length_input_port().FixValue(context, [float(p.history)])
+        expected = p.predict(0, gains[p.history] * action, past[-p.history :]).output
+        np.testing.assert_array_equal(system.get_output_output_port().Eval(context), expected)
+    with pytest.raises(InputError, match="one primitive"):
+        LcNsKmpSystem(longest, None, PERIOD).get_history_length_input_port()
+
+
+@pytest.mark.parametrize("history", [0, 3, 4])
+def test_refuses_a_shorter_history_that_is_not(history):
+    with pytest.raises(InputError, match="shorter history has 1 to 2"):
+        LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(primitive(history), np.ones(2))])
+
+
+def test_without_constraints_the_violation_is_a_finite_number():
+    system = LcNsKmpSystem(LcNsKmp(primitive().reference, horizon=8), None, PERIOD)
+    context = system.CreateDefaultContext()
+    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    assert system.get_constraint_violation_output_port().Eval(context)[0] == -1e30
+
+
 @pytest.mark.parametrize(
     ("gain", "period", "words"), [(np.ones(3), 0.1, "gain"), ([np.nan, 1], 0.1, "gain"), (None, 0.0, "period")]
 )

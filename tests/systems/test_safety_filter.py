@@ -28,6 +28,8 @@ def start(system, desired, pose):
 def test_ports(system):
     assert [system.get_input_port(i).get_name() for i in range(2)] == ["desired_pose", "pose"]
     assert [system.get_output_port(i).get_name() for i in range(2)] == ["safe_pose", "intervention"]
+    # The measured pose is sampled: nothing follows it within a step.
+    assert system.GetDirectFeedthroughs() == [(0, 0), (0, 1)]
 
 
 def test_passes_on_what_is_safe(system):
