@@ -349,3 +349,66 @@ def test_a_position_that_has_jumped_and_stays_is_not_believed_before_it_has_sett
         watched.check(slipped())
     assert watched.fault == Fault.NONE
     assert watched.state[0] > 2.5
+
+
+def test_the_ports_have_the_sizes_that_they_say():
+    system = StatusWatchdog(LIMITS, period=PERIOD)
+    ports = [system.get_output_port(i) for i in range(system.num_output_ports())]
+    assert {port.get_name(): port.size() for port in ports} == {
+        **{"state": 4, "external_torque": 2, "fault": 1, "age": 1, "is_new": 1}
+    }
+    assert system.get_clock_input_port().size() == 1
+
+
+def test_new_is_what_is_believed_and_was_not_there_before():
+    watched = Watched().settle()
+    is_new = watched.system.get_is_new_output_port()
+    sound = watched.sound()
+    jumped = WRONG[Fault.POSITION_JUMP](sound)
+    for status, expected in ((sound, 1.0), (None, 0.0), (UNREADABLE, 0.0), (jumped, 0.0), (sound, 1.0)):
+        watched.port.GetMutableData().set_value(status)
+        assert is_new.Eval(watched.context)[0] == expected
+    watched.check(sound)
+    assert is_new.Eval(watched.context)[0] == 0.0  # it has been taken in
+
+
+def test_before_any_status_the_age_is_the_time_since_the_start():
+    watched = Watched()
+    assert watched.age == 0.0
+    for _ in range(5):
+        watched.check(None)
+    assert watched.age == pytest.approx(5 * PERIOD, abs=1.5 * PERIOD)
+
+
+def test_statuses_that_fall_behind_one_after_another_stay_stale():
+    """Each is new, and none of them says that the clocks differ by as much."""
+    watched = Watched().settle()
+    queue = [watched.sound()]
+    while watched.step * PERIOD + CLOCK - queue[0].time < 1.5 * LIMITS.max_age:
+        for _ in range(2):  # two come for each that is read
+            queue.append(watched.sound())
+            watched.check(queue[0])
+        queue.pop(0)
+    for _ in range(2 * round(LIMITS.settling / PERIOD)):
+        queue.append(watched.sound())
+        assert watched.check(queue.pop(0)) == Fault.STALE
+
+
+def test_after_a_silence_the_clocks_are_synchronized_anew():
+    watched = Watched().settle()
+    last = watched.sound()
+    for _ in range(round(3.0 * LIMITS.max_age / PERIOD)):
+        watched.check(last)
+    for _ in range(round(LIMITS.settling / PERIOD) + 3):
+        sound = watched.sound()
+        watched.check(replace(sound, time=sound.time - 1.2 * LIMITS.max_age))
+    assert watched.fault == Fault.NONE
+
+
+def test_what_was_known_is_no_news_after_a_stray_status():
+    watched = Watched().settle()
+    known = watched.sound()
+    watched.check(known)
+    watched.check(replace(watched.sound(), time=watched.sound().time + 1.0))
+    assert watched.check(known) == Fault.OUT_OF_ORDER
+    assert watched.age > PERIOD
