@@ -49,6 +49,13 @@ def test_the_gap_can_be_passed(keep_out):
     assert not blocked
 
 
+def test_however_long_the_way_it_stops_a_gap_before_the_margin():
+    wall = KeepOut([[0.5, -9.0]], [[0.6, 9.0]], LinearConstraints.none(2), MARGIN)
+    for start, end in (([0.0, 0.0], [1.0, 0.0]), ([-3.0, 1.0], [3.0, 1.0]), ([0.4, 2.0], [4.0, 2.0])):
+        safe, _ = wall.project(np.array(start), np.array(end))
+        np.testing.assert_allclose(safe, [0.48 - 1e-6, start[1]], rtol=0, atol=1e-12)
+
+
 def test_someone_pushed_into_the_margin_may_leave_but_not_come_nearer(keep_out):
     start = np.array([0.2, 0.495])
     nearer, _ = keep_out.project(start, np.array([0.2, 0.7]))
