@@ -26,3 +26,11 @@ def test_averages_over_the_control_step_and_forgets_the_one_before():
 def test_refuses_what_makes_no_sense(arguments):
     with pytest.raises(InputError):
         MeanForce(*arguments)
+
+
+def test_one_component_and_one_plant_step_are_enough():
+    system = MeanForce(1, 1, 0.1)
+    context = system.CreateDefaultContext()
+    system.get_force_sum_input_port().FixValue(context, [-3.0])
+    assert system.get_force_output_port().Eval(context) == [-3.0]
+    assert system.get_magnitude_output_port().Eval(context) == [3.0]
