@@ -13,18 +13,12 @@ settings.register_profile("long", max_examples=2500, **CALM)
 settings.load_profile("quick")
 
 
-@pytest.fixture
-def frozen():
-    """Call it, and a collection of garbage looks only through what comes after: a third of a second less."""
-    yield gc.freeze
-    gc.unfreeze()
-
-
 FORKS = pytest.StashKey[Forks]()
 
 
 def pytest_collection_finish(session):
     """Before the first test this process has imported everything, and made nothing."""
+    gc.freeze()  # collections of garbage look only through what comes after: a fifteenth of the whole run
     used = {name for item in session.items for name in getattr(item, "fixturenames", ())}
     # In this order: a server that is begun later holds what the earlier one is asked by, and ends first.
     if "forkserver" in used:

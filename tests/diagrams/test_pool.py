@@ -85,10 +85,9 @@ def test_a_closed_environment_stays_closed():
 
 
 @pytest.mark.parametrize(("render_mode", "close"), [(None, False), ("human", False), ("human", True)])
-def test_nothing_grows(close, render_mode, frozen):
+def test_nothing_grows(close, render_mode):
     process, after = psutil.Process(), []
     make_env("NarrowPassage", guidance="safe_residual").close()  # what the process starts once, and keeps
-    frozen()
     before = held(process)
     for index in range(6):
         env = make_env("NarrowPassage", guidance="safe_residual", render_mode=render_mode)

@@ -6,29 +6,24 @@ from guiderail.models.errors import InputError
 from guiderail.tools.certify import certify_skill
 
 
-def test_a_tasks_certificate_is_written_and_accepted(tmp_path):
-    found = certify_skill("NarrowPassage", {"guidance": "skgrl"}, out=tmp_path)
+def test_a_tasks_certificate_is_written_and_accepted_and_an_attack_says_how_tight_it_is(tmp_path):
+    found = certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=2000)
     assert found["checker"] == "yes"
     assert found["always_upper"][0] <= found["while_free_upper"][0]
     assert found["steps"] >= found["steps_that_constraints_can_touch"]
     assert json.loads((tmp_path / "certificate.json").read_text())["assumes"]
+    rows = found["attack"]
+    assert found["attack_steps"] >= 2000
+    assert {row["quantity"] for row in rows} == {"pose", "speed", "acceleration"}
+    assert all(row["left"] == 0 for row in rows)
+    assert all(row["ratio"] < 1.2 for row in rows if row["constraint"] == "never active")
+    assert (tmp_path / "attack.csv").exists()
 
 
 def test_demonstrations_alone_are_certified_too(tmp_path):
     found = certify_skill("NarrowPassage", {"guidance": "kmp"}, out=tmp_path)
     assert found["checker"] == "yes"
     assert found["steps_that_constraints_can_touch"] == 0
-
-
-def test_an_attack_says_how_tight_the_bounds_are(tmp_path):
-    found = certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=2000)
-    rows = found["attack"]
-    assert found["checker"] == "yes"
-    assert found["attack_steps"] >= 2000
-    assert {row["quantity"] for row in rows} == {"pose", "speed", "acceleration"}
-    assert all(row["left"] == 0 for row in rows)
-    assert all(row["ratio"] < 1.2 for row in rows if row["constraint"] == "never active")
-    assert (tmp_path / "attack.csv").exists()
 
 
 @pytest.mark.parametrize(

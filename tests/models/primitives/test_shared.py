@@ -47,10 +47,9 @@ def test_it_answers_as_one_that_nobody_else_uses():
     np.testing.assert_array_equal(shared.predict(5, action, past).output, own.predict(5, action, past).output)
 
 
-def test_what_nobody_uses_is_not_kept(frozen):
+def test_what_nobody_uses_is_not_kept():
     from guiderail.models.primitives.shared import _USED
 
-    frozen()
     shared_primitive(reference(1.7), box(), 2.0)
     gc.collect()
     assert not [primitive for primitive in _USED.values() if primitive.reference.means[-1, 1] == 1.7]

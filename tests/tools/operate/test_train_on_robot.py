@@ -1,6 +1,5 @@
 """Learning on a robot: episodes as motions, both sides of the bus in one process."""
 
-import gc
 from contextlib import contextmanager
 
 import gymnasium
@@ -51,9 +50,7 @@ def shared():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("guiderail.tools.operate.crawl.SETTLE", 0.1)
         env = make(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
-        gc.freeze()  # a reset collects garbage, for which it would look through everything that tests ever imported
         yield env
-        gc.unfreeze()
 
 
 @pytest.fixture
