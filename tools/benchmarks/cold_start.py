@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.benchmarks import told
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import evaluate_run
+from guiderail.tools.rollouts.suited import as_learned
 
 TASK = "BncConnector"
 ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "uncertainty": "calibration"}
@@ -59,8 +61,7 @@ def measure(
         for seed, kind in told([(seed, kind) for seed in seeds for kind in KINDS], "run"):
             out = Path(folder) / f"{seed}-{KINDS[kind]}"
             seconds = _train(task, options, episodes, seed, KINDS[kind], out)
-            policy = Policy.load(out)
-            judged = evaluate_run(RunFolder(out).config(), lambda env, learned=policy: learned, episodes=held_out)
+            judged = evaluate_run(RunFolder(out).config(), partial(as_learned, Policy.load(out)), episodes=held_out)
             success = float((judged["termination"] == "success").mean())
             runs.append({"kind": kind, "seed": seed, "seconds": seconds, "success_rate": success})
     return {"task": task, "environment": dict(options), "episodes": episodes, "held_out": held_out, "runs": runs}
