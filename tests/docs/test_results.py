@@ -27,21 +27,14 @@ def test_standard_tasks_hardly_ask_for_anything():
 
 
 @pytest.mark.parametrize(
-    ("study", "nothing", "rule"),
-    [
-        ("connector_hard_nulls", "demonstrations", "rule"),
-        ("grid_clamp_hard_nulls", "zero", "rule"),
-        ("pouring_hard_nulls", "zero", "rule"),
-        ("narrow_passage_hard_nulls", "skgrl_demonstrations", "skgrl_rule"),
-    ],
+    ("study", "nothing"), [("connector_hard_nulls", "demonstrations"), ("grid_clamp_hard_nulls", "zero")]
 )
-def test_at_hard_policies_that_learned_nothing_fail_and_a_rule_does_not(study, nothing, rule):
-    prefix = nothing.removesuffix("demonstrations") if "_" in nothing else ""
-    for method, most in ((nothing, 0.05), (f"{prefix}white", 0.10), (f"{prefix}best_constant", 0.15)):
+def test_at_hard_policies_that_learned_nothing_fail_and_a_rule_does_not(study, nothing):
+    for method, most in ((nothing, 0.05), ("white", 0.10), ("best_constant", 0.15)):
         rows = of(study, method)
         assert (rows["success_rate"] <= most).all(), method
         assert (rows["episodes"] >= 200).all()
-    assert (of(study, rule)["success_rate"] >= 0.95).all()
+    assert (of(study, "rule")["success_rate"] >= 0.95).all()
 
 
 def test_at_hard_all_three_learn_the_connector_and_only_residual_learning_leaves_its_bound():
