@@ -67,8 +67,10 @@ class Registry(Generic[Entry]):
         """The entry of that name.
 
         Raises:
-            InputError: if there is none; the sentence has the nearest name, or all of them.
+            InputError: if there is none, the sentence has the nearest name or all of them; or if it is no word.
         """
+        if not isinstance(name, str):
+            raise InputError(f"a {self.noun} is named by a word, not {brief(name)}: {did_you_mean('', self.names())}")
         if name not in self._entries and name in self._modules:
             import_module(self._modules[name])
         if name not in self._entries and name in self._points:

@@ -781,13 +781,17 @@ def serve_iiwa(
         str | None, _opt("x,y of the fixture from where it is thought to be [m], such as 0.001,-0.0005.")
     ] = None,
     scenario: Annotated[Path | None, _opt("A file that says what stands around it.")] = None,
+    imports: Imports = None,
 ) -> None:
     """Simulate an iiwa at the other end of LCM, with a deputy who stands by.
 
     It stands in front of a task's fixture; the command ends with 1 if commands stopped coming.
     """
     from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
+    from guiderail.tools.tasks import import_modules
 
+    import_modules(imports or ())
+    task = _named(task)[0]
     is_done = serve(url, seconds, patience, task, rate=rate, offset=_numbers(offset), scenario=scenario, say=_tell)
     raise typer.Exit(0 if is_done else 1)
 
@@ -797,6 +801,7 @@ def stand_by(
     url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
     robot: WhichRobot = "iiwa14",
     task: Annotated[str, _opt("What the arm carries is this task's: {tasks}.", of="tasks")] = "BncConnector",
+    imports: Imports = None,
 ) -> None:
     """Stop a robot where commands stop.
 
@@ -804,8 +809,10 @@ def stand_by(
     on the same machine, until it is ended; where it is missing, guiderail run moves nothing.
     """
     from guiderail.tools.operate.stand_by import stand_by as wait
+    from guiderail.tools.tasks import import_modules
 
-    wait(url, robot, task, say=_tell)
+    import_modules(imports or ())
+    wait(url, robot, _named(task)[0], say=_tell)
 
 
 @command("generate connector-demonstrations --out .")

@@ -20,6 +20,7 @@ from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.registry import did_you_mean
 from guiderail.models.units import DEGREE, MM
+from guiderail.models.writing import write_atomically
 from guiderail.models.yaml_files import load_yaml
 
 FILE_NAME = "task.yaml"
@@ -246,7 +247,8 @@ def write_task_file(folder: Path, file: PartTaskFile) -> Path:
     """Writes `task.yaml`; what it holds reads back as the same."""
     path = folder / FILE_NAME
     values = _plain(file.model_dump())
-    path.write_text(yaml.safe_dump(values, sort_keys=False, width=110, default_flow_style=None), encoding="utf-8")
+    text = yaml.safe_dump(values, sort_keys=False, width=110, default_flow_style=None)
+    write_atomically(path, text.encode())
     return path
 
 

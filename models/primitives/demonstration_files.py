@@ -24,6 +24,7 @@ import numpy as np
 
 from guiderail.models.errors import InputError, brief
 from guiderail.models.reading import read_bytes
+from guiderail.models.writing import write_atomically
 
 MOST_NUMBERS = 2_000_000  # times and outputs together: five minutes of six outputs at a kilohertz
 MOST_DEMONSTRATIONS = 1_000
@@ -75,22 +76,25 @@ def _read_file(path: Path, most: int) -> Recording:
 
 def write_npz(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndarray], names: Sequence[str]) -> None:
     """All samples one after the other, and how many each demonstration has."""
+    content = io.BytesIO()
     np.savez_compressed(
-        path,
+        content,
         lengths=np.array([len(t) for t in times]),
         times=np.concatenate(times),
         outputs=np.concatenate(outputs),
         names=np.array(names),
     )
+    write_atomically(path, content.getvalue())
 
 
 def write_csv(path: Path, times: Sequence[np.ndarray], outputs: Sequence[np.ndarray], names: Sequence[str]) -> None:
     """One row a sample: demonstration, time, outputs."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["demonstration", "time", *names])
-        for m, (t, y) in enumerate(zip(times, outputs, strict=True)):
-            writer.writerows([m, repr(float(a)), *(repr(float(v)) for v in b)] for a, b in zip(t, y, strict=True))
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["demonstration", "time", *names])
+    for m, (t, y) in enumerate(zip(times, outputs, strict=True)):
+        writer.writerows([m, repr(float(a)), *(repr(float(v)) for v in b)] for a, b in zip(t, y, strict=True))
+    write_atomically(path, text.getvalue().encode())
 
 
 def _is_folder(path: Path) -> bool:

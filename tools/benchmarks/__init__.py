@@ -10,8 +10,19 @@ from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 
 Item = TypeVar("Item")
-BENCHMARKS = ("primitive", "simulation", "loop", "time_step", "engines", "impedance", "saving", "learner", "training")
-OF_A_TASK = ("training",)  # those that are told which task, and how it is set up
+BENCHMARKS = (
+    "primitive",
+    "simulation",
+    "loop",
+    "time_step",
+    "engines",
+    "impedance",
+    "saving",
+    "learner",
+    "training",
+    "cold_start",
+)
+OF_A_TASK = ("training", "cold_start")  # those that are told which task, and how it is set up
 DRAWN = ("time_step", "engines")  # those that can be drawn
 
 

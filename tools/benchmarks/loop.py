@@ -138,21 +138,44 @@ def _transport() -> list[Row]:
     return [*rows, _row("there and back over LCM", PERIOD, np.array(answered)[20:])]
 
 
+class _Answers:
+    """When each message was sent, and when its own answer came: one that is late is not the next message's."""
+
+    def __init__(self) -> None:
+        self._said: list[float] = []
+        self._came: dict[int, float] = {}
+
+    def say(self, now: float) -> bytes:
+        """The next message, which is sent now [s]."""
+        self._said.append(now)
+        return (len(self._said) - 1).to_bytes(8)
+
+    def hear(self, message: bytes, now: float) -> None:
+        """An answer, which came now [s]; one that comes twice counts once."""
+        self._came.setdefault(int.from_bytes(message), now)
+
+    def is_answered(self) -> bool:
+        """Whether the last message is."""
+        return len(self._said) - 1 in self._came
+
+    def seconds(self) -> list[float]:
+        """How long each answer took [s]; infinite where none came."""
+        return [self._came.get(number, np.inf) - said for number, said in enumerate(self._said)]
+
+
 def _speak(pipe: Connection, url: str) -> None:
-    """The other process: how long each answer took [s]; an answer that never came counts as infinite."""
-    lcm, came = DrakeLcm(url), [0.0]
-    lcm.Subscribe("ANSWERED", lambda message: came.__setitem__(0, time.perf_counter()))
-    taken = []
+    """The other process: how long each answer took."""
+    lcm, answers = DrakeLcm(url), _Answers()
+    lcm.Subscribe("ANSWERED", lambda message: answers.hear(message, time.perf_counter()))
     with _in_a_hurry():
         due = time.perf_counter() + 0.5
-        for number in range(round(SECONDS / PERIOD)):
+        for _ in range(round(SECONDS / PERIOD)):
             time.sleep(max(due - time.perf_counter(), 0.0))
-            said, due = time.perf_counter(), due + PERIOD
-            lcm.Publish("SPOKEN", number.to_bytes(8))
-            while came[0] < said and time.perf_counter() < due:
+            due += PERIOD
+            lcm.Publish("SPOKEN", answers.say(time.perf_counter()))
+            while not answers.is_answered() and time.perf_counter() < due:
                 lcm.HandleSubscriptions(1)
-            taken.append(came[0] - said if came[0] >= said else np.inf)
-    pipe.send(taken)
+    pipe.send(answers.seconds())
 
 
 @contextmanager

@@ -150,6 +150,7 @@ def onboard(
     """
     if out.exists():
         raise InputError(f"{out} already exists: name another folder with --out, or remove it")
+    _check_given(friction, scenario)
     parts = read_parts(plug, socket, unit, place, axis, centre)
     check_target(*parts)
     path = motion(*parts, turn * DEGREE, CLEAR)
@@ -166,6 +167,17 @@ def onboard(
     finally:
         shutil.rmtree(made, ignore_errors=True)
     return {"task": str(out), **measured, "page": str(out / "preview.html")}
+
+
+def _check_given(friction: float, scenario: Sequence[Path]) -> None:
+    """Raises an InputError for what would be found out only after minutes."""
+    from guiderail.diagrams.options import validated
+    from guiderail.diagrams.tasks.part_file import Piece
+
+    validated(Piece, {"file": "plug.obj", "friction": friction}, "a part")
+    for file in scenario:
+        if not file.is_file():
+            raise InputError(f"there is no scenario {file}")
 
 
 def _snapping(plug: Part, socket: Part, path: Motion) -> frozenset[int]:
@@ -316,6 +328,7 @@ def _write_pieces(folder: Path, parts: tuple[Part, Part], contact: Contact) -> N
 
 
 def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers: dict[str, Any]) -> Any:
+    from guiderail.diagrams.options import validated
     from guiderail.diagrams.tasks.part_file import NAMESPACE, MotionNumbers, PartModel, PartTaskFile, Piece
 
     path, friction = numbers["path"], numbers["friction"]
@@ -342,15 +355,17 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
         name=f"{NAMESPACE}/{_plain_name(numbers['name'])}",
         **models,
         scenario=tuple(file.name for file in numbers["scenario"]),
-        motion=MotionNumbers.model_validate(
-            {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push}
+        motion=validated(
+            MotionNumbers,
+            {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push},
+            "a motion",
         ),
         force_limit=numbers["force_limit"],
         time_step=contact.time_step,
         sides=numbers["sides"],
         rim_sides=numbers["rim_sides"],
     )
-    return PartTaskFile.model_validate(values)
+    return validated(PartTaskFile, values, "a task of parts")
 
 
 def _plain_name(name: str) -> str:
@@ -371,4 +386,7 @@ def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
     """The unit, asked for at a terminal where neither an argument nor the format says it."""
     if given is not None or all(unit_of(path, None) for path in paths) or not sys.stdin.isatty():
         return given
-    return input(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ").strip() or "mm"
+    try:
+        return input(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ").strip() or "mm"
+    except EOFError:
+        return None  # as where nobody can be asked

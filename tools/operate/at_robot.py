@@ -63,7 +63,7 @@ def at_robot(config: RunConfig, other: Other, *, yes: bool, say: Say) -> Iterato
     assert isinstance(station, HardwareStation)
     diagram = assemble(task, station, make_guidance(resolved, station))
     start = task.start(np.random.default_rng(0))
-    with other.standing_in(config.task, station.lcm_url), listening() as keys:
+    with other.standing_in(config.task, station.lcm_url, config.imports), listening() as keys:
         pace, clock = other.paces(station)
         say(f"waiting for {other.robot} on {station.lcm_url or 'LCM'}, channel {station.driver.status_channel}")
 

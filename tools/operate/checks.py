@@ -105,5 +105,9 @@ def confirm(question: str) -> None:
     """
     if not sys.stdin.isatty():
         raise InputError("nobody is there to confirm this: read it, and say --yes")
-    if input(f"{question} Type yes: ").strip().lower() != "yes":
+    try:
+        answer = input(f"{question} Type yes: ")
+    except EOFError:
+        answer = ""
+    if answer.strip().lower() != "yes":
         raise InputError("not confirmed: nothing moves")

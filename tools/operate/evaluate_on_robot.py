@@ -56,7 +56,8 @@ def evaluate_on_robot(
         say: what a person is told.
 
     Raises:
-        InputError: for what can't be run, where no robot answers, or a check fails or isn't confirmed.
+        InputError: for what can't be run, where no robot answers, a check fails or isn't confirmed, or for rows
+            that are there already.
     """
     if episodes < 1:
         raise InputError(f"a number of episodes is at least one, not {episodes}")
@@ -66,8 +67,15 @@ def evaluate_on_robot(
     environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
     config = replace(config, environment=environment)
     path = (out or run / "hardware") / f"episodes{'-' * bool(policy)}{policy}.csv"
+    if path.exists():
+        raise InputError(f"{path} already exists: name another folder with --out, or remove it")
     path.parent.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
+
+    def write(rows: list[dict[str, Any]]) -> None:
+        if rows:
+            write_atomically(path, table_text(pd.DataFrame(rows)).encode())
+
     with at_robot(config, other, yes=yes, say=say) as robot:
         env = robot.env
         act = learned if acting is None else acting(env)
@@ -77,9 +85,12 @@ def evaluate_on_robot(
                 for index in range(episodes):
                     rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.rehearse))
                     env.idle()
-                    write_atomically(path, table_text(pd.DataFrame(rows)).encode())
+                    write(rows)
                     env.idle()
                     progress.update(rows[-1])
             finally:
-                env.rest()
+                try:
+                    env.rest()
+                finally:
+                    write(rows)  # of the last episode too, where nobody let the arm go on
     return {"rows": str(path), **summary(pd.DataFrame(rows), FOUND)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,13 +92,20 @@ class Other:
         }
 
     @contextmanager
-    def standing_in(self, task: str, url: str) -> Iterator[None]:
-        """A simulated robot in front of a task's fixture; nobody, of a real robot."""
+    def standing_in(self, task: str, url: str, imports: Sequence[str] = ()) -> Iterator[None]:
+        """A simulated robot in front of a task's fixture; nobody, of a real robot.
+
+        Args:
+            task: its name.
+            url: of the bus.
+            imports: what registers the task: modules, files and task folders.
+        """
         if not self.rehearse:
             yield
             return
         arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300", "--seconds", str(LONGEST)]
         arguments += [] if self.lockstep else ["--rate", str(self.rate)]
+        arguments += [word for module in imports for word in ("--import", module)]
         arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]
         with companion(f"from guiderail.tools.command import main; main({arguments!r})"):
             yield

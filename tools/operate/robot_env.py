@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context
 
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.stations.hardware import HardwareStation
@@ -298,8 +298,3 @@ class RobotEnv(GuidedEnv):
         self._say("going on from here")
         self._elsewhere_acts()
         self._take_over()
-
-
-def skills_station(diagram: Diagram) -> HardwareStation:
-    """The station of a task's diagram."""
-    return diagram.GetSubsystemByName("station")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -211,6 +212,9 @@ class Operation:
             else station.GetOutputPort(name).Eval(mine)
             for name in SIGNALS
         }
+        # Before the trace: whoever is interrupted in between has a sample too many, and none too few.
+        for name, values in self._joints.items():
+            values.append(station.GetOutputPort(f"{station.driver.name}.{name}").Eval(mine).copy())
         self.trace.append(
             guidance.GetOutputPort("desired_pose").Eval(guiding),
             station.get_pose_output_port().Eval(mine),
@@ -218,17 +222,25 @@ class Operation:
             np.nan,  # nobody judges here
             signals,
         )
-        for name, values in self._joints.items():
-            values.append(station.GetOutputPort(f"{station.driver.name}.{name}").Eval(mine).copy())
+
+    def keep(self, folder: Path, outcome: Outcome, found: Mapping[str, Any], say: Say) -> None:
+        """Writes what was recorded, however it ended, and says where; `found` is what else is known of it."""
+        found = {**found, "outcome": outcome.words, "fault": outcome.fault.name, "steps": outcome.steps}
+        if outcome.steps:
+            away, turned = distance(self.trace.measured[-1], np.zeros(6))
+            found |= {"millimetres_from_target": away / MM, "degrees_from_target": turned / DEGREE}
+            found["peak_force"] = float(self.trace.force.max())
+            say(f"ended {away / MM:.1f} mm and {turned / DEGREE:.1f} degrees from the nominal target")
+        say(f"{outcome.words}, after {outcome.steps} control steps: {self.write(folder, found)}")
 
     def write(self, folder: Path, found: Mapping[str, Any]) -> Path:
         """Writes a ledger of the control steps, the joints' too, and beside it what was found; returns its path."""
         folder.mkdir(parents=True, exist_ok=True)
-        number = len(list(folder.glob("episode-*.json")))
+        number = _next_number(folder)
         ledger = table(self.trace, number)
         joints = self._station.known.plant.num_positions()
         for name, values in self._joints.items():
-            for joint, column in enumerate(np.reshape(values, (len(self.trace), joints)).T):
+            for joint, column in enumerate(np.reshape(values[: len(self.trace)], (len(self.trace), joints)).T):
                 ledger = ledger.append_column(f"{name}_{joint}", pa.array(column))
         file = io.BytesIO()
         pq.write_table(ledger, file, compression="NONE", use_dictionary=False)
@@ -236,6 +248,12 @@ class Operation:
         write_atomically(path, file.getvalue())
         write_atomically(path.with_suffix(".json"), json.dumps(dict(found), indent=2).encode() + b"\n")
         return path
+
+
+def _next_number(folder: Path) -> int:
+    """Of a recording: one above all that are there, whichever of their files somebody took away."""
+    found = (re.match(r"episode-(\d+)\.", file.name) for file in folder.iterdir())
+    return max((int(one.group(1)) for one in found if one), default=-1) + 1
 
 
 def run_policy(
@@ -268,7 +286,7 @@ def run_policy(
         raise InputError(f"{config.task} has no pose that an arm could approach to begin: run an insertion")
     skill = make_skill(config.task, policy, **environment)
     bus: HardwareStation = skill.diagram.GetSubsystemByName("station")
-    with other.standing_in(config.task, environment["lcm_url"]), listening() as keys:
+    with other.standing_in(config.task, environment["lcm_url"], config.imports), listening() as keys:
         pace, clock = other.paces(bus)
         say(f"waiting for {other.robot} on {environment['lcm_url'] or 'LCM'}, channel {bus.driver.status_channel}")
         operation = Operation(task, skill, pace, keys.stops)
@@ -277,25 +295,21 @@ def run_policy(
         if not other.lockstep and not hurry():
             say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
         say("Enter or Ctrl-C stops the arm")
+        found: dict[str, Any] = {
+            "task": config.task,
+            "run": folder.path.name,
+            "robot": other.robot,
+            "rehearsal": other.rehearse,
+            "checks": {check.name: check.words for check in checks},
+        }
         with no_pauses():
-            outcome = operation.run(say)
-    found: dict[str, Any] = {
-        "task": config.task,
-        "run": folder.path.name,
-        "robot": other.robot,
-        "rehearsal": other.rehearse,
-        "outcome": outcome.words,
-        "fault": outcome.fault.name,
-        "steps": outcome.steps,
-        "checks": {check.name: check.words for check in checks},
-        **other.timing(bus, clock),
-    }
-    if outcome.steps:
-        away, turned = distance(operation.trace.measured[-1], np.zeros(6))
-        found |= {"millimetres_from_target": away / MM, "degrees_from_target": turned / DEGREE}
-        found["peak_force"] = float(operation.trace.force.max())
-        say(f"ended {away / MM:.1f} mm and {turned / DEGREE:.1f} degrees from the nominal target")
-    say(f"{outcome.words}, after {outcome.steps} control steps: {operation.write(out or run / 'hardware', found)}")
+            try:
+                outcome = operation.run(say)
+            except BaseException as error:
+                outcome = Outcome(Fault.NONE, f"failed: {type(error).__name__}: {error}", len(operation.trace))
+                raise
+            finally:
+                operation.keep(out or run / "hardware", outcome, {**found, **other.timing(bus, clock)}, say)
     return outcome.exit_code
 
 

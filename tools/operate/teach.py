@@ -133,7 +133,7 @@ class Teaching:
         """
         self.begin()
         for _ in range(most_steps):
-            self.simulator.set_target_realtime_rate((SLOWLY if self._slow else 1.0) if real_time else 0.0)
+            self._go_at((SLOWLY if self._slow else 1.0) if real_time else 0.0)
             self.step()
             for name in BUTTONS:
                 while self._clicked(name):
@@ -160,8 +160,10 @@ class Teaching:
             self._show_force()
 
     def undo(self) -> None:
-        """Takes the last second back: robot, parts, command and sliders."""
+        """Takes the last second back: robot, parts, command and sliders. Where nothing was shown there is none."""
         snapshots = self.taken.snapshots
+        if not snapshots:
+            return
         if len(snapshots) > 1 and self.steps - snapshots[-1][1] < round(0.5 * SNAPSHOT / self._period):
             snapshots.pop()
         context, self.steps, self.command, self.wanted = snapshots[-1]
@@ -232,6 +234,13 @@ class Teaching:
             "highest": bounds.upper[0].round(5).tolist(),
             "the mean alone succeeds": self.is_success(),
         }
+
+    def _go_at(self, rate: float) -> None:
+        """Paces the simulation at a rate to the wall's clock, from now on."""
+        if rate != self.simulator.get_target_realtime_rate():
+            self.simulator.set_target_realtime_rate(rate)
+            # Drake compares all the time since then: it would hurry, or wait, until the new rate held for all of it.
+            self.simulator.ResetStatistics()
 
     def _press(self, name: str, say: Callable[[str], None]) -> None:
         if name == KEEP:

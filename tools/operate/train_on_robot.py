@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,10 +65,12 @@ def train_on_robot(
         raise InputError("nobody demonstrates on a robot: leave the setting demonstration_episodes out")
     with folder.locked(), at_robot(config, other, yes=yes, say=say) as robot:
         folder.write_config(config)
-        with no_pauses(), EpisodeProgress(config.episodes, name=config.task) as progress:
-            rows = _learn(folder, config, robot.env, robot.keys, waits=other.lockstep, report=progress.update)
-        timing = pd.Series(dict(robot.timing()), dtype=object)
-        write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
+        try:
+            with no_pauses(), EpisodeProgress(config.episodes, name=config.task) as progress:
+                rows = _learn(folder, config, robot.env, robot.keys, waits=other.lockstep, report=progress.update)
+        finally:
+            timing = pd.Series(dict(robot.timing()), dtype=object)
+            write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY), "not_learned_from": _unsound(rows)}
 
 
@@ -83,30 +87,42 @@ def _learn(
     waits: bool,
     report: Callable[[dict[str, Any]], None],
 ) -> list[dict[str, Any]]:
-    """All episodes; the arm is brought to rest whatever is raised."""
+    """All episodes; whatever is raised, the arm is brought to rest, and what was recorded and learned is kept."""
     named = arguments_of(config, env.task)
     acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **named)
     student = Student(
         acting, ((config.learner, Spaces(env)), named), waits=waits, leaves_out=UNSOUND, niceness=NICENESS
     )
     rows: list[dict[str, Any]] = []
+    due: list[Callable[[], None]] = []  # what the last episode still leaves
+
+    def write_ledger() -> None:
+        if config.ledger:
+            student.write(ledger_file(folder.ledger, rows[-1]["episode"]), table(env.trace, rows[-1]["episode"]))
+
+    def save_policy() -> None:
+        shape = list(env.observation_space.shape or ())
+        acting.policy({"task": config.task, "observation_shape": shape}).save(folder.path, write=write_atomically)
+
+    def save_learned() -> None:
+        if student.known:
+            save_policy()
+
     try:
         student.warm_up()
         gymnasium.Env.reset(env, seed=config.seed)
         while len(rows) < config.episodes:
             started = time.perf_counter()
             row = rollout(env, student.act, student, index=len(rows))
-            row |= {"learned_from": row["termination"] not in UNSOUND}
+            row |= {"learned_from": int(row["termination"] not in UNSOUND)}
             row |= {"episodes_known": student.known, "late": student.late}
-            student.hand_over()
-            env.idle()
             row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
             rows.append(row)
-            if config.ledger:
-                student.write(ledger_file(folder.ledger, row["episode"]), table(env.trace, row["episode"]))
-            env.idle()
-            folder.write_episodes(rows)
-            env.idle()
+            due = [student.hand_over, write_ledger, partial(folder.write_episodes, rows)]
+            while due:
+                due[0]()
+                due.pop(0)
+                env.idle()
             report(row)
             if keys.wants_pause:
                 keys.wants_pause = False
@@ -114,9 +130,15 @@ def _learn(
         env.rest()
         student.finish()
     except BaseException:
-        env.rest()
-        student.close()
+        with closing(student):
+            try:
+                env.rest()
+            finally:
+                # Each for itself: what ended it may have been the disk, or the process that learns. What is known is
+                # saved before anything is waited for, and again when all that was handed over is learned.
+                for leave in (*due, save_learned, student.finish, save_learned):
+                    with suppress(Exception):
+                        leave()
         raise
-    shape = list(env.observation_space.shape or ())
-    acting.policy({"task": config.task, "observation_shape": shape}).save(folder.path, write=write_atomically)
+    save_policy()
     return rows

@@ -10,7 +10,7 @@ import yaml
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.demonstrated_bounds import DemonstratedBounds, demonstrated_bounds
-from guiderail.tools.files import check_picture
+from guiderail.tools.files import check_picture, write_atomically
 from guiderail.tools.recording.reader import load_demonstrations
 
 
@@ -42,6 +42,8 @@ def constraints(
         check_picture(draw)
     if out is not None and out.exists():
         raise InputError(f"{out} already exists: name another file")
+    if out is not None and not out.parent.is_dir():
+        raise InputError(f"there is no folder {out.parent}: make it first")
     demonstrations = load_demonstrations(file)
     found = demonstrated_bounds(demonstrations, phases, margin, least, outputs)
     values = as_values(found)
@@ -49,7 +51,7 @@ def constraints(
         _write_into(into, values)
     if out is not None:
         text = yaml.safe_dump({"outputs": list(found.names), "bounds": values}, sort_keys=False, width=110)
-        out.write_text(text, encoding="utf-8")
+        write_atomically(out, text.encode())
     if draw is not None:
         _draw(found, demonstrations, draw)
     rows = {

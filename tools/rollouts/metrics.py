@@ -98,6 +98,7 @@ def episode_row(episode: Episode) -> dict[str, Any]:
     return row | {f"reward_{name}": value for name, value in episode.terms.items()}
 
 
+WORDS = ("termination", "fault")  # the latter at a robot
 COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturations", "fallbacks")
 
 
@@ -105,9 +106,9 @@ def checked_rows(rows: pd.DataFrame, where: Path) -> pd.DataFrame:
     """A table of episodes that was read from somewhere.
 
     Raises:
-        InputError: if a column but `termination` holds words, or one that counts no whole numbers.
+        InputError: if a column but `WORDS` holds words, or one that counts no whole numbers.
     """
-    words = [name for name in rows if name != "termination" and not pd.api.types.is_numeric_dtype(rows[name])]
+    words = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
     parts = [name for name in COUNTS if name in rows and name not in words and not (rows[name] % 1 == 0).all()]
     wrong = [*(words if len(rows) else ()), *parts]
     if not wrong and "success" in rows and not rows["success"].isin([0, 1]).all():

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
+from guiderail.models.yaml_files import load_yaml
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
 from guiderail.tools.rollouts.metrics import STATISTICS
 
@@ -176,10 +176,7 @@ def load_study(file: Path | str) -> Study | Smoothness:
             raise InputError(f"there is no study {str(file)!r}: {did_you_mean(file, shipped_studies())}")
     if not path.is_file():
         raise InputError(f"there is no file {path}: name a study's YAML file, or one of {', '.join(shipped_studies())}")
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is no YAML file: {' '.join(str(error).split())}") from error
+    data = load_yaml(path, "study")
     if not isinstance(data, dict):
         raise InputError(f"{path} is no study: it needs at least name, task, methods and seeds")
     kind = Smoothness if "program" in data else Study

@@ -36,6 +36,12 @@ COLUMNS = (
     "collisions in training", "hours",
 )  # fmt: skip
 
+# Of the benchmark of smoothness, whose table has three dozen columns.
+OF_SMOOTHNESS = (
+    "method", "place", "jerk_commanded_linear", "jerk_commanded_angular", "times_below_kgrl_linear",
+    "times_below_kgrl_angular", "success_rate", "peak_force", "worst_violation",
+)  # fmt: skip
+
 
 def write_results(folders: Sequence[Path], out: Path) -> Path:
     """Takes what studies and figures left into a folder, and writes its README.md anew from all that is there.
@@ -105,9 +111,12 @@ def _words(key: str) -> str:
 def _study(name: str, rows: pd.DataFrame) -> str:
     """The section of a study."""
     study = load_study(name)
-    if not isinstance(study, Study):
-        raise InputError(f"{name} is no study of methods and seeds: remove its table")
     lines = [f"## {name}", "", f"`guiderail study {name} --out studies`, and the table `{name}.csv`.", ""]
+    if not isinstance(study, Study):
+        told = rows[list(OF_SMOOTHNESS)]
+        lines += [f"| {' | '.join(map(_words, told))} |", "|" + "---|" * len(told.columns)]
+        lines += [f"| {' | '.join(map(cell, row))} |" for row in told.itertuples(index=False)]
+        return "\n".join([*lines, ""])
     lines += [f"- Figure {number}: {THESIS[number]}." for number in FIGURES.get(name, ())]
     lines += ["", f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
     # A study that judges nothing has an empty column, whose cells are read as NaN.

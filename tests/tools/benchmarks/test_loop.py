@@ -10,3 +10,16 @@ def test_every_part_is_measured_against_its_period(monkeypatch, capsys):
         assert row["over"] <= row["number"]
     loop.show({"as it is": rows})
     assert "station, with what guards it" in capsys.readouterr().out
+
+
+def test_an_answer_that_is_late_is_not_the_next_ones():
+    answers = loop._Answers()
+    first = answers.say(1.0)
+    second = answers.say(2.0)
+    answers.hear(first, 2.5)
+    assert not answers.is_answered()
+    answers.hear(second, 2.75)
+    answers.hear(second, 9.0)
+    assert answers.is_answered()
+    answers.say(3.0)
+    assert answers.seconds() == [1.5, 0.75, float("inf")]

@@ -10,6 +10,7 @@ import yaml
 from guiderail.diagrams.options import validated
 from guiderail.diagrams.tasks.part_file import PartTaskFile
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.models import writing
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
 from guiderail.tools.viewing import replay
@@ -102,6 +103,17 @@ def test_bounds_from_demonstrations_become_its_own(folder, capsys):
         (folder / "task.yaml").write_text(before)
 
 
+def test_bounds_that_cannot_be_written_leave_the_task_as_it_was(folder, monkeypatch, capsys):
+    def fail(*paths):
+        raise OSError(28, "No space left on device")
+
+    before = (folder / "task.yaml").read_text()
+    monkeypatch.setattr(writing.os, "replace", fail)
+    call("constraints", folder / "demonstrations.npz", "--into", folder, code=2)
+    assert "cannot be written" in capsys.readouterr().err
+    assert (folder / "task.yaml").read_text() == before
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -130,6 +142,8 @@ def test_what_makes_no_sense_is_refused_and_leaves_nothing(folder, tmp_path, cap
         (("--unit", "mm", "--axis", "z"), "--axis is one of"),
         (("--unit", "mm", "--place", "1,2"), "--place takes 6 numbers"),
         (("--unit", "mm", "--out", folder), "already exists"),
+        (("--unit", "mm", "--friction", "5"), "friction must be at most 2, not 5"),
+        (("--unit", "mm", "--scenario", tmp_path / "none.yaml"), "there is no scenario"),
     ):
         out = () if "--out" in arguments else ("--out", tmp_path / "task")
         call("onboard", plug, socket, *out, *arguments, code=2)

@@ -1,6 +1,8 @@
 """A policy on a robot, both sides of the bus in one process: neither waits for the wall's clock."""
 
 import json
+from contextlib import contextmanager
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -15,6 +17,8 @@ from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault, StatusLimits
 from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.command import main
+from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.operate import checks, run_policy
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.run_policy import Operation
@@ -61,6 +65,42 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
     assert len(ledger) == 20
     assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(ledger)
     assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "done"
+
+
+def test_a_run_that_fails_leaves_what_was_recorded_beside_what_was_there(monkeypatch, tmp_path):
+    lcm, asked, imported = DrakeLcm("memq://"), [], []
+    task = resolve("BncConnector", {}).task
+    pace = Together(task.world(), lcm, task.start(np.random.default_rng(0)))
+
+    def policy(observation):
+        asked.append(observation)
+        return np.full(2, 0.0 if len(asked) <= 2 else np.nan)
+
+    @contextmanager
+    def standing_in(other, task, url, imports):
+        imported.extend(imports)
+        yield
+
+    monkeypatch.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
+    monkeypatch.setattr(run_policy.Policy, "load", lambda folder: policy)
+    monkeypatch.setattr(run_policy, "hurry", lambda: True)
+    monkeypatch.setattr(Other, "standing_in", standing_in)
+    monkeypatch.setattr(Other, "paces", lambda other, station: (pace, None))
+    monkeypatch.setattr("guiderail.tools.operate.crawl.SETTLE", 0.1)
+    monkeypatch.setattr(Other, "timing", lambda other, station, clock: {})
+    options = {"guidance": "kmp", "uncertainty": "known"}
+    RunFolder(tmp_path).write_config(configure("BncConnector", options, imports=["json"], episodes=1))
+    there = tmp_path / "hardware" / "episode-000004.json"  # of five recordings, somebody took four away
+    there.parent.mkdir()
+    there.write_text("{}")
+    with pytest.raises(PolicyError):
+        run_policy.run_policy(tmp_path, Other(), yes=True, say=lambda words: None)
+    assert imported == ["json"]
+    assert there.read_text() == "{}"
+    found = json.loads((tmp_path / "hardware" / "episode-000005.json").read_text())
+    ledger = pd.read_parquet(tmp_path / "hardware" / "episode-000005.parquet")
+    assert found["outcome"].startswith("failed: PolicyError")
+    assert found["steps"] == len(ledger) > 0
 
 
 @pytest.mark.parametrize("sound", [0, 2])  # of its actions: it is asked once before anything moves
@@ -139,6 +179,9 @@ def test_nobody_confirms_for_a_person(monkeypatch):
         checks.confirm("So?")
     monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
     monkeypatch.setattr("builtins.input", lambda words: "no")
+    with pytest.raises(InputError, match="nothing moves"):
+        checks.confirm("So?")
+    monkeypatch.setattr("builtins.input", Mock(side_effect=EOFError))
     with pytest.raises(InputError, match="nothing moves"):
         checks.confirm("So?")
     monkeypatch.setattr("builtins.input", lambda words: "yes")

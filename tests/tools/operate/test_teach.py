@@ -5,10 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from guiderail.models import writing
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.operate import teach as teaching
-from guiderail.tools.operate.teach import BUTTONS, DISCARD, END, KEEP, SLIDERS, UNDO, Teaching
+from guiderail.tools.operate.teach import BUTTONS, DISCARD, END, KEEP, SLIDERS, SLOW, UNDO, Teaching
 
 
 class Page:
@@ -93,6 +94,47 @@ def test_undo_takes_a_second_back(session):
     assert session.meshcat.sliders["x [mm]"] == pytest.approx(1.0)
     lead(session, "x [mm]", 1.0, 10)
     assert session.simulator.get_context().get_time() == pytest.approx(60 * 0.02)
+
+
+def test_where_nothing_was_shown_undo_does_nothing(session):
+    session.begin()
+    session.undo()
+    lead(session, "x [mm]", 1.0, 5)
+    session.undo()
+    session.undo()
+    assert (session.steps, session.taken.commands) == (0, [])
+    lead(session, "x [mm]", 1.0, 5)
+    assert session.simulator.get_context().get_time() == pytest.approx(5 * 0.02)
+
+
+def test_slow_motion_is_slow_from_now_on_and_catches_up_with_nothing(session, monkeypatch):
+    monkeypatch.setattr(teaching, "SLOWLY", 4.0)  # what is slow takes a test too long
+    paced, step = [], session.step
+
+    def stepped():
+        step()
+        paced.append((session.simulator.get_target_realtime_rate(), session.simulator.get_num_steps_taken()))
+        session.meshcat.clicks[SLOW] += len(paced) in (3, 6)
+
+    session.step = stepped
+    session.run(lambda words: None, most_steps=9)
+    rates, since = zip(*paced, strict=True)
+    assert rates == (1.0,) * 3 + (4.0,) * 3 + (1.0,) * 3
+    # Drake's steps since it began to compare its time with the wall's.
+    assert since[0] == since[3] == since[6] < since[1] == since[4] == since[7]
+
+
+def test_what_was_kept_outlasts_whoever_dies_while_writing(session, monkeypatch):
+    def die(*paths):
+        raise KeyboardInterrupt
+
+    session.begin()
+    lead(session, "x [mm]", 2.0, 12)
+    session.keep()
+    monkeypatch.setattr(writing.os, "replace", die)
+    with pytest.raises(KeyboardInterrupt):
+        session.keep()
+    assert Demonstrations.load(session.out).num_demonstrations == 1
 
 
 def test_buttons_do_what_they_say(session):

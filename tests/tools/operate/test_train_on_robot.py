@@ -13,6 +13,7 @@ from guiderail.diagrams.make import make_guidance, make_station, resolve
 from guiderail.diagrams.tasks.assemble import assemble
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
+from guiderail.models.policy import Policy
 from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.operate.at_robot import AtRobot
@@ -21,7 +22,8 @@ from guiderail.tools.operate.keys import Keys
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
 from guiderail.tools.operate.serve_iiwa import START
-from guiderail.tools.operate.train_on_robot import train_on_robot
+from guiderail.tools.operate.train_on_robot import _learn, train_on_robot
+from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.rollout import rollout
 
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "reward": "shaped", "hold": 5}
@@ -94,8 +96,32 @@ def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_pat
     assert (found["episodes"], found["success_rate"]) == (2, 0.0)
     rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
     assert rows["termination"].tolist() == ["time_limit"] * 2
+    with pytest.raises(InputError, match="already exists"):
+        evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
     with pytest.raises(InputError, match="at least one"):
         evaluate_on_robot(tmp_path, Other(), 0)
+
+
+def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, tmp_path, forkserver):
+    small = {"units": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_every": 1}
+    given = {"algorithm": "sac", "episodes": 5, "settings": small}
+    config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **given)
+    folder, idle, before = RunFolder(tmp_path), env.idle, []
+
+    def refuse():
+        before.append([file.name for file in tmp_path.rglob("*") if file.is_file()])
+        idle()
+        if len(before) == 4:  # the first of the second episode
+            raise InputError("not confirmed: nothing moves")
+
+    monkeypatch.setattr(env, "idle", refuse)
+    with pytest.raises(InputError, match="not confirmed"):
+        _learn(folder, config, env, env.keys, waits=True, report=lambda row: None)
+    assert "policy.json" not in before[-1]
+    assert folder.episodes()["termination"].tolist() == ["time_limit"] * 2
+    assert len(read_ledger(folder.ledger)) == 20
+    assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
+    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.ASKED  # at rest
 
 
 def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
+from guiderail.tools.recording.bounds import constraints
 from guiderail.tools.recording.exchange import export_demonstrations, import_recording
 
 NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
@@ -74,7 +75,7 @@ LAYOUTS = {
 }
 
 
-def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True):
+def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True, beside=None):
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -83,6 +84,8 @@ def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True):
     with Writer(path, version=8) as writer:
         for topic, frame in topics.items():
             connection = writer.add_connection(topic, kind, typestore=store)
+            if beside is not None:
+                writer.add_connection(topic, beside, typestore=store)
             for n in range(5):
                 stamp = types["Time"](sec=10 if stamped else 0, nanosec=10_000_000 * n if stamped else 0)
                 x, y, z, w = Rotation.from_euler("z", 10.0 * n, degrees=True).as_quat()
@@ -172,3 +175,38 @@ def test_what_is_no_recording_is_refused(tmp_path):
     pytest.importorskip("rosbags")
     with pytest.raises(InputError, match="can't be read as a bag"):
         import_recording(tmp_path / "bad.mcap", tmp_path / "a.npz")
+
+
+def test_a_turn_past_half_a_circle_is_the_same_in_all_demonstrations(tmp_path):
+    for name, degrees in (("a", 175), ("b", -175), ("c", 178)):
+        rows = [(0.01 * n, 0, 0, 0, 0, 0, np.deg2rad(degrees + n)) for n in range(4)]
+        write_table(tmp_path / f"{name}.csv", "t,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad", rows)
+    import_recording(tmp_path, tmp_path / "kept.npz")
+    starts = [np.rad2deg(one[0, 3]) for one in Demonstrations.load(tmp_path / "kept.npz").outputs]
+    assert starts == pytest.approx([175, 185, 178])
+
+
+def test_a_feature_of_one_number_is_an_output(tmp_path):
+    import pyarrow.parquet as parquet
+
+    t = 0.1 * np.arange(5)
+    Demonstrations([t], [t[:, None]]).save(tmp_path / "one.npz")
+    export_demonstrations(tmp_path / "one.npz", tmp_path / "set", "lerobot")
+    (data,) = (tmp_path / "set" / "data").rglob("*.parquet")
+    table = parquet.read_table(data)
+    flat = table["action"].combine_chunks().flatten()  # as LeRobot writes it
+    parquet.write_table(table.set_column(table.column_names.index("action"), "action", flat), data)
+    import_recording(tmp_path / "set", tmp_path / "back.npz", signal="action")
+    np.testing.assert_allclose(Demonstrations.load(tmp_path / "back.npz").outputs[0][:, 0], t, atol=1e-6)
+
+
+def test_two_publishers_on_a_topic_are_not_mixed(tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {"/a/pose": "base"}, beside="geometry_msgs/msg/Pose")
+    with pytest.raises(InputError, match="2 publishers on /a/pose"):
+        import_recording(tmp_path / "bag", tmp_path / "x.npz")
+
+
+def test_bounds_go_into_a_folder_that_is_there(file, tmp_path):
+    with pytest.raises(InputError, match="there is no folder"):
+        constraints(file, out=tmp_path / "none" / "bounds.yaml")

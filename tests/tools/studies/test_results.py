@@ -5,7 +5,7 @@ from guiderail.models.errors import InputError
 from guiderail.tools.figures import reproduce
 from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.studies.declaration import shipped_studies
-from guiderail.tools.studies.results import FIGURES, write_results
+from guiderail.tools.studies.results import FIGURES, OF_SMOOTHNESS, write_results
 from guiderail.tools.tables import read_table, write_table
 
 
@@ -39,6 +39,14 @@ def test_a_study_that_judges_nothing_has_its_rows_too(finished, tmp_path):
     write_table(tmp_path / "unjudged" / "connector", table.assign(judged_on=""))
     page = write_results([tmp_path / "unjudged"], tmp_path / "results").read_text()
     assert "| skgrl | 40 | – | – | 12, never | within | 2 | 1.00 |" in page
+
+
+def test_the_benchmark_of_smoothness_has_a_line_for_every_way_to_explore(tmp_path):
+    row = {"method": "KGRL", "place": "free", **dict.fromkeys(OF_SMOOTHNESS[2:], 0.25), "ldlj_measured_angular": 1.0}
+    write_table(tmp_path / "study" / "smoothness", pd.DataFrame([row, row | {"method": "gSDE"}]))
+    page = write_results([tmp_path / "study"], tmp_path / "results").read_text()
+    assert page.count("| free |" + " 0.25 |" * 7) == 2
+    assert "ldlj" not in page
 
 
 def test_the_page_is_written_anew_from_what_is_stored(finished, tmp_path):

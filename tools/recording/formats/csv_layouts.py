@@ -49,7 +49,8 @@ def read_csv_files(
         raise InputError(f"there is no .csv file in {path}: name a file, or a folder of them")
     found = Recorded([], [], ())
     for file in files:
-        one = _read(file, unit, time_unit, quaternion, angles, target)
+        like = found.outputs[0] if found.outputs else None
+        one = _read(file, unit, time_unit, quaternion, angles, target, like)
         if found.names and one.names != found.names:
             raise InputError(f"{file} has other columns than {files[0].name}: record the same ones in all of them")
         found.times += one.times
@@ -66,6 +67,7 @@ def _read(
     quaternion: str | None,
     angles: str | None,
     target: Sequence[float] | None,
+    like: np.ndarray | None,
 ) -> Recorded:
     try:
         table = pd.read_csv(file, sep=None, engine="python", skipinitialspace=True).astype(float)
@@ -92,7 +94,7 @@ def _read(
         return Recorded([times], [positions], POSE_NAMES[:3], [*assumed, "there is no orientation"])
     if target is None:
         assumed.append("poses stay in the frame of the recording: --target says where the task's target is in it")
-    return Recorded([times], [poses_in_target(positions, rotations, target)], POSE_NAMES, assumed)
+    return Recorded([times], [poses_in_target(positions, rotations, target, like)], POSE_NAMES, assumed)
 
 
 def _plain(name: str) -> str:

@@ -57,6 +57,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     try:
         tables = [parquet.read_table(file, columns=columns) for file in files]
         values = np.concatenate([np.array(table[chosen].to_pylist(), dtype=float) for table in tables])
+        values = values.reshape(len(values), -1)  # a feature of one number is stored as numbers, not as lists of one
         frames, episodes = (
             np.concatenate([table[name].to_numpy() for table in tables]) for name in ("frame_index", "episode_index")
         )

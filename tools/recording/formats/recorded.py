@@ -33,12 +33,19 @@ class Recorded:
     assumed: list[str] = field(default_factory=list)
 
 
-def poses_in_target(positions: np.ndarray, rotations: Rotation, target: Sequence[float] | None) -> np.ndarray:
+def poses_in_target(
+    positions: np.ndarray,
+    rotations: Rotation,
+    target: Sequence[float] | None,
+    like: np.ndarray | None = None,
+) -> np.ndarray:
     """Poses (N, 6), [x y z Rz Ry Rx], of positions (N, 3) [m] and rotations, in the target frame.
 
     Args:
         positions, rotations: in the recording's frame.
         target: [x y z] in metres and [rx ry rz] in degrees of the target in that frame; None keeps the recording's.
+        like: poses of an earlier demonstration, (N', 6), to whose angles these are the nearest of all that mean the
+            same: a whole turn between two demonstrations would be learned as their spread.
     """
     if target is not None:
         turn = Rotation.from_euler("xyz", np.asarray(target[3:], dtype=float), degrees=True)
@@ -46,6 +53,8 @@ def poses_in_target(positions: np.ndarray, rotations: Rotation, target: Sequence
         rotations = turn.inv() * rotations
     # Rz(a) Ry(b) Rx(c); a turn past half a circle goes on.
     angles = np.unwrap(rotations.as_euler("ZYX"), axis=0)
+    if like is not None:
+        angles -= 2.0 * np.pi * np.round((angles.mean(axis=0) - like[:, 3:].mean(axis=0)) / (2.0 * np.pi))
     return np.column_stack([positions, angles])
 
 

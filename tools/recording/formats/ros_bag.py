@@ -57,7 +57,7 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
     """
     found = Recorded([], [], ())
     for bag in find_bags(path):
-        times, outputs, names, assumed = _read_bag(bag, topic, target)
+        times, outputs, names, assumed = _read_bag(bag, topic, target, found.outputs[0] if found.outputs else None)
         if found.names and names != found.names:
             raise InputError(f"{bag} has {', '.join(names)}, the bag before {', '.join(found.names)}: record the same")
         found.times.append(times)
@@ -68,7 +68,7 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
 
 
 def _read_bag(
-    bag: Path, topic: str | None, target: Sequence[float] | None
+    bag: Path, topic: str | None, target: Sequence[float] | None, like: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], list[str]]:
     highlevel = _rosbags()
     from rosbags.typesys import Stores, get_typestore
@@ -83,7 +83,15 @@ def _read_bag(
         known = [name for name, kind in kinds.items() if kind in POSES or kind in (JOINTS, DATA)]
         chosen, assumed = choose_signal(sorted(known), topic, str(bag), "--signal")
         connections = [one for one in reader.connections if one.topic == chosen]
+        if len(connections) > 1:
+            raise InputError(
+                f"{bag} has {len(connections)} publishers on {chosen}, whose motions would be mixed: record one of them"
+            )
         rows = [(stamp, reader.deserialize(raw, kinds[chosen])) for _, stamp, raw in reader.messages(connections)]
+    except InputError:
+        raise
+    except Exception as error:  # as above, of a message
+        raise InputError(f"{bag} holds a message that can't be read: {brief(str(error))}") from error
     finally:
         reader.close()
     if len(rows) < 2:
@@ -106,7 +114,7 @@ def _read_bag(
     assumed.append("positions are in metres and quaternions by their fields' names, as ROS has them (REP 103)")
     if target is None:
         assumed.append(f"poses stay in the frame {frame!r}: --target says where the task's target is in it")
-    return times, poses_in_target(positions, rotations, target), POSE_NAMES, assumed
+    return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumed
 
 
 def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:

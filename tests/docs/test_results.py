@@ -1,0 +1,68 @@
+"""What the page of results says of studies is what their tables say."""
+
+from pathlib import Path
+
+import pytest
+
+from guiderail.tools.rollouts.metrics import TOLERANCE
+from guiderail.tools.tables import read_table
+
+RESULTS = Path(__file__).parents[2] / "docs" / "results"
+SMOOTHER = 3.0  # "several times"
+
+
+def of(study, method, judged=None):
+    """A method's rows, each seed's after its last episode."""
+    table = read_table(RESULTS / f"{study}.csv")
+    rows = table[(table["method"] == method) & ((judged is None) | (table["judged_on"] == judged))]
+    assert len(rows), f"{study} has no {method}"
+    return rows
+
+
+def test_standard_tasks_hardly_ask_for_anything():
+    assert (of("connector_nulls", "white", "calibration")["success_rate"] > 0.5).all()
+    assert (of("grid_clamp_nulls", "white")["success_rate"] > 0.5).all()
+    assert (of("pouring_nulls", "best_constant")["success_rate"] > 0.95).all()
+    assert (of("narrow_passage_nulls", "demonstrations")["success_rate"] == 1.0).all()
+
+
+@pytest.mark.parametrize(
+    ("study", "nothing"), [("connector_hard_nulls", "demonstrations"), ("grid_clamp_hard_nulls", "zero")]
+)
+def test_at_hard_policies_that_learned_nothing_fail_and_a_rule_does_not(study, nothing):
+    for method, most in ((nothing, 0.05), ("white", 0.10), ("best_constant", 0.15)):
+        rows = of(study, method)
+        assert (rows["success_rate"] <= most).all(), method
+        assert (rows["episodes"] >= 200).all()
+    assert (of(study, "rule")["success_rate"] >= 0.95).all()
+
+
+def test_at_hard_all_three_learn_the_connector_and_only_residual_learning_leaves_its_bound():
+    methods = {method: of("connector_hard", method) for method in ("kgrl", "skgrl_adaptive", "residual")}
+    for method, rows in methods.items():
+        assert len(rows) >= 5
+        assert (rows["success_rate"] >= 0.95).all(), method
+        assert (rows["training_episodes"] == 60).all()
+        worst = rows[["worst_violation", "training_worst_violation"]]
+        assert (worst.max(axis=1) > TOLERANCE).all() if method == "residual" else (worst <= TOLERANCE).all(axis=None)
+    jerk = {method: rows["training_jerk_commanded_linear_first_10"] for method, rows in methods.items()}
+    assert SMOOTHER * jerk["skgrl_adaptive"].max() < min(jerk["kgrl"].min(), jerk["residual"].min())
+
+
+def test_a_template_inserts_the_clamp_with_the_least_force_and_residual_learning_with_the_most():
+    force = {
+        method: of(study, method)["peak_force"].max()
+        for study, method in (
+            ("grid_clamp", "sct"),
+            ("grid_clamp_guidance", "none"),
+            ("grid_clamp_guidance", "residual"),
+        )
+    }
+    assert force["sct"] < force["none"] < force["residual"]
+    assert (of("grid_clamp_hard", "sct")["success_rate"] >= 0.98).all()
+
+
+def test_kgrl_stays_clear_of_the_passages_walls_and_safe_residual_learning_gets_stuck():
+    assert (of("narrow_passage", "kgrl")["training_collisions"] == 0).all()
+    assert (of("narrow_passage", "residual")["training_collisions"] > 0).all()
+    assert (of("narrow_passage", "safe_residual")["training_success_rate"] < 0.5).all()
