@@ -71,3 +71,16 @@ def test_what_six_joints_lose_in_a_singular_posture_the_posture_gets():
     lost = W[:, 5]
     torque = law(J, 3.0 * lost + W[:, 0])
     np.testing.assert_allclose(torque, 3.0 * lost, atol=1e-6)
+
+
+def test_what_is_too_heavy_to_move_is_left_to_the_posture_before_the_arm_is_singular():
+    rng = np.random.default_rng(3)
+    U, W = (np.linalg.qr(rng.standard_normal((6, 6)))[0] for _ in range(2))
+    J = (U * [1.0, 0.8, 0.6, 0.4, 0.3, (2.0 * HEAVY) ** -0.5]) @ W.T / SCALE[:, None]
+    torque = law(J, 3.0 * W[:, 5] + W[:, 0])
+    np.testing.assert_allclose(torque, 3.0 * W[:, 5], atol=1e-6)
+
+
+def test_refuses_a_mass_matrix_that_is_none():
+    with pytest.raises(np.linalg.LinAlgError, match="mass matrix"):
+        law(np.eye(6), np.zeros(6), M=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0]))
