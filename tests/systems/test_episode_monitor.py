@@ -92,3 +92,17 @@ def test_the_first_of_two_conditions_counts():
 def test_refuses_what_makes_no_sense(make):
     with pytest.raises(InputError):
         make()
+
+
+def test_each_condition_counts_for_itself():
+    episode = Episode(above(5, steps=2), Condition("success", {"u": 1}, lambda u: u[0] > 1, steps=3))
+    assert [episode.step(u) for u in (6, 2, 6, 0)] == [0, 0, SUCCESS, SUCCESS]
+
+
+def test_an_initialization_forgets():
+    episode = Episode(above(1))
+    assert [episode.step(2), episode.step(0)] == [BLOCKED, BLOCKED]
+    episode.signal.GetMutableData().set_value([0.0])
+    episode.context.SetTime(0.0)
+    episode.simulator.Initialize()
+    assert episode.system.get_termination_output_port().Eval(episode.context)[0] == 0.0

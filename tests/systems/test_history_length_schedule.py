@@ -46,6 +46,7 @@ def test_torques_are_no_contact():
     "arguments",
     [
         {"contact_threshold": 1.0, "release_threshold": 2.0},
+        {"release_threshold": -0.1},
         {"dwell_steps": 0},
         {"wrench_size": 0},
         {"lengths": []},
@@ -55,3 +56,7 @@ def test_torques_are_no_contact():
 def test_what_makes_no_sense_is_refused(arguments):
     with pytest.raises(InputError):
         HistoryLengthSchedule(arguments.pop("lengths", [1, 2]), PERIOD, **arguments)
+
+
+def test_one_component_and_a_contact_that_ends_at_no_force_are_allowed():
+    HistoryLengthSchedule([1], PERIOD, contact_threshold=0.0, release_threshold=0.0, dwell_steps=1, wrench_size=1)

@@ -43,7 +43,8 @@ class Episode:
 def test_ports():
     system = SafetyLedger(PERIOD, num_actuators=7)
     assert system.get_record_input_port("saturation").size() == 7
-    assert system.get_record_input_port("contact_force").size() == 1
+    for name in ("commanded_violation", "measured_violation", "contact_force", "fallback"):
+        assert system.get_record_input_port(name).size() == 1
     assert system.get_ledger_output_port().size() == len(SafetyLedger.FIELDS)
 
 
@@ -114,3 +115,8 @@ def test_a_reset_empties_it():
 def test_refuses_what_makes_no_sense(arguments):
     with pytest.raises(InputError):
         SafetyLedger(*arguments)
+
+
+def test_says_that_a_robot_without_actuators_is_none():
+    with pytest.raises(InputError, match="at least one actuator"):
+        SafetyLedger(PERIOD, 0)
