@@ -69,7 +69,7 @@ class DeputyWatch(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
 
     def get_word_input_port(self) -> InputPort:
-        """The deputy's newest word, an abstract `DeputyWord` or None."""
+        """The deputy's newest word, an abstract `DeputyWord`; any other object is none."""
         return self._word_port
 
     def get_status_fault_input_port(self) -> InputPort:
@@ -80,12 +80,16 @@ class DeputyWatch(LeafSystem):
         """What is wrong with the status or the deputy, (1,): a code of `Fault`."""
         return self._fault_port
 
+    def _word(self, context: Context) -> DeputyWord | None:
+        found = self._word_port.Eval(context)
+        return found if isinstance(found, DeputyWord) else None
+
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value([np.nan, 0.0])
         return EventStatus.Succeeded()
 
     def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        word: DeputyWord | None = self._word_port.Eval(context)
+        word = self._word(context)
         number, silence = context.get_discrete_state(self._memory).value()
         if word is not None and word.number != number:
             discrete_state.set_value([word.number, 0.0])
@@ -95,7 +99,7 @@ class DeputyWatch(LeafSystem):
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         fault = float(self._status_fault_port.Eval(context)[0])
-        word: DeputyWord | None = self._word_port.Eval(context)
+        word = self._word(context)
         number, silence = context.get_discrete_state(self._memory).value()
         if fault == Fault.NONE and word is not None:
             is_silent = word.number == number and silence > self._patience

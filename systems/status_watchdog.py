@@ -120,7 +120,7 @@ class StatusWatchdog(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
 
     def get_status_input_port(self) -> InputPort:
-        """The newest status, an abstract `JointStatus` or None."""
+        """The newest status, an abstract `JointStatus`; any other object is none."""
         return self._status_port
 
     def get_clock_input_port(self) -> InputPort:
@@ -160,7 +160,8 @@ class StatusWatchdog(LeafSystem):
         return float(memory[_CLOCK])
 
     def _judge(self, context: Context) -> _Verdict:
-        status: JointStatus | None = self._status_port.Eval(context)
+        found = self._status_port.Eval(context)
+        status = found if isinstance(found, JointStatus) else None
         memory, values = self._memory_of(context), context.get_discrete_state(self._last).value()
         last = Heard(float(memory[_TIME]), float(memory[_OFFSET]), values)
         believed = context.get_discrete_state(self._believed).value().copy()

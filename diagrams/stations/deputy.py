@@ -33,7 +33,7 @@ class WordSerializer(SerializerInterface):
 
     def CreateDefaultValue(self) -> Value:
         """No word yet."""
-        return Value[object](None)
+        return Value[object]()
 
     def Deserialize(self, buffer: bytes, abstract_value: Value) -> None:
         """A message as a `DeputyWord`."""

@@ -33,7 +33,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
-from guiderail.models.joint_status import MISSED, StatusLimits
+from guiderail.models.joint_status import MISSED, DeputyWord, StatusLimits
 from guiderail.models.parsing import follow_directives
 from guiderail.models.registry import did_you_mean
 from guiderail.models.robots.iiwa import IIWA14
@@ -131,7 +131,7 @@ class _StatusSerializer(SerializerInterface):
 
     def CreateDefaultValue(self) -> Value:
         """No status yet."""
-        return Value[object](None)
+        return Value[object]()
 
     def Deserialize(self, buffer: bytes, abstract_value: Value) -> None:
         """A message as a `JointStatus`."""
@@ -351,7 +351,7 @@ class HardwareStation(Station):
     def has_deputy(self, context: Context) -> bool:
         """Whether somebody stands by at the robot; `context` is this station's own."""
         words = self.GetSubsystemByName("deputy_subscriber")
-        return words.get_output_port().Eval(self.GetSubsystemContext(words, context)) is not None
+        return isinstance(words.get_output_port().Eval(self.GetSubsystemContext(words, context)), DeputyWord)
 
     def take_over(self, context: Context, before: Context) -> None:
         """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.

@@ -15,13 +15,13 @@ class Watched:
         self.system = DeputyWatch(period=PERIOD, patience=PATIENCE)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        self.word = self.system.get_word_input_port().FixValue(self.context, Value[object](None))
+        self.word = self.system.get_word_input_port().FixValue(self.context, Value[object]())
         self.status_fault = self.system.get_status_fault_input_port().FixValue(self.context, [0.0])
         self.simulator.Initialize()
         self.step = 0
 
     def hear(self, word):
-        self.word.GetMutableData().set_value(word)
+        self.word.GetMutableData().set_value(word or object())
         self.step += 1
         self.simulator.AdvanceTo(self.step * PERIOD)
         return self.fault

@@ -21,7 +21,7 @@ class Watched:
         self.system = StatusWatchdog(limits, period=PERIOD)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        self.port = self.system.get_status_input_port().FixValue(self.context, Value[object](None))
+        self.port = self.system.get_status_input_port().FixValue(self.context, Value[object]())
         self.step = 0
         self.simulator.Initialize()
 
@@ -31,7 +31,7 @@ class Watched:
 
     def check(self, status):
         """What is found when this is the newest status, before the watchdog's own event and after it."""
-        self.port.GetMutableData().set_value(status)
+        self.port.GetMutableData().set_value(status or object())
         found = self.fault
         self.step += 1
         self.simulator.AdvanceTo(self.step * PERIOD)
@@ -366,7 +366,7 @@ def test_new_is_what_is_believed_and_was_not_there_before():
     sound = watched.sound()
     jumped = WRONG[Fault.POSITION_JUMP](sound)
     for status, expected in ((sound, 1.0), (None, 0.0), (UNREADABLE, 0.0), (jumped, 0.0), (sound, 1.0)):
-        watched.port.GetMutableData().set_value(status)
+        watched.port.GetMutableData().set_value(status or object())
         assert is_new.Eval(watched.context)[0] == expected
     watched.check(sound)
     assert is_new.Eval(watched.context)[0] == 0.0  # it has been taken in
