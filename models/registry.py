@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import difflib
 import pkgutil
+import sys
 from collections.abc import Callable, Iterable, Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -44,6 +45,7 @@ class Registry(Generic[Entry]):
         self.noun = noun
         self._package, self._decorator, self._group = package, decorator, entry_points
         self._entries: dict[str, Entry] = {}
+        self._origins: dict[str, tuple[str, str]] = {}
 
     @overload
     def register(self, name: str, value: None = None) -> Callable[[Entry], Entry]: ...
@@ -57,10 +59,11 @@ class Registry(Generic[Entry]):
         """
         if value is None:
             return lambda decorated: self.register(name, decorated)
-        known = self._entries.get(name)
-        if known is not None and _origin(known) != _origin(value):
-            raise InputError(f"there is a {self.noun} {name!r} already, from {_origin(known)}: choose another name")
-        self._entries[name] = value
+        origin = _origin(value)
+        known = self._origins.get(name, origin)
+        if name in self._entries and known != origin:
+            raise InputError(f"there is a {self.noun} {name!r} already, from {known[0]}: choose another name")
+        self._entries[name], self._origins[name] = value, origin
         return value
 
     def get(self, name: str) -> Entry:
@@ -127,6 +130,16 @@ def _registered(source: str, decorator: str) -> Iterator[str]:
                 yield name.value
 
 
-def _origin(value: object) -> str:
-    """Where something was defined: a module that is imported again defines the same things again."""
-    return f"{getattr(value, '__module__', type(value).__module__)}.{getattr(value, '__qualname__', repr(value))}"
+def _origin(value: object) -> tuple[str, str]:
+    """Where something was defined, a file or a module, and as what: imported again, it is the same thing again.
+
+    An entry that is a record is told by what it builds with. A module's file counts, not its name: the same file can be
+    imported under several.
+    """
+    defined = value if hasattr(value, "__qualname__") else getattr(value, "build", value)
+    while isinstance(defined, partial):
+        defined = defined.func
+    named = hasattr(defined, "__qualname__")
+    module = str(getattr(defined, "__module__", None) or type(defined).__module__)
+    file = getattr(defined, "__globals__", {}).get("__file__") or getattr(sys.modules.get(module), "__file__", None)
+    return str(Path(file).resolve()) if file else module, defined.__qualname__ if named else repr(value)

@@ -21,6 +21,9 @@ from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 from guiderail.models.yaml_files import parse_yaml
 
+_IMPORTED: dict[Path, bytes] = {}
+"""What each file said when it was imported."""
+
 
 def known_tasks() -> list[str]:
     """The tasks that there are: those that are declared, and environments that somebody registered as guiderail's."""
@@ -87,13 +90,17 @@ def task_content(task: str) -> str:
 
 
 def _import_file(path: Path) -> str:
+    """Runs a file as a module, once as long as it stays what it is: what it registers is then one thing."""
     path = path.resolve()
     name = f"guiderail_imported_{path.stem}"
     spec = spec_from_file_location(name, path)
     if spec is None or spec.loader is None or not path.is_file():
         raise FileNotFoundError(f"{path} is no file")
-    module = sys.modules[name] = module_from_spec(spec)
-    spec.loader.exec_module(module)
+    content = path.read_bytes()
+    if _IMPORTED.get(path) != content:
+        module = sys.modules[name] = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        _IMPORTED[path] = content
     return str(path)
 
 

@@ -1,7 +1,8 @@
 import pytest
 
+from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.models.errors import InputError
-from guiderail.tools.tasks import changed_environment, check_environment
+from guiderail.tools.tasks import changed_environment, check_environment, import_modules
 
 
 @pytest.mark.parametrize(("learned_on", "judged_on"), [("rails", "mujoco"), ("rails", "arm"), ("arm", "rails")])
@@ -24,3 +25,17 @@ def test_what_is_asked_for_and_the_other_station_does_not_have_is_refused():
 def test_an_environment_of_no_station_takes_others():
     assert changed_environment("Bead", {"wall": 1.0}, {"wall": 2.0}) == {"wall": 2.0}
     assert changed_environment("Bead", {"wall": 1.0}, {"station": "rails"}) == {"wall": 1.0, "station": "rails"}
+
+
+def test_a_file_is_run_once_as_long_as_it_stays_what_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(GUIDANCE, "_entries", {**GUIDANCE._entries})  # no other test has this one
+    file = tmp_path / "step_of_mine.py"
+    declared = "import guiderail as gr\n\n@gr.register_guidance('step_of_mine', label='{}')\ndef step(known):\n    pass\n"
+    file.write_text(declared.format("one"), encoding="utf-8")
+    import_modules([file])
+    first = GUIDANCE.get("step_of_mine")
+    assert import_modules([file]) == (str(file),)
+    assert GUIDANCE.get("step_of_mine") is first
+    file.write_text(declared.format("another"), encoding="utf-8")
+    import_modules([file])
+    assert GUIDANCE.get("step_of_mine").label == "another"

@@ -48,6 +48,7 @@ def test_a_simulated_robot_imports_what_the_run_does(tmp_path, monkeypatch):
             lambda: main(["stand-by", "--task", "mine/Connector", "--import", str(file)]),
         ):
             monkeypatch.setattr(TASKS, "_entries", {**TASKS._entries})
+            monkeypatch.setattr("guiderail.tools.tasks._IMPORTED", {})
             TASKS._entries.pop("mine/Connector", None)  # it is another process
             with pytest.raises(SystemExit) as end:
                 run()
