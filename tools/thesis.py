@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.options import STANDARD
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.units import MM
 from guiderail.tools.learning.presets import PRESETS, Preset, decision_discount
@@ -189,11 +191,22 @@ def differences(config: RunConfig, *, learns: bool = True) -> list[str]:
             continue
         if not any(_same(environment[name], value) for value in values):
             found.append(f"{_words(name)} {_value(environment[name])} (thesis: {_either(values)})")
-    found += _learner_differences(config, setting) if learns else []
+    if learns:
+        sided = replace(config.learner, symmetry=config.learner.symmetry if _has_sides(config) else False)
+        found += _learner_differences(replace(config, learner=sided), setting)
     chamfer = environment.get("mouth_chamfer", BncDimensions().mouth_chamfer)
     known = {"kappa": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
     found += [words.format(**known) for words, holds in setting.remarks if holds(environment)]
     return found
+
+
+def _has_sides(config: RunConfig) -> bool:
+    """Whether the task has a symmetry that holds for the guidance's actions."""
+    from guiderail.diagrams.tasks.task import Task  # Drake takes a second
+
+    guidance = config.environment.get("guidance")
+    displaces = guidance in GUIDANCE.names() and GUIDANCE.get(guidance).displaces
+    return displaces and TASKS.get(config.task).symmetry is not Task.symmetry
 
 
 def _learner_differences(config: RunConfig, setting: Setting) -> list[str]:

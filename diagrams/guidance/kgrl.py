@@ -10,7 +10,14 @@ from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
-@register_guidance("kgrl", needs=(("demonstrations",),), label="KGRL", colour="#1f77b4", demonstrates=True)
+@register_guidance(
+    "kgrl",
+    needs=(("demonstrations",),),
+    label="KGRL",
+    colour="#1f77b4",
+    demonstrates=True,
+    displaces=True,
+)
 class KgrlGuidance(PrimitiveGuidance):
     """A policy's actions deviate where the demonstrations did, and every command keeps the constraints."""
 

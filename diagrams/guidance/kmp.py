@@ -10,7 +10,12 @@ from guiderail.diagrams.guidance.registry import register_guidance
 
 
 @register_guidance(
-    "kmp", needs=(("demonstrations",),), label="demonstration alone", colour="#333333", demonstrates=True
+    "kmp",
+    needs=(("demonstrations",),),
+    label="demonstration alone",
+    colour="#333333",
+    demonstrates=True,
+    displaces=True,
 )
 class KmpGuidance(PrimitiveGuidance):
     """Commands the demonstrations' mean; the action changes nothing."""

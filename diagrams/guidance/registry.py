@@ -36,6 +36,8 @@ class GuidanceKind:
         colour: what it is drawn with, "#rrggbb".
         demonstrates: whether an action of zero is the demonstrations or the script alone, so that success before
             anything is learned can be stated.
+        displaces: whether an action displaces the explored outputs, a number for each. Only of such actions a task's
+            symmetry says what they are from another side; learning by any other goes on without it.
         options: a model of further options of the environment; none unless given.
     """
 
@@ -45,6 +47,7 @@ class GuidanceKind:
     label: str
     colour: str
     demonstrates: bool = False
+    displaces: bool = False
     options: type[Options] | None = None
 
     def lacks(self, known: Collection[str]) -> tuple[str, ...]:
@@ -68,18 +71,19 @@ def register_guidance(
     label: str | None = None,
     colour: str = "#17becf",
     demonstrates: bool = False,
+    displaces: bool = False,
     options: type[Options] | None = None,
 ) -> Callable[[Callable[[Known], Diagram]], Callable[[Known], Diagram]]:
     """A decorator that adds a kind of guidance; it decorates a function or a class that takes a `Known`.
 
     Args:
         name: what `guidance=` calls it.
-        needs, colour, demonstrates, options: see `GuidanceKind`.
+        needs, colour, demonstrates, displaces, options: see `GuidanceKind`.
         label: what a legend calls it; its name unless given.
     """
 
     def add(build: Callable[[Known], Diagram]) -> Callable[[Known], Diagram]:
-        kind = GuidanceKind(name, build, needs, label or name, colour, demonstrates, options)
+        kind = GuidanceKind(name, build, needs, label or name, colour, demonstrates, displaces, options)
         GUIDANCE.register(name, kind)
         return build
 

@@ -45,6 +45,7 @@ class ResidualGuidance(PrimitiveGuidance):
     label="residual RL",
     colour="#d62728",
     demonstrates=True,
+    displaces=True,
 )
 def residual(known: Known) -> Diagram:
     """Adds to the demonstrations, or to a scripted approach behind a template's active constraints."""
@@ -57,6 +58,7 @@ def residual(known: Known) -> Diagram:
     label="safe residual RL",
     colour="#ff7f0e",
     demonstrates=True,
+    displaces=True,
 )
 def safe_residual(known: Known) -> Diagram:
     """Residual learning that stops before walls."""

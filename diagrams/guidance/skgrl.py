@@ -12,7 +12,14 @@ from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
-@register_guidance("skgrl", needs=(("demonstrations",),), label="sKGRL", colour="#2ca02c", demonstrates=True)
+@register_guidance(
+    "skgrl",
+    needs=(("demonstrations",),),
+    label="sKGRL",
+    colour="#2ca02c",
+    demonstrates=True,
+    displaces=True,
+)
 class SkgrlGuidance(PrimitiveGuidance):
     """Null-space actions through a history of outputs: exploration is smooth.
 

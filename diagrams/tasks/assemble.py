@@ -16,6 +16,7 @@ from guiderail.diagrams.cameras import Camera, add_camera, add_meshcat
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.ledger import add_ledger
 from guiderail.diagrams.observation import Observation, affine
 from guiderail.diagrams.options import validated
@@ -221,6 +222,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
+    displaces = GUIDANCE.get(task.choice.guidance).displaces  # what a symmetry of the task takes an action for
     return TaskDiagram(
         diagram=diagram,
         control_period=period,
@@ -231,8 +233,8 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         randomize=randomizes(task, station, guidance),
         push=_push(station) if task.pushable else None,
         query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
-        symmetry=task.symmetry(),
-        near_symmetry=task.near_symmetry(),
+        symmetry=task.symmetry() if displaces else None,
+        near_symmetry=task.near_symmetry() if displaces else None,
         declaration=task,
     )
 

@@ -142,7 +142,10 @@ class Task(ABC):
         """What ends an episode; the first that holds counts."""
 
     def symmetry(self) -> Symmetry | None:
-        """Turns and mirrors under which the task stays what it is."""
+        """Turns and mirrors under which the task stays what it is; an action displaces the explored outputs.
+
+        Guidance that is not registered with `displaces=True` takes actions for something else, and has none.
+        """
         return None
 
     def near_symmetry(self) -> Symmetry | None:

@@ -80,6 +80,14 @@ def test_each_setting_of_the_learner_that_differs_is_named(setting, words):
     assert words in added
 
 
+@pytest.mark.parametrize(
+    ("task", "guidance", "sides"), [("BncConnector", "kgrl", 1), ("NarrowPassage", "kgrl", 0), ("GridClamp", "sct", 0)]
+)
+def test_other_sides_are_named_where_there_are_any(task, guidance, sides):
+    words = told(task, {"guidance": guidance}, algorithm="tqc", preset="robust")
+    assert sum("seen from other sides" in one for one in words) == sides
+
+
 def test_a_discount_means_the_same_whatever_an_action_lasts():
     words = told("BncConnector", {**AS_PRINTED, "hold": 10}, algorithm="tqc", preset="table_4_1_robot")
     assert not any("discount" in one for one in words)
