@@ -127,7 +127,7 @@ class TaskDiagram:
             pushes the robot. None where a task has no such thing.
         query: of the scene, for a browser view.
         view: the browser view of an environment made with `render_mode="human"`.
-        symmetry: of task and guidance, where they have one; a learner may learn from what it saw, seen from the other side.
+        symmetry: of task and guidance, where they have one; what was seen may be learned from as seen from other sides.
         near_symmetry: the same, with sides from which only most of an episode stays what it is.
         declaration: the `Task` that this was assembled of, where it was.
     """

@@ -256,7 +256,7 @@ def evaluate(
 
     It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
     episodes: what they come to is what a success is worth. Their episodes are kept, and not run again. To be a policy
-    for the offset that a run hides, or with --fresh for any, are two claims: which of them, is printed first.
+    for the offset that a run hides, or with --fresh for any, are two claims: the row "claim" of the table says which.
     """
     from guiderail.tools.rollouts.evaluate import evaluate as evaluate_run
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from guiderail.diagrams.disturbances import Disturbances
@@ -80,17 +81,29 @@ def options_in_words(name: str) -> dict[str, str]:
     words = {}
     for model in resolved.models.values():
         for row in described(type(model)):
-            allowed = row.get("choices") or choices.get(row["name"])
-            among = f"one of {', '.join(map(str, allowed))}; " if allowed else ""
-            if {"minimum", "maximum"} <= row.keys():
-                among = f"from {row['minimum']:g} to {row['maximum']:g}; "
-            words[row["name"]] = f"{row['description']}: {among}{resolved.values[row['name']]!r} unless given"
+            words[row["name"]] = _option(row, resolved.values[row["name"]], choices.get(row["name"], ()))
+    for kind in map(GUIDANCE.get, choices["guidance"]):
+        if kind.name != resolved.task.choice.guidance:
+            own = {
+                row["name"]: f"of guidance={kind.name}: {_option(row, row['default'])}"
+                for row in described(kind.options)
+            }
+            words |= {key: f"{words[key]}; {said}" if key in words else said for key, said in own.items()}
     for difficulty, settings in declared.difficulties.items():
         if settings:
             stands_for = ", ".join(f"{key}={_said(value)}" for key, value in settings.items())
             words[f"difficulty={difficulty}"] = f"stands for {stands_for}"
     reset = {f"reset: {row['name']}": row["description"] for row in described(declared.Reset)}
     return words | reset
+
+
+def _option(row: Mapping[str, Any], default: Any, choices: Collection[str] = ()) -> str:
+    """What an option is, what it can be, and what it is unless given."""
+    allowed = row.get("choices") or choices
+    among = f"one of {', '.join(map(str, allowed))}; " if allowed else ""
+    if {"minimum", "maximum"} <= row.keys():
+        among = f"from {row['minimum']:g} to {row['maximum']:g}; "
+    return f"{row['description']}: {among}{default!r} unless given"
 
 
 def _guidance(name: str) -> dict[str, Any]:

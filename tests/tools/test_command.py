@@ -118,6 +118,7 @@ def test_training_leaves_the_whole_folder(capsys, tmp_path):
     assert code == 0
     assert json.loads(out)["episodes"] == 2
     assert "Bead 2/2" in err
+    assert err.index("learned; now the learning curve and a replay page") > err.index("Bead 2/2")
     expected = {"config.yaml", "episodes.csv", "checkpoint", "policy.safetensors", "policy.json", "learning_curve.png"}
     assert expected <= {path.name for path in (tmp_path / "run").iterdir()}
 
@@ -125,7 +126,7 @@ def test_training_leaves_the_whole_folder(capsys, tmp_path):
 def test_evaluation_can_be_read_by_a_program(capsys, trained):
     code, out, err = call(capsys, "evaluate", trained, "--episodes", 3, "--json")
     assert code == 0
-    assert "held-out episodes 3/3" in err
+    assert "series 1 of 4: the policy 3/3" in err
     result = json.loads(out)
     assert {"success_rate", "demonstration_success_rate", "episodes", "worst_violation", "peak_force"} <= result.keys()
     assert result["episodes"] == 3

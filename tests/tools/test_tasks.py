@@ -30,7 +30,9 @@ def test_an_environment_of_no_station_takes_others():
 def test_a_file_is_run_once_as_long_as_it_stays_what_it_is(tmp_path, monkeypatch):
     monkeypatch.setitem(GUIDANCE._entries, "step_of_mine", None)  # no other test has this one
     file = tmp_path / "step_of_mine.py"
-    declared = "import guiderail as gr\n\n@gr.register_guidance('step_of_mine', label='{}')\ndef step(known):\n    pass\n"
+    declared = (
+        "import guiderail as gr\n\n@gr.register_guidance('step_of_mine', label='{}')\ndef step(known):\n    pass\n"
+    )
     file.write_text(declared.format("one"), encoding="utf-8")
     import_modules([file])
     first = GUIDANCE.get("step_of_mine")

@@ -1,5 +1,6 @@
 """`guiderail train`: what was typed becomes a checked configuration, and a run becomes a folder with its pictures."""
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -101,6 +102,7 @@ def run(
     watching = person() if config.with_person and person is not None else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
         rows = train(folder, config, resume=resume, report=progress.update, demonstrator=shows, person=watching)
+    print(f"learned; now the learning curve and a replay page are drawn into {out}", file=sys.stderr, flush=True)
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
@@ -34,6 +35,11 @@ COMPARED = (
     "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "worst_violation",
     "worst_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
 )  # fmt: skip
+SERIES = {
+    "policy": "the policy", "demonstration": "demonstration alone", "zero": "no action", "white": "white noise",
+    "constant": "one constant action", "rule": "the rule written by hand",
+}  # fmt: skip
+"""Who acts in a series of held-out episodes, in words."""
 
 
 def evaluate_policy(
@@ -116,8 +122,8 @@ def evaluate(
         episodes: how many, each with held-out initial conditions and offsets.
         seed: of the first; the policy and the demonstration meet the same ones.
         environment: arguments of the environment that are other ones than where it learned, such as the station.
-        beside: what else acts in the same episodes, by a name: null policies and rules by hand. Their rows are kept in
-            the run's folder and used again.
+        beside: what else acts in the same episodes, by a name: null policies and rules by hand. Their rows and the
+            demonstration's are kept in the run's folder and used again.
         fresh: what is hidden and constant in the run is drawn anew in every episode.
 
     Returns:
@@ -138,24 +144,28 @@ def evaluate(
     claimed = claim(config.task, where, fresh)
     if fresh:
         how["options"] = {"new_run": True}
-    rows = evaluate_run(config, partial(as_learned, policy), where, words="held-out episodes", **how)
-    alone = pd.DataFrame()
-    if is_demonstrated(where.get("guidance")):
-        alone = evaluate_run(config, still, where, words="demonstration alone", **how)
+    alone = {"demonstration": still} if is_demonstrated(where.get("guidance")) else {}
+    them = {**alone, **(beside or {})}
+    series = {
+        name: f"series {number} of {1 + len(them)}: {SERIES.get(name, name)}"
+        for number, name in enumerate(("policy", *them), start=1)
+    }
+    rows = evaluate_run(config, partial(as_learned, policy), where, words=series["policy"], **how)
+    kept, judged = folder.path / "beside", {}
+    for name, acts in them.items():
+        if kept_file(kept, name, config, where, **how).exists():
+            print(f"{series[name]}: kept from before, and not run again", file=sys.stderr, flush=True)
+        found = judged_once(kept, name, config, acts, where, words=series[name], **how)
+        if found is not None:
+            judged[name] = found
     others: dict[str, Any] = {}
-    names = ["demonstration"] * bool(len(alone))
-    for name, acts in (beside or {}).items():
-        judged = judged_once(folder.path / "beside", name, config, acts, where, **how)
-        if judged is None:
-            continue
-        others |= summary(judged, COMPARED, f"{name}_")
-        names.append(name)
+    for name, found in ({"demonstration": pd.DataFrame()} | judged).items():
+        others |= summary(found, COMPARED, f"{name}_")
     return {
         "claim": claimed,
         **summary(rows, COMPARED),
-        **summary(alone, COMPARED, "demonstration_"),
         **others,
-        "beside": names,
+        "beside": [*judged],
         "episodes": episodes,
         "seed": seed,
         "converged_after": converged_after(trained),

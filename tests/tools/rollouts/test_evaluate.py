@@ -39,8 +39,8 @@ def test_what_is_known_is_not_evaluated_again(tmp_path):
 def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_run, capsys):
     result = evaluate(bead_run, episodes=3)
     said = capsys.readouterr().err
-    assert "held-out episodes 3/3" in said
-    assert "demonstration alone 3/3" in said
+    assert "series 1 of 2: the policy 3/3" in said
+    assert "series 2 of 2: demonstration alone 3/3" in said
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
     elsewhere = evaluate(bead_run, episodes=3, environment={"wall": -0.5})
@@ -59,9 +59,12 @@ def test_what_learned_nothing_meets_the_same_episodes_once(bead_run, capsys):
     for name in COMPARED:
         assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
     assert first["white_mean_return"] != first["zero_mean_return"]
-    assert "white 3/3" in capsys.readouterr().err
+    assert "series 4 of 5: white noise 3/3" in capsys.readouterr().err
     again = evaluate(bead_run, episodes=3, beside=policies)
-    assert "white" not in capsys.readouterr().err
+    said = capsys.readouterr().err
+    for who in ("series 2 of 5: demonstration alone", "series 4 of 5: white noise"):
+        assert f"{who}: kept from before, and not run again" in said
+        assert f"{who} 3/3" not in said
     assert again == first
     assert evaluate(bead_run, episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
 
