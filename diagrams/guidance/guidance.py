@@ -82,16 +82,23 @@ class Guidance(Diagram):
         return self.GetOutputPort("fallback")
 
 
-def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int) -> None:
+def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int, kind: str = "") -> None:
     """Refuses a diagram that can't stand between a policy and a station.
+
+    Args:
+        guidance: the diagram.
+        pose_size, wrench_size: O and W of the station.
+        kind: what the sentence calls it; the diagram's name unless given.
 
     Raises:
         InputError: if a port of the contract is missing or of another size than the station's.
     """
-    missing = [name for name in INPUTS if not guidance.HasInputPort(name)]
-    missing += [name for name in OUTPUTS if not guidance.HasOutputPort(name)]
+    called = f"guidance '{kind or guidance.get_name()}'"
+    unlistened = [name for name in INPUTS if not guidance.HasInputPort(name)]
+    missing = unlistened + [name for name in OUTPUTS if not guidance.HasOutputPort(name)]
     if missing:
-        raise InputError(f"guidance '{guidance.get_name()}' exports no port {', '.join(missing)}: all guidance does")
+        remedy = ", and an input that it doesn't use from a PassThrough of its size" if unlistened else ""
+        raise InputError(f"{called} exports no port {', '.join(missing)}: all guidance does{remedy}")
     sizes = {
         "pose": (guidance.GetInputPort("pose").size(), pose_size),
         "wrench": (guidance.GetInputPort("wrench").size(), wrench_size),
@@ -102,6 +109,4 @@ def check_guidance_ports(guidance: Diagram, pose_size: int, wrench_size: int) ->
     }
     for name, (found, wanted) in sizes.items():
         if found != wanted:
-            raise InputError(
-                f"port {name} of guidance '{guidance.get_name()}' has size {found}, where {wanted} is needed"
-            )
+            raise InputError(f"port {name} of {called} has size {found}, where {wanted} is needed")

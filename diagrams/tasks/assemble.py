@@ -131,7 +131,7 @@ class Loop:
         self.builder = builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
         self.guidance = builder.AddNamedSystem("guidance", guidance)
-        check_guidance_ports(guidance, station.pose_size, station.wrench_size)
+        check_guidance_ports(guidance, station.pose_size, station.wrench_size, task.choice.guidance)
         builder.Connect(station.get_pose_output_port(), guidance.GetInputPort("pose"))
         builder.Connect(station.get_wrench_output_port(), guidance.GetInputPort("wrench"))
         builder.Connect(guidance.GetOutputPort("desired_pose"), station.get_desired_pose_input_port())

@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import PassThrough
 
+from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.law import LawGuidance
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.diagrams.make import make_env
+from guiderail.models.errors import InputError
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -29,3 +33,17 @@ def test_where_an_action_displaces_the_explored_outputs_the_tasks_symmetry_holds
     env = make_env("BncConnector", guidance="kgrl")
     np.testing.assert_array_equal(env.task.symmetry.actions, [-np.eye(2)])
     assert len(env.task.near_symmetry.actions) > 1
+
+
+def test_guidance_that_lacks_a_port_is_named_by_its_kind(monkeypatch):
+    monkeypatch.setitem(GUIDANCE._entries, "deaf_of_mine", None)  # no other test has this one
+
+    @register_guidance("deaf_of_mine")
+    def deaf(known):
+        guidance, builder = Guidance(), DiagramBuilder()
+        builder.ExportInput(builder.AddSystem(PassThrough(2)).get_input_port(), "action")
+        builder.BuildInto(guidance)
+        return guidance
+
+    with pytest.raises(InputError, match=r"guidance 'deaf_of_mine' exports no port pose, wrench, .*from a PassThrough"):
+        make_env("NarrowPassage", guidance="deaf_of_mine")

@@ -1,0 +1,60 @@
+"""How does guidance of my own remember? In discrete state, which a reset restores as it does everything else's.
+
+This one adds each action to its last command, not to where the robot is.
+"""
+
+import numpy as np
+from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOrderHold
+
+from guiderail import Guidance, Known, make_env, register_guidance
+from guiderail.systems import ConstraintViolation
+
+STEP = 0.01  # of a full action [m]
+
+
+class Creep(LeafSystem):
+    """Commands command[k] = command[k − 1] + STEP action[k], from where the robot is at first."""
+
+    def __init__(self, known: Known):
+        super().__init__()
+        self.action = self.DeclareVectorInputPort("action", known.pose_size)
+        self.pose = self.DeclareVectorInputPort("pose", known.pose_size)
+        # Of the state alone: where an input fed through, the loop with the station's measured pose would be algebraic.
+        self.DeclareStateOutputPort("desired_pose", self.DeclareDiscreteState(known.pose_size))
+        self.DeclareInitializationDiscreteUpdateEvent(self.start)
+        self.DeclarePeriodicDiscreteUpdateEvent(known.period, 0.0, self.step)
+
+    def start(self, context: Context, state: DiscreteValues) -> None:
+        """The first command is the measured pose: anything else would pull the robot there."""
+        state.set_value(self.pose.Eval(context))
+
+    def step(self, context: Context, state: DiscreteValues) -> None:
+        state.set_value(context.get_discrete_state_vector().value() + STEP * self.action.Eval(context))
+
+
+@register_guidance("creep")
+def creep(known: Known) -> Guidance:
+    guidance, builder = Guidance(), DiagramBuilder()
+    command = builder.AddNamedSystem("creep", Creep(known))
+    held = builder.AddNamedSystem("held_action", ZeroOrderHold(known.period, known.pose_size))
+    judge = builder.AddNamedSystem("violation", ConstraintViolation(known.constraints, known.period))
+    builder.Connect(command.get_output_port(), judge.get_pose_input_port())
+    builder.ExportInput(command.GetInputPort("pose"), "pose")
+    builder.ExportInput(command.GetInputPort("action"), "action")
+    builder.ConnectInput("action", held.get_input_port())
+    builder.ExportInput(builder.AddSystem(PassThrough(known.wrench_size)).get_input_port(), "wrench")  # unused
+    builder.ExportOutput(command.get_output_port(), "desired_pose")
+    builder.ExportOutput(held.get_output_port(), "held_action")
+    builder.ExportOutput(judge.get_violation_output_port(), "constraint_violation")
+    builder.ExportOutput(builder.AddSystem(ConstantVectorSource([0.0])).get_output_port(), "fallback")
+    builder.BuildInto(guidance)
+    return guidance
+
+
+env = make_env("NarrowPassage", guidance="creep", hold=5)
+for episode in range(2):
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.array([0.0, 0.5]))
+    print("episode", episode, "commands", env.trace.commanded[-1].round(3), "m at last: a reset forgets")
