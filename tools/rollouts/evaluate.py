@@ -63,7 +63,7 @@ def evaluate_policy(
     if not 0 <= seed < 2**31:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
     rows = []
-    with EpisodeProgress(episodes, name=words) if words else nullcontext() as progress:
+    with EpisodeProgress(episodes, name=words, window=None) if words else nullcontext() as progress:
         for i in range(episodes):
             rows.append(rollout(env, act, index=i, seed=seed + i, held_out=True, options=options))
             if progress is not None:
