@@ -429,7 +429,9 @@ def record(
 def check(
     file: Annotated[
         Path,
-        _arg("Demonstrations (.npz, .csv or a folder of them), or a skill (.yaml, or the name of a shipped one).", "FILE"),
+        _arg(
+            "Demonstrations (.npz, .csv or a folder of them), or a skill (.yaml, or the name of a shipped one).", "FILE"
+        ),
     ],
     draw: Annotated[
         Path | None, _opt("Draw the demonstrations, or a skill's state machine (.png, .svg, .pdf; a skill also .dot).")
@@ -1056,9 +1058,7 @@ def _rule(task: str) -> Any:
     return untrained(task, "rule")
 
 
-def _episode(
-    shown: str, policy: str, environment: Mapping[str, Any], seed: int, imports: Sequence[str] | None
-) -> Any:
+def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int, imports: Sequence[str] | None) -> Any:
     """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
     from guiderail.tools.viewing import shown as showing
 
