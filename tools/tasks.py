@@ -100,7 +100,8 @@ def _import_file(path: Path) -> str:
     path = path.resolve()
     name = f"guiderail_imported_{path.stem}"
     spec = spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = sys.modules[name] = module_from_spec(spec)
     beside = str(path.parent)
     sys.path.insert(0, beside)

@@ -225,7 +225,8 @@ def stress(
     """Stresses a task, or all of them, for so many episodes or control steps.
 
     Args:
-        task: a task; those of one's own are tried as `own_task` says. Or "all": each of `STRESSED` gets the same part of the control steps.
+        task: a task; one of your own is tried as `own_task` says. Or "all": each of `STRESSED` gets the same part of
+            the control steps.
         episodes: how many; 1000 unless given, and not for all tasks.
         steps: control steps, instead.
         seed: of the first episode of each task.
