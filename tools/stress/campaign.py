@@ -250,7 +250,7 @@ def stress(
             raise InputError(f"all tasks leave a folder, not the table {out}: name a folder with --out")
         return _stress_all(-(-steps // len(STRESSED)), seed=seed, out=out, say=say)
     if task not in STRESSED and task not in TASKS.names():
-        remedy = did_you_mean(task, [*STRESSED, *TASKS.names(), EVERY])
+        remedy = did_you_mean(task, {*STRESSED, *TASKS.names(), EVERY})
         raise InputError(
             f"there is no task {brief(task)} to stress: {remedy}"
             + ("" if remedy.endswith("?") else ", or --import the file that registers it")
