@@ -66,6 +66,9 @@ class Task(ABC):
     Attributes:
         options: the task's own, checked.
         choice: what every environment is made with.
+        collision: the signal that the ledger counts collisions of; unless declared, none are counted as known.
+        draws_held_out: whether `reset` draws from conditions that training never draws where `options.held_out` is
+            true. Without it an evaluation repeats conditions of training, and says so.
         drawn: what `signals` adds to a diagram and a reset sets, by name. A diagram is used again by whoever asks for
             the same, whose task gets these with it: systems that a task keeps anywhere else are missing there.
     """
@@ -82,6 +85,7 @@ class Task(ABC):
     num_steps: int
     clip: ClassVar[float] = 3.0
     collision: Threshold = Threshold()
+    draws_held_out: ClassVar[bool] = False
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
 
@@ -170,6 +174,11 @@ class Task(ABC):
     def scene(self) -> Scene:
         """What is drawn beside the robot, and where to look from."""
         return Scene(to_world=in_plane)
+
+    @classmethod
+    def declares_collision(cls) -> bool:
+        """Whether somebody said what a collision is, for the class or in its constructor."""
+        return cls.collision is not Task.collision or cls.__init__ is not Task.__init__
 
     @classmethod
     def knows(cls) -> tuple[str, ...]:
