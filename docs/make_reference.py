@@ -402,7 +402,9 @@ STATE_WORDS = {
     "starts_at_…": "the distance at which the state's progress is 0",
     "ends_at_…": "the distance at which it is over; unless given the first transition's",
     "weight_per_…": "how much of the reward's progress a metre or a degree is worth; 1 unless given",
-    "transitions": "a list of `to`, `below_…` and, where there is a way back, `hysteresis_…`",
+    "transitions": "a list of `to`, `below_…` and, for a way back, `hysteresis_…`: the state changes to `to` where this "
+    "state's distance falls below `below_…`, and returns where it exceeds `below_…` + `hysteresis_…`; without "
+    "`hysteresis_…` it never returns",
 }
 
 
