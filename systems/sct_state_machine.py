@@ -24,8 +24,9 @@ class SctStateMachine(LeafSystem):
 
         q → q' where d_q < threshold of the transition to q',  q' → q where d_q > threshold + hysteresis
 
-    (`Skill.next_state`), for the pose just before the control instant, and at most one transition at each. An episode
-    begins in the state that the initial pose is in.
+    (`Skill.next_state`), for the pose just before the control instant, and at most one transition at each. A transition
+    waits until one period leads from that pose into the next state's active constraints: so no command has to leave
+    them, however the template's states meet. An episode begins in the state that the initial pose is in.
 
     .. pydrake_system::
 
@@ -60,7 +61,7 @@ class SctStateMachine(LeafSystem):
         """
         super().__init__()
         check_period(period)
-        self._skill = skill
+        self._skill, self._period = skill, period
         self.frames = SkillFrames(self, skill, frames)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._initial_pose_port = self.DeclareVectorInputPort("initial_pose", 6)
@@ -114,5 +115,6 @@ class SctStateMachine(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
         if context.get_time() > 0:
-            discrete_state.set_value([float(self._skill.next_state(*self._state_pose_frames(context)))])
+            state = self._skill.next_state(*self._state_pose_frames(context), self._period)
+            discrete_state.set_value([float(state)])
         return EventStatus.Succeeded()

@@ -136,20 +136,31 @@ class Skill:
 
         A constraint may ask for more than it seems: an orientation that depends on the position turns quickly where
         the position is near the object. Where the projected request is too far away for the skill's greatest speeds,
-        it is the displacement that is scaled down, so that the orientation never lags behind the position.
-        A last command that is outside (the state has just changed) is led inside at the greatest speed.
+        it is the displacement that is scaled down, so that the orientation never lags behind the position; likewise
+        where one constraint undoes another. From a last command that is inside, a command is always inside. One that
+        is outside (an episode begins there, or an object has moved) is led inside at the greatest speed.
         """
         # Within reach before it is projected: of a request far away, the projection alone would not tell a direction.
         fraction = 1.0 / max(1.0, self._load(X_WLast, X_WRequest, period_s))
         for _ in range(BACKTRACKS):
             X_WE = self.project(state, between(X_WLast, X_WRequest, fraction), frames)
             load = self._load(X_WLast, X_WE, period_s)
-            if load <= 1.0:
+            if load <= 1.0 and self._is_inside(state, X_WE, frames):
                 return Command(X_WE, fraction)
-            fraction *= 0.98 / load
+            fraction *= 0.98 / load if load > 1.0 else 0.5
+        if self._is_inside(state, X_WLast, frames):
+            return Command(X_WLast, 0.0)
         X_WE = self.project(state, X_WLast, frames)
         load = self._load(X_WLast, X_WE, period_s)
         return Command(X_WE if load <= 1.0 else between(X_WLast, X_WE, 1.0 / load), 0.0)
+
+    def can_enter(self, state: int, X_WLast: RigidTransform, frames: Frames, period_s: float) -> bool:
+        """Whether one period leads from the last command into a state's active constraints."""
+        X_WE = self.project(state, X_WLast, frames)
+        return self._load(X_WLast, X_WE, period_s) <= 1.0 and self._is_inside(state, X_WE, frames)
+
+    def _is_inside(self, state: int, X_WE: RigidTransform, frames: Frames) -> bool:
+        return self.violation(state, X_WE, frames) <= INSIDE
 
     def _load(self, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
         """The share of the greatest speeds that the way between two commands needs."""
@@ -172,12 +183,16 @@ class Skill:
                     back[target].append((number, -1.0, number, transition.below + transition.hysteresis))
         return tuple(tuple(f + b) for f, b in zip(forward, back, strict=True))
 
-    def next_state(self, state: int, X_WE: RigidTransform, frames: Frames) -> int:
-        """The state after `state`, at most one transition away."""
+    def next_state(self, state: int, X_WE: RigidTransform, frames: Frames, period_s: float | None = None) -> int:
+        """The state after `state`, at most one transition away.
+
+        With `period_s`, X_WE is the last command: a state is not entered while its constraints are out of its reach.
+        """
         for source, sign, target, threshold in self._ways[state]:
             distance = self.states[source].transition_distance.value(X_WE, frames)
             if sign * distance < sign * threshold:
-                return target
+                waits = period_s is not None and not self.can_enter(target, X_WE, frames, period_s)
+                return state if waits else target
         return state
 
     def state_at(self, X_WE: RigidTransform, frames: Frames) -> int:

@@ -20,6 +20,7 @@ TOLERANCE = 1e-9  # [m or rad]
 GREEDY_STEPS = 400
 GREEDY_PERIOD = 0.05  # [s]
 CONTROL_PERIOD = 0.01  # [s]
+ARRIVALS = 5  # at each transition
 
 Scenes = Sequence[tuple[RigidTransform, Frames]]
 
@@ -130,7 +131,7 @@ def _transitions(skill: Skill, scenes: Scenes, rng: np.random.Generator) -> Iter
         # From the nearest pose, and from where a phase begins: either proves that the distance can get there.
         best = np.inf
         for X, frames in [starts[0], *starts[len(starts) // 2 :: len(starts) // 8]]:
-            best = min(best, _greedy(skill, number, X, frames, lowest))
+            best = min(best, _greedy(skill, number, X, frames, lowest)[0])
             if best < lowest:
                 break
         for goal, threshold in goals:
@@ -146,39 +147,47 @@ def _transitions(skill: Skill, scenes: Scenes, rng: np.random.Generator) -> Iter
             yield Finding(False, f"{state.name}: every pose is below the threshold; the state is left at once")
 
 
-def _greedy(skill: Skill, number: int, X_WE: RigidTransform, frames: Frames, enough: float) -> float:
-    """The least distance that the single input that lowers it most, chosen anew at every step, reaches."""
+def _greedy(
+    skill: Skill, number: int, X_WE: RigidTransform, frames: Frames, enough: float, period: float = GREEDY_PERIOD
+) -> tuple[float, RigidTransform]:
+    """The least distance that the single input that lowers it most, chosen anew at every step, reaches, and where."""
     candidates = [sign * row for row in np.eye(skill.inputs) for sign in (1.0, -1.0)]
     best = skill.distance(number, X_WE, frames)
     for _ in range(GREEDY_STEPS):
         options = []
         for inputs in candidates:
-            request = skill.displace(X_WE, skill.map(number, inputs, X_WE, frames, GREEDY_PERIOD))
-            X = skill.command(number, X_WE, request, frames, GREEDY_PERIOD).X_WE
+            request = skill.displace(X_WE, skill.map(number, inputs, X_WE, frames, period))
+            X = skill.command(number, X_WE, request, frames, period).X_WE
             options.append((skill.distance(number, X, frames), X))
         distance, X_WE = min(options, key=lambda option: option[0])
-        if distance > best - 1e-6 * GREEDY_PERIOD:
-            return min(best, distance)
+        if distance > best - 1e-6 * period:
+            return min(best, distance), X_WE
         best = distance
         if best < enough:
-            return best
-    return best
+            return best, X_WE
+    return best, X_WE
 
 
 def _jumps(skill: Skill, scenes: Scenes) -> Iterator[Finding]:
-    """What the next state's constraints would move at a transition is no more than one control step can."""
+    """Where a transition is due, one control step leads into the next state's constraints; otherwise it waits."""
+    reach = GREEDY_PERIOD * max(skill.max_speed_m_per_s, skill.max_speed_rad_per_s)
     for number, state in enumerate(skill.states):
+        inside = [(skill.project(number, X, frames), frames) for X, frames in scenes]
         for transition in state.transitions:
-            target = skill.index(transition.to)
-            worst = 0.0
-            for X, frames in scenes:
-                X_WE = skill.project(number, X, frames)
-                if transition.below * 0.97 < skill.distance(number, X_WE, frames) < transition.below:
-                    command = skill.command(target, X_WE, X_WE, frames, CONTROL_PERIOD)
-                    worst = max(worst, skill.violation(target, command.X_WE, frames))
-            if worst > TOLERANCE:
+            target, arrived, waiting, worst = skill.index(transition.to), 0, 0, 0.0
+            before = [start for start in inside if skill.distance(number, *start) >= transition.below]
+            for X, frames in before[:ARRIVALS]:
+                # Slowly where it comes near, or it would arrive farther beyond the threshold than a control step leads.
+                _, X_WE = _greedy(skill, number, X, frames, transition.below + reach)
+                distance, X_WE = _greedy(skill, number, X_WE, frames, transition.below, CONTROL_PERIOD)
+                if distance < transition.below:
+                    arrived += 1
+                    waiting += not skill.can_enter(target, X_WE, frames, CONTROL_PERIOD)
+                    worst = max(worst, skill.violation(target, X_WE, frames))
+            if waiting:
                 yield Finding(
                     False,
-                    f"{state.name}: at the transition to {transition.to} the command is up to {worst:.2g} m or rad "
-                    "outside of the next state's constraints; let them meet at the threshold",
+                    f"{state.name}: the transition to {transition.to} waits in {waiting} of {arrived} arrivals, as the "
+                    f"command is up to {worst:.2g} m or rad outside of the next state's constraints; let them meet at "
+                    "the threshold",
                 )

@@ -56,6 +56,41 @@ def test_without_constraints_it_goes_as_far_as_the_speeds_allow(seed, spread):
     assert load(s, last, command.X_WE) <= 1 + 1e-9
 
 
+UNDONE = [ac.Cylinder("f", max_radius_m=0.002), ac.KeepAbove(0.0, "f"), ac.Funnel("f", 0.001, 0.006, 1.0)]
+
+
+def wander(s, seed, height=0.02, climb=(-1e-3, 4e-4), steps=300):
+    """Commands, each with the state that it was made in, of requests that go anywhere from above the object."""
+    rng = np.random.default_rng(seed)
+    number, last = 0, RigidTransform([0.0, 0.0, height])
+    for _ in range(steps):
+        to = last.translation() + [*rng.choice([-1e-3, 1e-3], 2), rng.uniform(*climb)]
+        last = s.command(number, last, RigidTransform(to), F, PERIOD).X_WE
+        yield number, last
+        number = s.next_state(number, last, F, PERIOD)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_command_is_inside_where_one_constraint_undoes_another(seed):
+    s = skill(state(constraints=UNDONE[::-1]), speed=0.05)
+    assert s.violation(0, s.project(0, RigidTransform([0.003, 0.0, 0.009]), F), F) > 5e-4
+    pairs = list(wander(s, seed, height=0.006, climb=(-4e-4, 1e-3)))
+    assert max(s.violation(number, X, F) for number, X in pairs) <= 1e-9
+    assert np.ptp([X.translation() for _, X in pairs], axis=0).max() > 0.001  # and it does not stand still for it
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_command_leaves_the_constraints_of_a_next_state_that_are_tighter(seed):
+    wide, narrow = (
+        state(name, [ac.Cylinder("f", max_radius_m=radius), ac.KeepAbove(-0.006, "f")], to)
+        for name, radius, to in (("search", 0.004, (Transition("insert", 0.006, 0.002),)), ("insert", 0.002, ()))
+    )
+    s = skill(wide, narrow, speed=0.05)
+    pairs = list(wander(s, seed))
+    assert max(s.violation(number, X, F) for number, X in pairs) <= 1e-9
+    assert {number for number, _ in pairs} == {0, 1}
+
+
 @given(SEEDS)
 def test_inside_constraints_it_stays_inside_and_within_the_speeds(seed):
     """Also where the orientation that goes with a position turns quickly."""

@@ -111,3 +111,12 @@ def test_draws_every_state_and_every_way(tmp_path):
     for suffix in (".dot", ".png"):
         draw(skill, tmp_path / f"pouring{suffix}")
         assert (tmp_path / f"pouring{suffix}").stat().st_size > 100
+
+
+def test_warns_of_a_transition_into_tighter_constraints():
+    def change(data):
+        data["states"]["near"]["active_constraints"].insert(
+            0, {"kind": "cylinder", "frame": "cup", "max_radius_m": 0.01}
+        )
+
+    assert any("waits in" in finding.message and not finding.is_error for finding in findings(change))
