@@ -58,7 +58,7 @@ def _require_object(frame: str) -> None:
 class Translation(InputMapping):
     """Each input moves the end effector along one axis of a frame (`world`, `tool`, or an object's).
 
-    An axis that is not of unit length multiplies the speed: [0, 0, 2] moves at twice `speed_m_per_s`.
+    A full input means `speed_m_per_s` times the length of its axis: an axis of length 2 doubles the speed.
     """
 
     inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
@@ -84,7 +84,7 @@ class Translation(InputMapping):
 class Rotation(InputMapping):
     """Each input turns the end effector about one axis of a frame (`world`, `tool`, or an object's).
 
-    An axis that is not of unit length multiplies the speed: [0, 0, 2] turns at twice `speed_rad_per_s`.
+    A full input means `speed_rad_per_s` times the length of its axis: an axis of length 2 doubles the speed.
     """
 
     inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0

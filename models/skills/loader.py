@@ -55,7 +55,8 @@ def load_skill(source: str | Path, **parameters: float) -> Skill:
     """Reads a skill.
 
     Args:
-        source: a file, or the name of one of guiderail's own skills: `shipped_skills`.
+        source: a file that ends in .yaml or .yml, or the name of one of guiderail's own skills: `pouring`,
+            `pouring_aimed`, `grid_clamp` or `end_effector_velocity`.
         **parameters: sizes of the objects at hand, in place of the file's own values under `parameters`.
 
     Raises:
