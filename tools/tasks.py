@@ -91,7 +91,7 @@ def _is_module(name: str) -> bool:
         return find_spec(name) is not None
     except ModuleNotFoundError as error:
         return not f"{name}.".startswith(f"{error.name}.")
-    except (ValueError, TypeError):  # no name at all
+    except (ImportError, ValueError, TypeError):  # no name at all, or a relative one
         return False
 
 
