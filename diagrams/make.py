@@ -85,6 +85,14 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
         name = register_task_folder(name)
     declared = TASKS.get(name)
     places = stations_for(declared.world_kind)
+    if not places:
+        kinds = {STATIONS.get(place).world for place in STATIONS.names()}
+        raise InputError(
+            f"no station works on a world of the kind {brief(declared.world_kind)}, which {name} has: "
+            f"{did_you_mean(declared.world_kind, kinds)}"
+        )
+    if not possible_guidance(declared.knows()):
+        raise InputError(f"nothing guides {name}, as it knows nothing: write its reference(), template() or approach()")
     difficulty = choose("difficulty", given.get("difficulty", STANDARD), list(declared.difficulties), name)
     first = {"guidance": possible_guidance(declared.knows())[0], "station": places[0]}
     first |= {"reward": declared.rewards[0], "observation": declared.observations[0]}
@@ -95,6 +103,10 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
 
     models = option_models(declared, merged["guidance"], station.name)
     known = [key for model in models.values() for key in model.model_fields]
+    for whose, settings in {"defaults": declared.defaults, **declared.difficulties}.items():
+        for key in set(settings) - set(known):
+            if key not in (anywhere := _known_anywhere(declared)):
+                raise InputError(f"{whose} of {name} sets no option {brief(key)}: {did_you_mean(key, anywhere)}")
     unknown = sorted(set(given) - set(known))
     if unknown:
         elsewhere = [place for place in places if unknown[0] in (STATIONS.get(place).options or Options).model_fields]
@@ -108,6 +120,17 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
     choice = Choice(**_values(checked["common"]), values=values)
     task = declared(checked["task"], choice)
     return Resolved(task, station, checked)
+
+
+def _known_anywhere(task: type[Task]) -> set[str]:
+    """The options that a task has with any guidance on any of its stations."""
+    models = {
+        model
+        for guidance in possible_guidance(task.knows())
+        for station in stations_for(task.world_kind)
+        for model in option_models(task, guidance, station).values()
+    }
+    return {key for model in models for key in model.model_fields}
 
 
 def make_station(resolved: Resolved) -> Station:

@@ -63,11 +63,11 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def sections(doc: str) -> tuple[str, dict[str, list[tuple[str, str]]]]:
-    """A docstring's text, and its sections as names with words."""
+    """The text of a docstring as `inspect.getdoc` gives it, and its sections as names with words."""
     text: list[str] = []
     found: dict[str, list[tuple[str, str]]] = {}
     current = None
-    for line in inspect.cleandoc(doc).splitlines():
+    for line in doc.splitlines():
         head = SECTION.match(line)
         if head:
             current = found.setdefault(head[1], [])
@@ -224,7 +224,12 @@ def api() -> str:
     """The names that people import."""
     import guiderail
     from guiderail.diagrams import guidance
+    from guiderail.diagrams.guidance import guidance as guidance_ports
+    from guiderail.diagrams.guidance.registry import INGREDIENTS
+    from guiderail.diagrams.observation import CLOCKS
+    from guiderail.diagrams.stations.station import OUTPUTS
     from guiderail.models import primitives
+    from guiderail.systems.episode_monitor import TERMINATIONS
 
     page = (
         "# Names to import\n\nWhat `guiderail`, `guiderail.models.primitives` and `guiderail.diagrams.guidance` "
@@ -239,7 +244,21 @@ def api() -> str:
                 continue
             seen.add(name)
             page += f"### {name}\n\n" + exported(name, thing)
-    return page
+    page += "## Words\n\n"
+    rows = [
+        ("guiderail.diagrams.observation.CLOCKS", CLOCKS, "signals that every observation can have"),
+        (
+            "guiderail.systems.episode_monitor.TERMINATIONS",
+            TERMINATIONS,
+            "how an episode ends; the empty one: it goes on",
+        ),
+        ("guiderail.diagrams.guidance.registry.INGREDIENTS", tuple(INGREDIENTS), "what `register_guidance` can need"),
+        ("guiderail.diagrams.stations.station.OUTPUTS", OUTPUTS, "signals that every station has"),
+        ("guiderail.diagrams.guidance.guidance.OUTPUTS", guidance_ports.OUTPUTS, "signals that every guidance has"),
+    ]
+    return page + table(
+        ["name", "words", "what they are"], [(code(n), _listed(map(repr, w)), cell(m)) for n, w, m in rows]
+    )
 
 
 def exported(name: str, thing: Any) -> str:
@@ -402,8 +421,32 @@ STATE_WORDS = {
     "starts_at_…": "the distance at which the state's progress is 0",
     "ends_at_…": "the distance at which it is over; unless given the first transition's",
     "weight_per_…": "how much of the reward's progress a metre or a degree is worth; 1 unless given",
-    "transitions": "a list of `to`, `below_…` and, where there is a way back, `hysteresis_…`",
+    "transitions": "a list of `to`, `below_…` and, for a way back, `hysteresis_…`: the state changes to `to` where its "
+    "distance falls below `below_…`, and returns where that distance exceeds `below_…` + `hysteresis_…`; without "
+    "`hysteresis_…` it never returns",
 }
+
+
+KINDS_NOTES = {
+    "active_constraints": "They are applied in the order of the file. No kind bounds the turn about F's z axis (yaw) "
+    "and leaves it free in between: `fixed_orientation`, `tilt_limits`, `tilt_by_distance` and `arc` determine it, and "
+    "without any of them the orientation is free.\n\n",
+    "input_mapping": "Whatever the inputs ask for, a command moves no faster than `max_speed_m_per_s` and "
+    "`max_speed_rad_per_s`.\n\n",
+}
+
+
+def shipped_templates() -> str:
+    """The files of guiderail's own templates, as they are."""
+    from importlib import resources
+
+    folder = resources.files("guiderail.models.skills")
+    page = ""
+    for file in sorted((one for one in folder.iterdir() if one.name.endswith(".yaml")), key=lambda one: one.name):
+        name = file.name.removesuffix(".yaml")
+        page += f"### The template {name}\n\n`load_skill({name!r})`:\n\n"
+        page += f"```yaml\n{file.read_text(encoding='utf-8').rstrip()}\n```\n\n"
+    return page
 
 
 def templates() -> str:
@@ -431,6 +474,7 @@ def templates() -> str:
     )
     for title, where, registry in kinds:
         page += f"## {title}\n\nEach entry of `{where}` has `kind` and the fields of that kind.\n\n"
+        page += KINDS_NOTES.get(where, "")
         for name, kind in registry.items():
             page += f"### {name}\n\n{paragraphs(inspect.getdoc(kind) or '')}\n\n"
             words, kinds_of = field_words(kind), field_types(kind)
@@ -446,6 +490,58 @@ def templates() -> str:
                     )
                 )
             page += table(["field", "type", "what it is", "unless given"], rows)
+    page += (
+        "## The templates that come along\n\nA task of yours can use them, with other parameters, or start from a "
+        "copy.\n\n"
+    )
+    return page + shipped_templates()
+
+
+def worlds() -> str:
+    """What stations work on, and the signals that they have."""
+    from pydrake.systems.framework import PortDataType
+
+    from guiderail.diagrams.make import make_station, resolve
+    from guiderail.diagrams.stations import station as station_ports
+    from guiderail.diagrams.stations.registry import STATIONS, stations_for
+    from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
+    from guiderail.diagrams.tasks.registry import TASKS
+
+    page = (
+        "# Worlds and stations\n\nA task names a `world_kind`, and its `world()` returns what a station of that kind "
+        "is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a world of another kind, "
+        "`register_station(name, world=kind)` decorates a subclass of `Station` that is built from a world. Every "
+        "station has the inputs and outputs below; sizes are those of a pose with six numbers.\n\n"
+    )
+    rows = (
+        (port, size, cell(words))
+        for port, size, words in re.findall(
+            r"^(`\w+`) +(\d+) +(.*(?:\n {6}.*)*)", inspect.getdoc(station_ports) or "", re.MULTILINE
+        )
+    )
+    page += table(["port", "size", "what it is"], rows)
+    tasks = {TASKS.get(name).world_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
+    for kind, task in tasks.items():
+        world = resolve(task, {}).task.world()
+        page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
+        page += f"`{type(world).__module__}.{type(world).__name__}`.\n\n"
+        if kind == "workcell":
+            page += "Any object with these methods will do:\n\n"
+            for protocol in (Workcell, ConvexWorkcell):
+                where = " (for `station=mujoco`)" if protocol is ConvexWorkcell else ""
+                page += f"### {protocol.__name__}{where}\n\n" + exported(protocol.__name__, protocol)
+        else:
+            page += f"### {type(world).__name__}\n\n" + exported(type(world).__name__, type(world))
+        rows = []
+        for name in stations_for(kind):
+            if not STATIONS.get(name).simulated:
+                continue
+            station = make_station(resolve(task, {"station": name}))
+            ports = (station.get_output_port(index) for index in range(station.num_output_ports()))
+            sizes = {one.get_name(): one.size() for one in ports if one.get_data_type() == PortDataType.kVectorValued}
+            rows.append((code(name), ", ".join(f"`{port}` {size}" for port, size in sizes.items())))
+            page += f"### Station {name}\n\n" + documented(STATIONS.get(name).build)
+        page += "Signals, and how many numbers each has:\n\n" + table(["station", "signals"], rows)
     return page
 
 
@@ -499,7 +595,11 @@ def files() -> str:
     page += f"### learner, in config.yaml\n\n{prose(inspect.getdoc(Preset) or '')} "
     page += f"Presets are {', '.join(code(name) for name in PRESETS)}; `--set name=value` changes one setting.\n\n"
     page += _fields(Preset)
-    page += "### episodes.csv\n\nAnd `reward_…`, the sum of each of the reward's terms.\n\n"
+    page += (
+        "### episodes.csv\n\nAnd `reward_…`, the sum of each of the reward's terms. `collisions` and `collision_steps` "
+        "are of the signal that `Task.collision` names. An episode that a `Condition` ends as `collision` counts only "
+        "where that signal is above its limit too.\n\n"
+    )
     page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.words)) for m in COLUMNS])
     page += "### ledger\n\n`…_i` stands for a column for every number of a pose or a wrench.\n\n"
     page += table(["column", "unit", "meaning"], [(code(n), cell(u), cell(w)) for n, (u, w) in MEANINGS.items()])
@@ -630,6 +730,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "names": api,
     "command": command,
     "options": options,
+    "worlds": worlds,
     "templates": templates,
     "studies": studies,
     "files": files,

@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Generic, TypeVar, overload
+from typing import Any, Generic, TypeVar, overload
 
 from guiderail.models.errors import InputError, brief
 
@@ -136,7 +136,7 @@ def _origin(value: object) -> tuple[str, str]:
     An entry that is a record is told by what it builds with. A module's file counts, not its name: the same file can be
     imported under several.
     """
-    defined = value if hasattr(value, "__qualname__") else getattr(value, "build", value)
+    defined: Any = value if hasattr(value, "__qualname__") else getattr(value, "build", value)
     while isinstance(defined, partial):
         defined = defined.func
     named = hasattr(defined, "__qualname__")

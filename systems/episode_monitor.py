@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 from guiderail.models.errors import InputError
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
-from guiderail.systems.support.signal_ports import SignalPorts
+from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """How an episode can end; a ``termination`` port carries an index into this. The empty one means that it goes on."""
@@ -70,20 +70,25 @@ class EpisodeMonitor(LeafSystem):
     ``termination`` is (1,): an index into `TERMINATIONS`, 0 while the episode goes on.
     """
 
-    def __init__(self, conditions: Sequence[Condition], period: float):
+    def __init__(self, conditions: Sequence[Condition], period: float, of: str = ""):
         """
         Args:
             conditions: where two hold in the same step, the first one counts.
             period: between two control steps [s], positive.
+            of: whose episodes they end, for sentences.
 
         Raises:
-            InputError: if there is no condition, the period is not positive, or two conditions disagree about the
-                size of a signal.
+            InputError: if there is no condition, the period is not positive, two conditions disagree about the size
+                of a signal, or a function takes other names than its signals'.
         """
         super().__init__()
         if not conditions:
             raise InputError("a monitor needs at least one condition")
         check_period(period)
+        for condition in conditions:
+            for function in filter(None, (condition.holds, condition.progress)):
+                whose = f" of {of}" if of else ""
+                check_takes(function, condition.inputs, f"the condition {condition.termination!r}{whose}")
         self._conditions = tuple(conditions)
         self._indices = [TERMINATIONS.index(condition.termination) for condition in conditions]
         self._signals = SignalPorts(self, *(condition.inputs for condition in conditions))

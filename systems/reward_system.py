@@ -1,14 +1,15 @@
 """A reward as a sum of named terms."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.systems.support.caching import declare_cache
-from guiderail.systems.support.signal_ports import SignalPorts
+from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 
 
 @dataclass(frozen=True)
@@ -44,19 +45,23 @@ class RewardSystem(LeafSystem):
     `ZeroOrderHold` of the control period.
     """
 
-    def __init__(self, terms: Sequence[RewardTerm]):
+    def __init__(self, terms: Sequence[RewardTerm], of: str = ""):
         """
         Args:
             terms: at least one, of different names, none of them "reward".
+            of: whose reward it is, for sentences.
 
         Raises:
-            InputError: if there is no term, a name is taken, or two terms disagree about the size of a signal.
+            InputError: if there is no term, a name is taken, two terms disagree about the size of a signal, or a
+                function takes other names than its signals'. When it is evaluated: if a term is no finite number.
         """
         super().__init__()
         names = [term.name for term in terms]
         if not names or len(set(names)) < len(names) or "reward" in names:
             raise InputError(f"a reward needs terms of different names, other than 'reward', not {names}")
-        self._terms = tuple(terms)
+        self._terms, self._of = tuple(terms), f" of {of}" if of else ""
+        for term in terms:
+            check_takes(term.value, term.inputs, f"reward term {term.name!r}{self._of}")
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
         self._values = declare_cache(
             self,
@@ -100,7 +105,18 @@ class RewardSystem(LeafSystem):
 
     def _calc_terms(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)
-        return np.array([term.value(**{name: signals[name] for name in term.inputs}) for term in self._terms], float)
+        return np.array([self._value(term, signals) for term in self._terms])
+
+    def _value(self, term: RewardTerm, signals: Mapping[str, np.ndarray]) -> float:
+        value = term.value(**{name: signals[name] for name in term.inputs})
+        array = np.asarray(value)
+        if array.size != 1 or array.dtype.kind not in "fiub":
+            raise InputError(f"reward term {term.name!r}{self._of} must be one number, and it is {brief(value)}")
+        number = float(array.item())
+        # A learner that takes this in diverges, and is blamed for it episodes later.
+        if not math.isfinite(number):
+            raise InputError(f"reward term {term.name!r}{self._of} is not finite, but {number}")
+        return number
 
     def _calc_reward(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, self._values.Eval(context).sum())

@@ -11,13 +11,14 @@ from guiderail.tools.files import check_picture
 from guiderail.tools.recording.reader import ENDINGS, load_demonstrations
 
 SKILLS = (".yaml", ".yml")
+SI = {"m": "m", "deg": "rad"}  # what a distance is in, by the unit that a file gives it in
 
 
 def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
     """Reads a file as what its ending says it is.
 
     Args:
-        file: what is read.
+        file: what is read; or the name of one of guiderail's own skills.
         draw: where demonstrations or a state machine are drawn.
         fit: whether a primitive is fitted to demonstrations, which takes seconds.
 
@@ -25,7 +26,14 @@ def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[st
         InputError: if it is neither, or what it holds makes no sense.
     """
     if not file.exists():
-        raise InputError(f"there is no file {file}: name demonstrations (.npz, .csv, a folder) or a skill (.yaml)")
+        from guiderail.models.skills.loader import shipped_skills
+
+        if str(file) in shipped_skills():
+            return check_skill(file, draw)
+        raise InputError(
+            f"there is no file {file}: name demonstrations (.npz, .csv, a folder), a skill (.yaml) or one of "
+            f"{', '.join(shipped_skills())}"
+        )
     if file.suffix in ENDINGS or file.is_dir():
         return check_demonstrations(file, draw) | (fitted(file) if fit else {})
     if file.suffix in SKILLS:
@@ -116,7 +124,7 @@ def check_skill(file: Path, draw: Path | None = None) -> dict[str, Any]:
     """What a skill holds, and what is odd about it; reading it is what finds most of its faults.
 
     Args:
-        file: the skill.
+        file: the skill, or the name of one of guiderail's own.
         draw: where its state machine is drawn: .png, .svg, .pdf or .dot.
 
     Raises:
@@ -139,6 +147,15 @@ def check_skill(file: Path, draw: Path | None = None) -> dict[str, Any]:
         "inputs": skill.inputs,
         "frames": list(skill.frames),
         "states": [state.name for state in skill.states],
-        "transitions": [f"{s.name} → {t.to} below {t.below:g}" for s in skill.states for t in s.transitions],
+        "transitions": [_in_words(s, t) for s in skill.states for t in s.transitions],
         "remarks": [finding.message for finding in findings if not finding.is_error],
     }
+
+
+def _in_words(state: Any, transition: Any) -> str:
+    """A transition with its unit, and where the way back is."""
+    unit = SI[state.transition_distance.unit]
+    words = f"{state.name} → {transition.to} below {transition.below:g} {unit}"
+    if transition.hysteresis is None:
+        return f"{words}, no way back"
+    return f"{words}, back above {transition.below + transition.hysteresis:g} {unit}"

@@ -110,6 +110,9 @@ ENV_HELP = (
 Env = Annotated[list[str] | None, _opt(ENV_HELP, "--env", metavar="key=value")]
 IMPORT_HELP = "A module or a file (.py) that registers a task, guidance, a station or a learner; the run remembers it."
 Imports = Annotated[list[str] | None, _opt(IMPORT_HELP, "--import", metavar="MODULE")]
+OwnTask = Annotated[
+    list[str] | None, _opt("A module or a file (.py) that registers the task.", "--import", metavar="MODULE")
+]
 PolicyName = Annotated[str, _opt("Who acts in a task: rule, or zero, white or constant actions.", "--policy")]
 Guidance = Annotated[str | None, _opt("What guides: {guidance}.  [default: the task's]", of="guidance")]
 
@@ -247,7 +250,10 @@ def evaluate(
     env: Env = None,
     beside: Annotated[
         str | None,
-        _opt("Who else meets the same episodes, or none.  [default: zero, white and constant actions, and the rule]"),
+        _opt(
+            "Who else meets the same episodes, or none; the demonstration alone always does.  "
+            "[default: zero, white and constant actions, and the rule]"
+        ),
     ] = None,
     fresh: Annotated[bool, _opt("Draw anew in every episode what is hidden in the run.", "--fresh")] = False,
     as_json: Json = False,
@@ -322,6 +328,7 @@ def certify(
         float | None, _opt("How far beside its start the robot may begin, in the outputs' units.")
     ] = None,
     attack: Annotated[int, _opt("How many steps an adversary tries to leave the bounds.")] = 0,
+    imports: OwnTask = None,
     as_json: Json = False,
 ) -> None:
     """Bound what a skill can command for all actions, and have the bounds checked by a program that knows no guiderail.
@@ -331,7 +338,7 @@ def certify(
     """
     from guiderail.tools.certify import certify_skill
 
-    found = certify_skill(of, _environment(env), out=out, start_within=start_within, attack=attack)
+    found = certify_skill(_named(of, imports)[0], _environment(env), out=out, start_within=start_within, attack=attack)
     rows = found.get("attack", [])
     if as_json:
         typer.echo(json.dumps(found))
@@ -358,6 +365,7 @@ def replay(
     picture: Annotated[Path | None, _opt("Also write what a camera sees of the episode: a file {pictures}.")] = None,
     policy: PolicyName = "rule",
     episodes: Annotated[int | None, _opt("How many held-out episodes there are to pick from.  [default: 4]")] = None,
+    imports: OwnTask = None,
 ) -> None:
     """Show held-out episodes as a page that any browser opens: before learning beside after, on one clock.
 
@@ -369,7 +377,7 @@ def replay(
     from guiderail.tools.viewing.replay import default_page, write_page
 
     environment = _environment(env) | ({} if station is None else {"station": station})
-    episode = _episode(shown, policy, environment, seed)
+    episode = _episode(shown, policy, environment, seed, imports)
     page = default_page(Path(shown), environment) if html is None else html
     if picture is not None:
         check_picture(picture)
@@ -385,12 +393,14 @@ def film(
     seed: Seed = 1_000_000,
     env: Env = None,
     policy: PolicyName = "rule",
+    imports: OwnTask = None,
 ) -> None:
     """Draw six moments of an episode, as a camera sees them."""
     from guiderail.tools.viewing.film import write_film
     from guiderail.tools.viewing.shown import outcome
 
-    typer.echo(f"{out}: {outcome(write_film(out, _episode(shown, policy, _environment(env), seed)))}")
+    episode = _episode(shown, policy, _environment(env), seed, imports)
+    typer.echo(f"{out}: {outcome(write_film(out, episode))}")
 
 
 @command("plot runs/passage")
@@ -417,7 +427,12 @@ def record(
 
 @command("check demonstrations.csv --draw demonstrations.png")
 def check(
-    file: Annotated[Path, _arg("Demonstrations (.npz, .csv or a folder of them), or a skill (.yaml).", "FILE")],
+    file: Annotated[
+        Path,
+        _arg(
+            "Demonstrations (.npz, .csv or a folder of them), or a skill (.yaml, or the name of a shipped one).", "FILE"
+        ),
+    ],
     draw: Annotated[
         Path | None, _opt("Draw the demonstrations, or a skill's state machine (.png, .svg, .pdf; a skill also .dot).")
     ] = None,
@@ -604,6 +619,7 @@ def bench(
     picture: Annotated[
         Path | None, _opt("Where a picture of the time steps' errors, or of the engines, is written.")
     ] = None,
+    imports: OwnTask = None,
     as_json: Json = False,
 ) -> None:
     """Measure how fast the primitive, the simulation or a learner is here, or where a training run's time goes.
@@ -614,13 +630,14 @@ def bench(
     """
     from guiderail.tools.benchmarks import run_benchmark
 
+    task = None if task is None else _named(task, imports)[0]
     result, show = run_benchmark(what, picture=picture, task=task, environment=_environment(env))
     typer.echo(json.dumps(result)) if as_json else show(result)
 
 
 @command("stress BncConnector --episodes 1000 --out stress.csv")
 def stress(
-    task: Annotated[str, _arg("The task: {stressed}.", "TASK", "stressed")],
+    task: Annotated[str, _arg("The task: {stressed}, or one of your own.", "TASK", "stressed")],
     episodes: Annotated[int | None, _opt("How many in all, of one task.  [default: 1000]")] = None,
     steps: Annotated[int | None, _opt("Control steps in all, instead of --episodes.")] = None,
     seed: Annotated[int, _opt("The seed of the first episode; each has its own.")] = 0,
@@ -629,10 +646,12 @@ def stress(
         _opt("A table (.csv), and of all tasks a folder; a campaign that was stopped goes on in it."),
     ] = None,
     env: Env = None,
+    imports: OwnTask = None,
 ) -> None:
     """Try to make a task fail by actions that no policy sends.
 
-    With "all" it tries every task through every guidance, and leaves a ledger of every control step too. It prints what
+    With "all" it tries every task through every guidance, and leaves a ledger of every control step too. A task of your
+    own is tried through every guidance that it has. It prints what
     came of it as JSON, and ends with 1 if the simulation failed, anything was not finite, a prediction failed,
     constrained guidance commanded a violation (recomputed from the commands), or a limit of the task's own was passed.
     """
@@ -645,7 +664,7 @@ def stress(
         "out": out,
         "environment": _environment(env),
     }
-    found = stress_task(task, say=_say, **how)
+    found = stress_task(_named(task, imports)[0], say=_say, **how)
     typer.echo(json.dumps(found, indent=2))
     raise typer.Exit(1 if found["wrong"] else 0)
 
@@ -698,11 +717,12 @@ def drive(
     task: Annotated[str, _arg("The task: {tasks}.", "TASK", "tasks")],
     guidance: Guidance = None,
     env: Env = None,
+    imports: OwnTask = None,
 ) -> None:
     """Act in the policy's place, with a gamepad or the keyboard."""
     from guiderail.tools.operate.drive import drive_by_hand
 
-    drive_by_hand(_named(task)[0], ({} if guidance is None else {"guidance": guidance}) | _environment(env))
+    drive_by_hand(_named(task, imports)[0], ({} if guidance is None else {"guidance": guidance}) | _environment(env))
 
 
 @command("teach ./peg --out demonstrations.npz")
@@ -710,6 +730,7 @@ def teach(
     task: Annotated[str, _arg("A task's folder, or one of {tasks}.", "TASK", "tasks")],
     out: Annotated[Path, _opt("The demonstrations' file, .npz or .csv.")],
     env: Env = None,
+    imports: OwnTask = None,
     as_json: Json = False,
 ) -> None:
     """Demonstrate a task in the browser, with sliders, keys or a gamepad.
@@ -719,7 +740,7 @@ def teach(
     """
     from guiderail.tools.operate.teach import teach as record_taught
 
-    _print(record_taught(_named(task)[0], _environment(env), out, _tell), as_json)
+    _print(record_taught(_named(task, imports)[0], _environment(env), out, _tell), as_json)
 
 
 @command("run runs/connector --rehearse --yes")
@@ -788,10 +809,8 @@ def serve_iiwa(
     It stands in front of a task's fixture; the command ends with 1 if commands stopped coming.
     """
     from guiderail.tools.operate.serve_iiwa import serve_iiwa as serve
-    from guiderail.tools.tasks import import_modules
 
-    import_modules(imports or ())
-    task = _named(task)[0]
+    task = _named(task, imports)[0]
     is_done = serve(url, seconds, patience, task, rate=rate, offset=_numbers(offset), scenario=scenario, say=_tell)
     raise typer.Exit(0 if is_done else 1)
 
@@ -809,10 +828,8 @@ def stand_by(
     on the same machine, until it is ended; where it is missing, guiderail run moves nothing.
     """
     from guiderail.tools.operate.stand_by import stand_by as wait
-    from guiderail.tools.tasks import import_modules
 
-    import_modules(imports or ())
-    wait(url, robot, _named(task)[0], say=_tell)
+    wait(url, robot, _named(task, imports)[0], say=_tell)
 
 
 @command("generate connector-demonstrations --out .")
@@ -983,8 +1000,15 @@ def _environment(given: list[str] | None) -> dict[str, Any]:
     return {key: as_value(value) for key, value in _pairs(given, "--env", "station=arm").items()}
 
 
-def _named(task: str) -> tuple[str, tuple[str, ...]]:
-    """A task's name where the path of its folder was typed, and what a run has to import for it."""
+def _named(task: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
+    """A task's name where the path of its folder was typed, and what a run has to import for it.
+
+    What registers the task is imported first.
+    """
+    if imports:
+        from guiderail.tools.tasks import import_modules
+
+        import_modules(imports)
     if not (Path(task) / "task.yaml").is_file():
         return task, ()
     from guiderail.tools.tasks import task_named
@@ -1034,11 +1058,11 @@ def _rule(task: str) -> Any:
     return untrained(task, "rule")
 
 
-def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int) -> Any:
+def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int, imports: Sequence[str] | None) -> Any:
     """The episode that is shown: of a run, or of a task with a policy that nobody trained."""
     from guiderail.tools.viewing import shown as showing
 
-    shown = _named(shown)[0]
+    shown = _named(shown, imports)[0]
     if Path(shown).is_dir() or shown not in CHOICES["tasks"]():
         return showing.Shown.of_run(Path(shown), environment, seed)
     from guiderail.tools.studies.scripted import untrained

@@ -15,6 +15,7 @@ from guiderail.diagrams.stations.registry import STATIONS, stations_for
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.diagrams.tasks.task import Task
 from guiderail.models.robots.robot import end_effector_names, find_end_effector, find_robot, robot_names
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.tasks import task_options
@@ -93,7 +94,11 @@ def options_in_words(name: str) -> dict[str, str]:
         if settings:
             stands_for = ", ".join(f"{key}={_said(value)}" for key, value in settings.items())
             words[f"difficulty={difficulty}"] = f"stands for {stands_for}"
+    if declared.rewards is Task.rewards:
+        words["reward"] = "what is rewarded: the task's own, which has no name"
     reset = {f"reset: {row['name']}": row["description"] for row in described(declared.Reset)}
+    if not declared.draws_held_out:
+        reset["reset: held_out"] = "nothing here: the task declares no conditions that training never draws"
     return words | reset
 
 

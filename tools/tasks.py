@@ -2,9 +2,11 @@
 
 import inspect
 import sys
-from collections.abc import Iterable, Mapping
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, cast
 
@@ -38,23 +40,20 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
     that whoever goes on with a run elsewhere on the machine finds it.
 
     Raises:
-        InputError: if there is no such module or file.
+        InputError: if there is no such module or file, or it can't be imported.
     """
     names = []
     for module in modules:
-        try:
-            path = Path(module)
-            if is_task_folder(path):
-                register_task_folder(path)
-                names.append(str(path.resolve()))
-                continue
-            names.append(_import_file(path) if path.suffix == ".py" else import_module(module).__name__)
-        except (ModuleNotFoundError, FileNotFoundError, ValueError, TypeError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(
-                f"--import takes a module or a file (.py), and there is none for {brief(module)}: {error}"
-            ) from None
+        path = Path(module)
+        if is_task_folder(path):
+            register_task_folder(path)
+            names.append(str(path.resolve()))
+        elif path.suffix == ".py" and path.is_file():
+            names.append(_import_file(path))
+        elif _is_module(module):
+            names.append(_imported(module, partial(import_module, module)).__name__)
+        else:
+            raise InputError(f"--import takes a module or a file (.py), and there is none for {brief(module)}")
     register_envs()
     return tuple(names)
 
@@ -89,19 +88,48 @@ def task_content(task: str) -> str:
     return task_folder_digest(folder)
 
 
+def _is_module(name: str) -> bool:
+    """Whether there is a module of that name; one whose package can't be imported is there."""
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError as error:
+        return not f"{name}.".startswith(f"{error.name}.")
+    except (ImportError, ValueError, TypeError):  # no name at all, or a relative one
+        return False
+
+
 def _import_file(path: Path) -> str:
-    """Runs a file as a module, once as long as it stays what it is: what it registers is then one thing."""
+    """Runs a file, which finds those beside it as a program would; once, as long as it stays what it is."""
     path = path.resolve()
+    content = path.read_bytes()
+    if _IMPORTED.get(path) == content:
+        return str(path)
     name = f"guiderail_imported_{path.stem}"
     spec = spec_from_file_location(name, path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise FileNotFoundError(f"{path} is no file")
-    content = path.read_bytes()
-    if _IMPORTED.get(path) != content:
-        module = sys.modules[name] = module_from_spec(spec)
-        spec.loader.exec_module(module)
-        _IMPORTED[path] = content
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = module_from_spec(spec)
+    beside = str(path.parent)
+    sys.path.insert(0, beside)
+    try:
+        _imported(path.name, partial(spec.loader.exec_module, module))
+    finally:
+        sys.path.remove(beside)
+    _IMPORTED[path] = content
     return str(path)
+
+
+def _imported(what: str, load: Callable[[], Any]) -> Any:
+    """What is imported; whatever is wrong in it gets a sentence with its place."""
+    try:
+        return load()
+    except InputError:
+        raise
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
+        words = " ".join(str(error).split())
+        raise InputError(f"importing {what} failed: {where}{type(error).__name__}: {words}") from error
 
 
 def task_options(task: str) -> dict[str, Any]:
@@ -113,7 +141,11 @@ def task_options(task: str) -> dict[str, Any]:
     if task in TASKS.names():
         return check_environment(task, {})
     if task not in known_tasks():
-        raise InputError(f"there is no task {brief(task)}: {did_you_mean(task, known_tasks())}")
+        remedy = did_you_mean(task, known_tasks())
+        raise InputError(
+            f"there is no task {brief(task)}: {remedy}"
+            + ("" if remedy.endswith("?") else ", or --import the file that registers it")
+        )
     entry = gymnasium.spec(environment_id(task)).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
     taken = inspect.signature(creator).parameters.items()

@@ -53,7 +53,7 @@ class Approach:
 
 @dataclass(frozen=True)
 class Known:
-    """What a task knows; None where nobody wrote that down.
+    """What a task knows; None where the task does not override the method of that name.
 
     Attributes:
         period: s, seconds between control steps.
@@ -80,7 +80,7 @@ class Known:
         return LinearConstraints.none(self.pose_size) if known is None else known.constraints
 
     def has(self, ingredient: str) -> bool:
-        """Whether that is known."""
+        """Whether the task declares "demonstrations", "keep_out" (beside demonstrations), "template" or "approach"."""
         if ingredient == "keep_out":
             return self.demonstrations is not None and self.demonstrations.keep_out is not None
         return getattr(self, ingredient) is not None

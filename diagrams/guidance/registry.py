@@ -31,7 +31,7 @@ class GuidanceKind:
     Attributes:
         name: what `guidance=` calls it.
         build: from what is known to a diagram with the ports of `Guidance`.
-        needs: alternatives, each some of `INGREDIENTS`: one of them must be known completely.
+        needs: alternatives, each a tuple of names out of `INGREDIENTS`; the task must declare all names of one of them.
         label: what a legend calls it.
         colour: what it is drawn with, "#rrggbb".
         demonstrates: whether an action of zero is the demonstrations or the script alone, so that success before
@@ -51,7 +51,7 @@ class GuidanceKind:
     options: type[Options] | None = None
 
     def lacks(self, known: Collection[str]) -> tuple[str, ...]:
-        """The ingredients that are missing; none of them where some alternative is complete."""
+        """The names in `needs` that `known` lacks, of the alternative that lacks fewest; empty if one is complete."""
         lacking = [tuple(one for one in needed if one not in known) for needed in self.needs]
         return min(lacking, key=len, default=())
 
@@ -91,12 +91,12 @@ def register_guidance(
 
 
 def possible_guidance(known: Collection[str]) -> list[str]:
-    """The names of all kinds that can be made of these ingredients."""
+    """The names of all kinds of guidance whose `needs` are among `known`."""
     return [name for name in GUIDANCE.names() if not GUIDANCE.get(name).lacks(known)]
 
 
 def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:
-    """The kind of that name, if it can be made of the ingredients that are known of a task.
+    """The kind of that name, if its `needs` are among what is known of a task.
 
     Raises:
         InputError: if there is no such kind, or something that it needs is missing: then it says what.

@@ -81,6 +81,10 @@ class PlaneStation(Station):
     ``desired_pose`` and ``pose`` are (x, y) of the robot's centre [m]. ``wrench`` (2,) is what the walls did to the
     robot, averaged over the control step [N], and ``contact_force`` (1,) its norm. ``saturation`` (2,) is the force
     that was asked of each rail beyond its limit [N]. ``query`` is the scene graph's, for cameras.
+
+    Of its world it reads `walls` and `robot_radius`, which touch each other, and what it only draws: `goal`,
+    `goal_radius`, `zone_x`, `obstacle`, `obstacle_radius`, `obstacles` and `obstacles_move`. It stops nobody at
+    `zone_x` or at a disc: a task's constraints, conditions and rewards do, and a task puts the robot to its `start`.
     """
 
     def __init__(self, world: NarrowPassage, config: PlaneConfig = PlaneConfig()):

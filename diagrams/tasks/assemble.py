@@ -23,7 +23,7 @@ from guiderail.diagrams.options import validated
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.task import Task
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.via_points import through
 from guiderail.models.registry import did_you_mean
@@ -176,13 +176,13 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
 
     violations = _add_violations(builder, task, station, guidance)
     conditions = task.conditions()
-    monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period))
+    monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period, task.name))
     watched = {name: size for condition in conditions for name, size in condition.inputs.items()}
     signals.connect(monitor, watched, f"the end of an episode of {task.name}")
     signals.add({"termination": monitor.get_termination_output_port()})
 
     terms = task.reward_terms(guidance.GetInputPort("action").size())
-    reward = builder.AddNamedSystem("reward", RewardSystem(terms))
+    reward = builder.AddNamedSystem("reward", RewardSystem(terms, task.name))
     rewarded = {name: size for term in terms for name, size in term.inputs.items()}
     signals.connect(reward, rewarded, f"reward {task.choice.reward!r} of {task.name}")
 
@@ -335,6 +335,10 @@ def randomizes(task: Task, station: Station, guidance: Diagram) -> Any:
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         drawn = task.reset(station, guidance, context, rng, validated(task.Reset, options, f"a reset of {task.name}"))
+        if not isinstance(drawn, Mapping):
+            raise InputError(
+                f"reset of {task.name} returns what it drew by name, {{}} where it drew nothing, not {brief(drawn)}"
+            )
         return {**drawn, **station.disturb(context, rng)}
 
     return randomize
@@ -352,7 +356,10 @@ def _add_picture(builder: DiagramBuilder, task: Task, station: Station) -> None:
     """Adds the task's camera, whose image is exported."""
     camera = task.camera()
     if camera is None:
-        raise InputError(f"{task.name} has no camera: leave render_mode='rgb_array' out")
+        raise InputError(
+            f"{task.name} has no camera that could take a picture: leave out what asks for one "
+            "(--picture, render_mode='rgb_array'), or write its camera()"
+        )
     picture = add_camera(
         builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera, for_people=True
     )

@@ -40,6 +40,7 @@ class InsertionTask(Task):
     """
 
     Reset: ClassVar[type[ResetOptions]] = InsertionReset
+    draws_held_out = True
     workpiece: ClassVar[str]
     fixture: ClassVar[str]
     simulated_rewards: ClassVar[tuple[str, ...]] = ()

@@ -52,6 +52,7 @@ class NarrowPassage(Task):
     world_kind = "plane"
     Options = NarrowPassageOptions
     Reset = NarrowPassageReset
+    draws_held_out = True
     options: NarrowPassageOptions
     rewards = ("sparse", "shaped")
     observations = ("state", "image")

@@ -48,6 +48,7 @@ class Pouring(Task):
     world_kind = "pouring"
     Options = PouringOptions
     Reset = PouringReset
+    draws_held_out = True
     options: PouringOptions
     rewards = ("shaped", "sparse", "hand_shaped")
     defaults = {"guidance": "sct", "hold": 10}

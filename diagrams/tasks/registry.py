@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from guiderail.diagrams.options import STANDARD, Options, ResetOptions
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import Registry
 
 if TYPE_CHECKING:
@@ -25,15 +27,32 @@ def register_task(name: str) -> Callable[[AnyTask], AnyTask]:
         name: what it is called; it may have a namespace of its own, as in "lab/Peg".
 
     Raises:
-        InputError: when it decorates, if another task has that name.
+        InputError: when it decorates, if another task has that name, or what it declares is not of the right kind.
     """
 
     def add(task: AnyTask) -> AnyTask:
+        _check(name, task)
         task.name = name
         TASKS.register(name, task)
         return task
 
     return add
+
+
+def _check(name: str, task: type[Task]) -> None:
+    """Refuses declarations of the wrong kind, while whoever wrote them looks on."""
+    for attribute, kind in (("Options", Options), ("Reset", ResetOptions)):
+        given = getattr(task, attribute)
+        if not (isinstance(given, type) and issubclass(given, kind)):
+            raise InputError(f"{attribute} of {name} must be a class made of {kind.__name__}, not {brief(given)}")
+    for attribute in ("rewards", "observations"):
+        given = getattr(task, attribute)
+        if isinstance(given, str) or not given:
+            raise InputError(f"{attribute} of {name} must be some words, such as ('sparse',), not {brief(given)}")
+    if STANDARD not in task.difficulties:
+        raise InputError(f"difficulties of {name} must have {STANDARD!r}, not only {brief(list(task.difficulties))}")
+    if not isinstance(task.clip, int | float) or not task.clip > 0:
+        raise InputError(f"clip of {name} must be a positive number, not {brief(task.clip)}")
 
 
 def is_task_folder(name: str | Path) -> bool:

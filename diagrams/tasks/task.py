@@ -28,8 +28,11 @@ from guiderail.systems.reward_system import RewardTerm
 class Threshold:
     """A signal that means a collision while it is above a limit.
 
+    The safety ledger counts these collisions, in `collisions` and `collision_steps`. They do not end an episode: a
+    `Condition` does.
+
     Attributes:
-        signal: its name.
+        signal: the name of a signal of one number.
         above: the limit, in its unit.
     """
 
@@ -59,13 +62,33 @@ class Choice:
 class Task(ABC):
     """What is done, in what world, for what reward, and how an episode begins and ends.
 
-    A task says what there is; `assemble` wires it. A reward term, a condition or an observation names signals: ports of
-    the station, of the guidance, of `signals`, and any of them with "last_" before it, held from the control step
-    before.
+    A subclass says what there is, and `assemble` wires it. Reward terms, conditions and observations name signals. A
+    signal is an output port of the station, of the guidance or of `signals`; `action` and `termination` are signals
+    too. "last_" before a name means its value of the control step before.
 
     Attributes:
-        options: the task's own, checked.
+        name: set by `register_task`.
+        world_kind: the kind of world, "workcell" unless given: only stations that are registered for it can be used.
+        Options: the model of the task's own options, a subclass of `guiderail.Options`.
+        Reset: the model of the options of a reset, a subclass of `guiderail.ResetOptions`.
+        rewards: names that `reward=` chooses from; the first one unless given. `choice.reward` is the chosen one.
+        observations: names that `observation=` chooses from; the first one unless given.
+        defaults: options of the environment, by name, that differ from what they are elsewhere, such as the guidance.
+        difficulties: names that `difficulty=` chooses from, each with the options that it stands for. "standard" must
+            be one of them. What is given replaces what a difficulty says, and that replaces `defaults`.
+        learner: the algorithm and the preset that `guiderail train` uses unless told otherwise.
+        num_steps: control steps after which an episode is over; must be given, in the class or in `__init__`.
+        clip: the largest absolute value in an observation; larger ones are clipped.
+        collision: the signal that the ledger's `collisions` counts, and its limit; any contact force unless given. A
+            `Condition` that ends an episode as a collision is not counted by itself.
+        isotropic_groups: indices of outputs of one unit, group by group; residual learning moves all outputs of a group
+            alike. None is one group of all.
+        pushable: whether `GuidedEnv.push` may displace the robot.
+        options: the task's own options, checked: an instance of `Options`.
         choice: what every environment is made with.
+        collision: the signal that the ledger counts collisions of; unless declared, none are counted as known.
+        draws_held_out: whether `reset` draws from conditions that training never draws where `options.held_out` is
+            true. Without it an evaluation repeats conditions of training, and says so.
         drawn: what `signals` adds to a diagram and a reset sets, by name. A diagram is used again by whoever asks for
             the same, whose task gets these with it: systems that a task keeps anywhere else are missing there.
     """
@@ -82,6 +105,7 @@ class Task(ABC):
     num_steps: int
     clip: ClassVar[float] = 3.0
     collision: Threshold = Threshold()
+    draws_held_out: ClassVar[bool] = False
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
 
@@ -99,13 +123,20 @@ class Task(ABC):
 
     @abstractmethod
     def world(self) -> Any:
-        """What a station of `world_kind` works on."""
+        """What a station of `world_kind` works on: the first argument that the station is built with."""
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Further signals by name; whatever makes them is added to the builder."""
+        """Further signals: a mapping from names to output ports of systems that this adds to the builder.
+
+        They are found under these names by reward terms, conditions, observations and `collision`.
+
+        Args:
+            builder: of the root diagram.
+            station: already in it; its output ports are what a system here can be connected to.
+        """
         return {}
 
-    # What is known of it. A hook that a task doesn't override is something that nobody wrote down.
+    # What is known of it. Guidance can be made of what a task overrides here (see `knows`).
 
     def reference(self) -> ReferenceTrajectory:
         """What demonstrations have in common; its clock is the control period."""
@@ -160,6 +191,9 @@ class Task(ABC):
     ) -> dict[str, Any]:
         """Draws an episode's conditions and writes them into the root context; returns what `info` says of them.
 
+        `options` is an instance of `Reset`. Where its `held_out` is True, draw from conditions that training never
+        draws: evaluation resets so.
+
         They go nowhere else: rewards and conditions read signals, and may belong to a diagram that was built for an
         earlier environment with the same options. What is remembered in the task is for its next reset.
         """
@@ -175,8 +209,13 @@ class Task(ABC):
         return Scene(to_world=in_plane)
 
     @classmethod
+    def declares_collision(cls) -> bool:
+        """Whether somebody said what a collision is, for the class or in its constructor."""
+        return cls.collision is not Task.collision or cls.__init__ is not Task.__init__
+
+    @classmethod
     def knows(cls) -> tuple[str, ...]:
-        """The ingredients of guidance that somebody wrote down for this task."""
+        """Which of "demonstrations" (`reference`), "keep_out", "template" and "approach" the task overrides."""
         hooks = {
             "demonstrations": "reference",
             "keep_out": "keep_out",

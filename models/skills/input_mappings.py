@@ -56,7 +56,10 @@ def _require_object(frame: str) -> None:
 @register(INPUT_MAPPINGS, "translation")
 @dataclass(frozen=True)
 class Translation(InputMapping):
-    """Each input moves the end effector along one axis of a frame (`world`, `tool`, or an object's)."""
+    """Each input moves the end effector along one axis of a frame (`world`, `tool`, or an object's).
+
+    A full input means `speed_m_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    """
 
     inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
     speed_m_per_s: float  # at full input
@@ -79,7 +82,10 @@ class Translation(InputMapping):
 @register(INPUT_MAPPINGS, "rotation")
 @dataclass(frozen=True)
 class Rotation(InputMapping):
-    """Each input turns the end effector about one axis of a frame (`world`, `tool`, or an object's)."""
+    """Each input turns the end effector about one axis of a frame (`world`, `tool`, or an object's).
+
+    A full input means `speed_rad_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    """
 
     inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
     speed_rad_per_s: float  # at full input

@@ -3,7 +3,7 @@
 import ast
 import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -55,7 +55,8 @@ def load_skill(source: str | Path, **parameters: float) -> Skill:
     """Reads a skill.
 
     Args:
-        source: a file, or the name of one of guiderail's own skills (`pouring`).
+        source: a file that ends in .yaml or .yml, or the name of one of guiderail's own skills: `pouring`,
+            `pouring_aimed`, `grid_clamp` or `end_effector_velocity`.
         **parameters: sizes of the objects at hand, in place of the file's own values under `parameters`.
 
     Raises:
@@ -63,13 +64,18 @@ def load_skill(source: str | Path, **parameters: float) -> Skill:
     """
     path = Path(source)
     if path.suffix not in (".yaml", ".yml"):
-        known = resources.files("guiderail.models.skills")
-        names = [Path(str(f)).stem for f in known.iterdir() if str(f).endswith(".yaml")]
+        names = shipped_skills()
         if str(source) not in names:
             raise InputError(f"There is no skill {brief(str(source))}; {did_you_mean(str(source), names)}")
-        path = Path(str(known / f"{source}.yaml"))
+        path = Path(str(resources.files("guiderail.models.skills") / f"{source}.yaml"))
         return _skill(_shipped(path), path.name, parameters)
     return _skill(load_yaml(path, "skill"), path.name, parameters)
+
+
+def shipped_skills() -> list[str]:
+    """The names of guiderail's own skills."""
+    files = resources.files("guiderail.models.skills").iterdir()
+    return sorted(Path(str(file)).stem for file in files if str(file).endswith(".yaml"))
 
 
 @lru_cache
@@ -136,6 +142,9 @@ class _Numbers:
     def __init__(self, names: Mapping[str, float]):
         self.names = names
 
+    def _unknown(self, name: str, where: str) -> InputError:
+        return InputError(f"{where}: there is no parameter {brief(name)}; {did_you_mean(name, self.names)}")
+
     def __call__(self, entry: Any, where: str) -> float:
         try:
             value = self._value(entry, where)
@@ -163,15 +172,26 @@ class _Numbers:
             return float(node.value)
         if isinstance(node, ast.Name):
             if node.id not in self.names:
-                raise InputError(
-                    f"{where}: there is no parameter {brief(node.id)}; {did_you_mean(node.id, self.names)}"
-                )
+                raise self._unknown(node.id, where)
             return self.names[node.id]
         if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
             return OPERATORS[type(node.op)](self._evaluate(node.left, where), self._evaluate(node.right, where))
         if isinstance(node, ast.UnaryOp) and type(node.op) in OPERATORS:
             return OPERATORS[type(node.op)](self._evaluate(node.operand, where))
         raise InputError(f"{where}: {brief(ast.unparse(node))} is not a number; use parameters with + − * / only.")
+
+
+class _OwnNumbers(_Numbers):
+    """The same for the parameters themselves, none of which is made of others."""
+
+    def __init__(self, declared: Iterable[Any]):
+        super().__init__({})
+        self._declared = [str(name) for name in declared]
+
+    def _unknown(self, name: str, where: str) -> InputError:
+        return InputError(
+            f"{where}: {brief(name)} is no number, and no parameter ({', '.join(self._declared)}) is made of others."
+        )
 
 
 def _is_name(entry: Any) -> bool:
@@ -194,7 +214,7 @@ def _mapping(data: Any, where: str, known: set[str], required: set[str]) -> dict
 def _parameters(defaults: Any, given: Mapping[str, float], where: str) -> dict[str, float]:
     if not isinstance(defaults, dict):
         raise InputError(f"{where}: parameters must be a mapping from names to numbers, not {brief(defaults)}.")
-    plain = _Numbers({})
+    plain = _OwnNumbers(defaults)
     for name in defaults:
         if not (_is_name(name) and name.isascii() and name.isidentifier()):
             raise InputError(f"{where}: {brief(name)} can't name a parameter; take letters, digits and underscores.")

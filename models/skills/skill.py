@@ -21,11 +21,14 @@ BACKTRACKS = 8  # shortenings of a displacement before the command stays where i
 
 @dataclass(frozen=True)
 class Transition:
-    """Leaves a state when its distance falls below a threshold, and comes back with hysteresis."""
+    """Leaves a state for `to` when the state's distance falls below a threshold.
+
+    With a hysteresis it also leads back: from `to` to the state, when the state's distance exceeds below + hysteresis.
+    """
 
     to: str
     below: float  # [m] or [rad], in the unit of the state's distance
-    hysteresis: float | None = None  # back when the distance exceeds below + hysteresis; None: there is no way back
+    hysteresis: float | None = None  # [m] or [rad]; None: it does not lead back
 
 
 @dataclass(frozen=True)
@@ -193,7 +196,10 @@ class Skill:
         return state
 
     def state_at(self, X_WE: RigidTransform, frames: Frames) -> int:
-        """The state that an episode begins in at X_WE: as far on as transitions lead from the initial one there."""
+        """The state that an episode begins in at X_WE.
+
+        It is `initial_state`; where a transition fires there, the state that this leads to, and so on.
+        """
         state = self.initial_state
         for _ in self.states:
             state = self.next_state(state, X_WE, frames)

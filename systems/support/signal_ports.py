@@ -1,6 +1,8 @@
 """Input ports that are declared by name and size, and read by name."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from inspect import signature
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DependencyTicket, InputPort, LeafSystem
@@ -46,3 +48,28 @@ class SignalPorts:
     def eval(self, context: Context) -> dict[str, np.ndarray]:
         """All of them by name; `context` is the system's."""
         return {name: port.Eval(context) for name, port in self._ports.items()}
+
+
+def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
+    """Refuses a function that can't be called with signals by these names, before anything moves.
+
+    Args:
+        function: what is called with them.
+        names: of the signals.
+        what: the function is, in a sentence.
+
+    Raises:
+        InputError: if it takes other names.
+    """
+    try:
+        takes = signature(function)
+    except (ValueError, TypeError):
+        return  # one that is written in C doesn't say
+    names = list(names)
+    try:
+        takes.bind(**dict.fromkeys(names))
+    except TypeError:
+        raise InputError(
+            f"{what} is called with its signals by name, {', '.join(names) or 'none'}, and takes "
+            f"{', '.join(takes.parameters) or 'none'}: give its function and its inputs the same names"
+        ) from None

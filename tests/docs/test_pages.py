@@ -90,6 +90,18 @@ def test_every_field_of_a_template_says_what_it_is(reference):
     assert not [name for name, _, words in rows if not words.strip()]
 
 
+def test_whatever_a_task_can_declare_and_every_shipped_template_is_there(reference):
+    from guiderail.diagrams.tasks.task import Task
+    from guiderail.models import skills
+
+    part = reference["names"].partition("\n### Task\n")[2].partition("\n### ")[0]
+    declared = [name for name in Task.__annotations__ if not name.startswith("_")]
+    assert len(declared) > 10
+    assert not [name for name in declared if f"| `{name}` |" not in part]
+    for file in Path(skills.__file__).parent.glob("*.yaml"):
+        assert file.read_text(encoding="utf-8").rstrip() in reference["templates"], file.name
+
+
 def test_the_reference_names_no_place_of_this_machine(reference):
     for name, page in reference.items():
         assert str(ROOT) not in page, name

@@ -81,6 +81,21 @@ def trained(bead_run):
         (["drive", "Puring"], "did you mean Pouring?"),
         (["film", "new", "--out", "film.png"], "not a run"),
         (["film", "Bead", "--policy", "rul", "--out", "film.png"], "no policy 'rul'"),
+        *(
+            ([*words, "--import", "none.py"], "there is none for 'none.py'")
+            for words in (
+                ["stress", "lab/Own"],
+                ["replay", "lab/Own"],
+                ["certify", "lab/Own"],
+                ["film", "lab/Own", "--out", "film.png"],
+                ["drive", "lab/Own"],
+                ["teach", "lab/Own", "--out", "taught.npz"],
+                ["bench", "training", "lab/Own"],
+            )
+        ),
+        (["train", "lab/Own", "--out", "new"], "or --import the file that registers it"),
+        (["stress", "lab/Own"], "or --import the file that registers it"),
+        (["check", "pourin"], "or one of end_effector_velocity, grid_clamp, pouring"),
         (["generate", "objects"], "nothing called 'objects'"),
         (["generate", "clamp-objects", "--out", "none"], "make it first"),
         (["list", "metrix"], "did you mean metrics?"),

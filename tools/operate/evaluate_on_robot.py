@@ -80,7 +80,7 @@ def evaluate_on_robot(
         env = robot.env
         act = learned if acting is None else acting(env)
         assert act is not None
-        with no_pauses(), EpisodeProgress(episodes, name=policy or config.task) as progress:
+        with no_pauses(), EpisodeProgress(episodes, name=policy or config.task, window=None) as progress:
             try:
                 for index in range(episodes):
                     rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.rehearse))

@@ -42,6 +42,9 @@ SERIES = {
 """Who acts in a series of held-out episodes, in words."""
 
 
+COLLISIONS = ("collisions", "collision_steps")  # of them, those that a task declares a signal for
+
+
 def evaluate_policy(
     env: gymnasium.Env,
     act: Act,
@@ -69,7 +72,7 @@ def evaluate_policy(
     if not 0 <= seed < 2**31:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
     rows = []
-    with EpisodeProgress(episodes, name=words) if words else nullcontext() as progress:
+    with EpisodeProgress(episodes, name=words, window=None) if words else nullcontext() as progress:
         for i in range(episodes):
             rows.append(rollout(env, act, index=i, seed=seed + i, held_out=True, options=options))
             if progress is not None:
@@ -128,7 +131,8 @@ def evaluate(
 
     Returns:
         `claim`, what the policy is then judged as; the statistics `COMPARED`, each also as `demonstration_<name>` (the
-        same episodes before anything was learned; None where guidance has no demonstration) and as `<policy>_<name>`
+        same episodes before anything was learned; None where guidance has no demonstration, and those of collisions
+        where the task declares no signal of them) and as `<policy>_<name>`
         for those beside it; `beside`, the names of those that can act in this environment; `episodes` and `seed`;
         `converged_after` and `trained_episodes` of the training; `differs_from_thesis`, in what task, learner and
         environment do, in words.
@@ -161,10 +165,11 @@ def evaluate(
     others: dict[str, Any] = {}
     for name, found in ({"demonstration": pd.DataFrame()} | judged).items():
         others |= summary(found, COMPARED, f"{name}_")
+    counts = _counts_collisions(config.task)
+    statistics = {**summary(rows, COMPARED), **others}
     return {
         "claim": claimed,
-        **summary(rows, COMPARED),
-        **others,
+        **{key: value if counts or not key.endswith(COLLISIONS) else None for key, value in statistics.items()},
         "beside": [*judged],
         "episodes": episodes,
         "seed": seed,
@@ -188,11 +193,23 @@ def claim(task: str, environment: Mapping[str, Any], fresh: bool) -> str:
     hides = task in TASKS.names() and "new_run" in TASKS.get(task).Reset.model_fields
     if fresh and not hides:
         raise InputError(f"a run of {task} hides nothing that could be drawn anew: leave --fresh out")
+    if not draws_held_out(task):
+        return f"a policy for conditions as in training: {task} declares none that training never draws"
     if not hides:
         return "a policy for starts that training never drew"
     if fresh or environment.get("uncertainty", CALIBRATION) != CALIBRATION:
         return "a policy for any offset: a new one in every episode"
     return "a policy for the one offset that is hidden in this run, and for no other (--fresh: for any)"
+
+
+def _counts_collisions(task: str) -> bool:
+    """Whether a task declares what a collision is; a `Condition` that ends an episode as one is none of the ledger."""
+    return task not in TASKS.names() or TASKS.get(task).declares_collision()
+
+
+def draws_held_out(task: str) -> bool:
+    """Whether a task declares conditions that training never draws; one that is registered as Gymnasium's can't."""
+    return task not in TASKS.names() or TASKS.get(task).draws_held_out
 
 
 def judged_once(

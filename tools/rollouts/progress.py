@@ -9,7 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from guiderail.tools.rollouts.metrics import TOLERANCE
 
-WINDOW = 10  # episodes that success and return are averaged over
+WINDOW = 10  # episodes of training that success and return are averaged over
 
 
 class EpisodeProgress:
@@ -18,16 +18,19 @@ class EpisodeProgress:
     Use it as a context and call `update` with each episode's row.
     """
 
-    def __init__(self, episodes: int, *, name: str = "training", console: Console | None = None):
+    def __init__(
+        self, episodes: int, *, name: str = "training", window: int | None = WINDOW, console: Console | None = None
+    ):
         """
         Args:
             episodes: of the whole run; a run that goes on starts further along.
             name: what the bar is called.
+            window: how many of the last episodes success and return are averaged over; all of them for None.
             console: where it is drawn; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)
         self._episodes, self._name = episodes, name
-        self._done, self._seen = 0, 0
+        self._done, self._seen, self._window = 0, 0, window
         self._recent: list[tuple[float, float]] = []
         self._worst = float("-inf")
         self._started = self._said = time.monotonic()
@@ -52,7 +55,9 @@ class EpisodeProgress:
     def update(self, row: Mapping[str, Any]) -> None:
         """Takes one finished episode in."""
         self._done, self._seen = int(row["episode"]) + 1, self._seen + 1
-        self._recent = [*self._recent, (float(row["success"]), float(row["return"]))][-WINDOW:]
+        self._recent = [*self._recent, (float(row["success"]), float(row["return"]))]
+        if self._window is not None:
+            self._recent = self._recent[-self._window :]
         self._worst = max(self._worst, float(row["worst_violation"]))
         self._bar.update(self._task, completed=self._done, said=self.says())
         now = time.monotonic()

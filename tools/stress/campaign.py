@@ -16,7 +16,8 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
-from guiderail.models.errors import InputError
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 from guiderail.tools.files import write_atomically
 from guiderail.tools.rollouts.ledger import Ledger
@@ -82,7 +83,7 @@ class Campaign:
     # Makes what watches an environment's episodes for what their rows don't tell, in numbers: the greater, the worse.
     witness: Callable[[gymnasium.Env], Observer] | None = None
     actions: Mapping[str, Choose] = field(default_factory=lambda: ACTIONS)
-    frames: Frames = nothing_moves  # where a template's objects are, by what a reset drew
+    frames: Frames | None = nothing_moves  # where a template's objects are, by what a reset drew; None: nobody knows
 
 
 def run_campaign(
@@ -224,7 +225,8 @@ def stress(
     """Stresses a task, or all of them, for so many episodes or control steps.
 
     Args:
-        task: one of `STRESSED`, or "all": each gets the same part of the control steps.
+        task: a task; one of your own is tried as `own_task` says. Or "all": each of `STRESSED` gets the same part of
+            the control steps.
         episodes: how many; 1000 unless given, and not for all tasks.
         steps: control steps, instead.
         seed: of the first episode of each task.
@@ -237,7 +239,7 @@ def stress(
         `cases` and `all` of what came of it, and `wrong`; of all tasks `tasks`, `control_steps` and `wrong`.
 
     Raises:
-        InputError: for a task without a campaign, or a number out of range.
+        InputError: for an unknown task, or a number out of range.
     """
     if (episodes is not None and episodes < 1) or (steps is not None and steps < 1) or seed < 0:
         raise InputError("a stress campaign has at least one episode or control step, and a seed from 0")
@@ -247,8 +249,12 @@ def stress(
         if out is not None and out.suffix == ".csv":
             raise InputError(f"all tasks leave a folder, not the table {out}: name a folder with --out")
         return _stress_all(-(-steps // len(STRESSED)), seed=seed, out=out, say=say)
-    if task not in STRESSED:
-        raise InputError(f"nobody wrote down how to stress {task!r}: {did_you_mean(task, [*STRESSED, EVERY])}")
+    if task not in STRESSED and task not in TASKS.names():
+        remedy = did_you_mean(task, {*STRESSED, *TASKS.names(), EVERY})
+        raise InputError(
+            f"there is no task {brief(task)} to stress: {remedy}"
+            + ("" if remedy.endswith("?") else ", or --import the file that registers it")
+        )
     return _stress(task, 1000 if episodes is None else episodes, steps, seed, out, None, environment, say)
 
 
@@ -281,7 +287,12 @@ def _stress(
     environment: Mapping[str, Any] | None,
     say: Callable[[str], None] | None,
 ) -> dict[str, Any]:
-    campaign = import_module(f"guiderail.tools.stress.{STRESSED[task]}").campaign()
+    if task in STRESSED:
+        campaign = import_module(f"guiderail.tools.stress.{STRESSED[task]}").campaign()
+    else:
+        from guiderail.tools.stress.own_task import campaign_of
+
+        campaign = campaign_of(task)
 
     def enough(rows: list[dict[str, Any]]) -> bool:
         if steps is not None:

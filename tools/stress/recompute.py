@@ -29,11 +29,11 @@ class RecomputedViolation(EnvObserver):
     template in the state of each control step, with plain NumPy: not by the systems that say so in `info`.
     """
 
-    def __init__(self, env: gymnasium.Env, frames: Frames = nothing_moves):
+    def __init__(self, env: gymnasium.Env, frames: Frames | None = nothing_moves):
         """
         Args:
             env: the environment of a declared task.
-            frames: where the template's objects are.
+            frames: where the template's objects are; None where nobody knows: then only a task's constraints bound it.
         """
         super().__init__(env)
         self._frames = frames
@@ -53,6 +53,8 @@ class RecomputedViolation(EnvObserver):
             # The command at the end of control step n is the one of step n, as counted from zero.
             G, c = constraints.window(np.arange(len(poses)))
             return (c - np.einsum("nfo,no->nf", G, poses)).max(axis=1, initial=-np.inf)
+        if self._frames is None or "template" not in task.knows():
+            return np.full(len(poses), -np.inf)
         template = task.template()
         frames = {**template.frames, **self._frames(self.base.drawn)}
         states = self.base.trace.signals["state"][:, 0].astype(int)

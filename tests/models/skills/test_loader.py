@@ -201,3 +201,11 @@ def test_refuses_what_is_not_there(tmp_path):
     broken.write_text("name: [")
     with pytest.raises(InputError, match="not YAML"):
         load_skill(broken)
+
+
+def test_a_parameter_is_made_of_no_other_and_the_sentence_names_them():
+    with pytest.raises(InputError, match=r"'far' is no number, and no parameter \(near, far\) is made of others"):
+        parse_skill(
+            "{name: x, inputs: 1, parameters: {near: far, far: 1}, max_speed_m_per_s: 1, "
+            "max_speed_rad_per_s: 1, states: {}}"
+        )

@@ -184,3 +184,11 @@ def test_the_template_follows_the_object():
     wide = load_skill("pouring", mug_radius_m=0.06)
     narrow = load_skill("pouring", mug_radius_m=0.04)
     assert wide.states[1].ends_at - narrow.states[1].ends_at == pytest.approx(0.02)
+
+
+def test_the_length_of_an_axis_multiplies_the_speed():
+    moved = [
+        im.Translation((0,), 0.1, axes=((0.0, 0.0, length),)).displacement(np.ones(1), RigidTransform(), {}, 0.5)
+        for length in (1.0, 2.0)
+    ]
+    np.testing.assert_allclose(moved[1].translation(), 2 * moved[0].translation())

@@ -46,6 +46,7 @@ class Slot(Task):
     defaults = {"guidance": "kgrl", "hold": 5}
     num_steps = NUM_STEPS
     clip = 1.0
+    draws_held_out = True
 
     def world(self) -> NarrowPassage:
         middle = 0.35

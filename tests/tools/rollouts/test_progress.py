@@ -30,6 +30,15 @@ def test_a_log_file_gets_lines_that_say_the_same_as_the_bar():
         assert word in last
 
 
+def test_an_evaluation_says_the_mean_of_all_its_episodes():
+    last, whole = EpisodeProgress(40), EpisodeProgress(40, window=None)
+    for i in range(40):
+        for progress in (last, whole):
+            progress.update({"episode": i, "success": int(i >= 30), "return": 0.0, "worst_violation": -1.0})
+    assert "success 100%" in last.says()
+    assert "success 25%" in whole.says()
+
+
 def test_a_terminal_gets_a_bar():
     text = shown(terminal=True)
     for word in ("4/4", "success 50%", "return 10.0", "violation 2.0e-03"):

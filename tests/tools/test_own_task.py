@@ -1,0 +1,180 @@
+"""What somebody is told whose task, in a file of their own, is not yet right."""
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+from guiderail.diagrams.make import make_env, resolve
+from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.tasks.registry import TASKS, register_task
+from guiderail.diagrams.tasks.task import Task, Threshold
+from guiderail.models.errors import InputError
+from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.models.primitives import ReferenceTrajectory
+from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.reward_system import RewardTerm
+from guiderail.tools.check import check
+from guiderail.tools.listing import options_in_words
+from guiderail.tools.rollouts.evaluate import _counts_collisions, claim
+from guiderail.tools.stress.campaign import stress
+from guiderail.tools.tasks import import_modules
+
+NUM_STEPS = 10
+
+
+class Own(Task):
+    """Straight up through a wide gap."""
+
+    world_kind = "plane"
+    num_steps = NUM_STEPS
+    reward = staticmethod(lambda pose: -float(pose[1]))
+
+    def world(self):
+        return NarrowPassage(start=(0.35, 0.1), goal=(0.35, 0.9), goal_radius=0.05, gap_x=(0.2, 0.5))
+
+    def reference(self):
+        means = np.column_stack([np.full(NUM_STEPS, 0.35), np.linspace(0.1, 0.2, NUM_STEPS)])
+        return ReferenceTrajectory(0.02 * np.arange(NUM_STEPS), means, np.tile(1e-4 * np.eye(2), (NUM_STEPS, 1, 1)))
+
+    def observed(self):
+        return (Observed("phase"),)
+
+    def reward_terms(self, num_actions):
+        return [RewardTerm("a", {"pose": 2}, self.reward)]
+
+    def conditions(self):
+        return [Condition("success", {"pose": 2}, self.world().at_goal)]
+
+    def reset(self, station, guidance, context, rng, options):
+        return {}
+
+
+class Ignorant(Task):
+    """Nobody wrote down anything about it."""
+
+    world, observed, reward_terms, conditions, reset = Own.world, Own.observed, Own.reward_terms, Own.conditions, None
+
+
+@pytest.fixture(autouse=True)
+def no_other_test_has_it():
+    yield
+    TASKS._entries.pop("lab/Own", None)
+    gymnasium.registry.pop("lab/Own-v0", None)
+
+
+def first_step():
+    env = make_env("lab/Own", guidance="kmp")
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape))
+
+
+def declare(of=Own, **attributes):
+    return register_task("lab/Own")(type("Mine", (of,), attributes))
+
+
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"Options": dict}, "Options of lab/Own must be a class made of Options"),
+        ({"Reset": None}, "Reset of lab/Own must be a class made of ResetOptions"),
+        ({"clip": None}, "clip of lab/Own must be a positive number"),
+        ({"rewards": ()}, "rewards of lab/Own must be some words"),
+        ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
+    ],
+)
+def test_a_declaration_of_the_wrong_kind_is_refused_where_it_is_made(attributes, says):
+    with pytest.raises(InputError, match=says):
+        declare(**attributes)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"world_kind": "planes"}, "a world of the kind 'planes', which lab/Own has: did you mean plane"),
+        ({"of": Ignorant, "world_kind": "plane"}, "nothing guides lab/Own, as it knows nothing: write its reference"),
+        ({"difficulties": {"standard": {}, "hard": {"gapp": 1}}}, "hard of lab/Own sets no option 'gapp'"),
+        ({"defaults": {"hodl": 5}}, "defaults of lab/Own sets no option 'hodl': did you mean hold"),
+    ],
+)
+def test_what_no_environment_can_be_made_of_is_a_sentence(attributes, says):
+    declare(**attributes)
+    with pytest.raises(InputError, match=says):
+        resolve("lab/Own", {})
+
+
+def test_settings_of_another_guidance_are_no_mistake():
+    declare(difficulties={"standard": {}, "hard": {"history": 4}}, defaults={"guidance": "kmp"})
+    assert resolve("lab/Own", {"difficulty": "hard"}).values["guidance"] == "kmp"
+
+
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"reward": lambda self, pose: np.nan}, "reward term 'a' of lab/Own is not finite, but nan"),
+        ({"reward": lambda self, pose: pose}, "reward term 'a' of lab/Own must be one number, and it is array"),
+        ({"reward": lambda self, pose: None}, "reward term 'a' of lab/Own must be one number, and it is None"),
+        ({"reward": lambda self, place: 0.0}, "reward term 'a' of lab/Own is called with .*, pose, and takes place"),
+        (
+            {"conditions": lambda self: [Condition("success", {"pose": 2}, lambda position: False)]},
+            "the condition 'success' of lab/Own is called with .*, pose, and takes position",
+        ),
+        ({"reset": lambda self, *given: None}, "reset of lab/Own returns what it drew by name, {} .*, not None"),
+    ],
+)
+def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, says):
+    declare(**attributes)
+    with pytest.raises(InputError, match=says):
+        first_step()
+
+
+def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
+    declare()
+    assert "conditions as in training" in claim("lab/Own", {}, fresh=False)
+    words = options_in_words("lab/Own")
+    assert words["reset: held_out"].startswith("nothing here")
+    assert words["reward"] == "what is rewarded: the task's own, which has no name"
+    declare(draws_held_out=True)
+    assert claim("lab/Own", {}, fresh=False) == "a policy for starts that training never drew"
+    assert options_in_words("lab/Own")["reset: held_out"].startswith("draw from conditions that training never")
+
+
+def test_collisions_are_counted_only_where_a_task_says_what_they_are():
+    declare()
+    assert not _counts_collisions("lab/Own")
+    declare(collision=Threshold("contact_force"))
+    assert _counts_collisions("lab/Own")
+    assert all(map(_counts_collisions, ("BncConnector", "GridClamp", "Pouring", "NarrowPassage")))
+
+
+def test_a_task_of_ones_own_is_stressed_through_every_guidance_that_it_has():
+    declare()
+    import_modules(["json"])  # what makes Gymnasium's environments of tasks
+    found = stress("lab/Own", episodes=3)
+    assert found["wrong"] == []
+    assert found["cases"].keys() <= {"kgrl", "kmp", "residual", "skgrl"}
+    assert found["all"]["episodes"] == 3
+
+
+def test_a_file_finds_those_beside_it_and_what_fails_in_it_is_said(tmp_path):
+    path = [*sys.path]
+    (tmp_path / "beside_own.py").write_text("PERIOD = 3\n")
+    good, wrong = tmp_path / "own_good.py", tmp_path / "own_wrong.py"
+    good.write_text("from beside_own import PERIOD\n")
+    wrong.write_text("PERIOD = 3\nimport nowhere_to_be_found\n")
+    assert import_modules([str(good)]) == (str(good),)
+    with pytest.raises(InputError, match=r"importing own_wrong\.py failed: own_wrong\.py, line 2: ModuleNotFoundError"):
+        import_modules([str(wrong)])
+    with pytest.raises(InputError, match="there is none for 'nowhere_to_be_found'"):
+        import_modules(["nowhere_to_be_found"])
+    assert sys.path == path
+    sys.modules.pop("beside_own")
+
+
+def test_a_shipped_skill_is_checked_by_its_name_and_says_where_the_way_back_is(monkeypatch):
+    monkeypatch.setattr("guiderail.models.skills.validate.validate", lambda skill: [])
+    back, none = check(Path("pouring"))["transitions"]
+    assert back == "translational → tilt below 0.25 m, back above 0.27 m"
+    assert none == "tilt → pour below 0.075 m, no way back"
