@@ -16,7 +16,8 @@ settings.load_profile("quick")
 # What hears a robot's bus from Python while a simulator reads it, which a Drake of nanobind's bindings can not.
 ON_A_BUS = (
     "stations/test_hardware.py", "stations/test_injections.py", "stations/test_pace.py", "operate/test_places.py",
-    "operate/test_rehearsal.py", "operate/test_run_policy.py", "operate/test_train_on_robot.py", "benchmarks/test_loop.py",
+    "operate/test_rehearsal.py", "operate/test_run_policy.py", "operate/test_train_on_robot.py",
+    "benchmarks/test_loop.py",
 )  # fmt: skip
 
 

@@ -61,8 +61,8 @@ def check_handlers() -> None:
     """
     if not handlers_are_safe():
         raise InputError(
-            "this version of Drake calls Python's handlers of LCM messages without the interpreter's lock, which ends the "
-            "process: for a robot or a rehearsal use drake 1.51 (constraints.txt)"
+            "this version of Drake calls Python's handlers of LCM messages without the interpreter's lock, which ends "
+            "the process: for a robot or a rehearsal use drake 1.51 (constraints.txt)"
         )
 
 
