@@ -153,9 +153,7 @@ def train(
     reward: Annotated[str | None, _opt("sparse or shaped; Pouring: hand_shaped too, GridClamp: no_force.")] = None,
     observation: Annotated[str | None, _opt("state or image.")] = None,
     uncertainty: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
-    station: Annotated[
-        str | None, _opt("rails or arm, where a task has both; hardware for a robot, which is unfinished.")
-    ] = None,
+    station: Annotated[str | None, _opt("rails or arm, where a task has both; mujoco; hardware for a robot.")] = None,
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
     ] = None,

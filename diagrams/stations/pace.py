@@ -44,6 +44,28 @@ class Pace(Protocol):
         """Advances by so many statuses."""
 
 
+def handlers_are_safe() -> bool:
+    """Whether Drake takes the interpreter's lock before it calls a handler of Python's.
+
+    A Drake whose bindings are nanobind's (1.58 was tried) makes the handler's argument without it where a simulator
+    reads the bus, and the process ends there.
+    """
+    return not type(DrakeLcmInterface.__dict__["Subscribe"]).__module__.startswith("nanobind")
+
+
+def check_handlers() -> None:
+    """Asked before anything of a robot's bus is heard.
+
+    Raises:
+        InputError: if handlers are not safe.
+    """
+    if not handlers_are_safe():
+        raise InputError(
+            "this version of Drake calls Python's handlers of LCM messages without the interpreter's lock, which ends "
+            "the process: for a robot or a rehearsal use drake 1.51 (constraints.txt)"
+        )
+
+
 class NewMessages:
     """Counts the messages of a channel; one that is sent again counts once, whatever torques it says by then.
 
@@ -58,7 +80,11 @@ class NewMessages:
         Args:
             lcm: the bus.
             channel: its channel.
+
+        Raises:
+            InputError: if handlers are not safe.
         """
+        check_handlers()
         self.count = self.repeats = 0
         self.last = b""
         lcm.Subscribe(channel, self._hear)
@@ -295,7 +321,11 @@ def serve_in_real_time(
         attend: called after every status: for a deputy.
         rate: of its clock to the wall's.
         say: what a person is told, once.
+
+    Raises:
+        InputError: if handlers are not safe.
     """
+    check_handlers()
     simulator.set_target_realtime_rate(rate)
     started, has_said = time.monotonic(), False
     for step in range(1, round(seconds / driver.period) + 1):
