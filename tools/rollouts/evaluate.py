@@ -149,7 +149,7 @@ def evaluate(
     if fresh:
         how["options"] = {"new_run": True}
     alone = {"demonstration": still} if is_demonstrated(where.get("guidance")) else {}
-    them = {**alone, **(beside or {})}
+    them: dict[str, Callable[[gymnasium.Env], Act]] = {**alone, **(beside or {})}
     series = {
         name: f"series {number} of {1 + len(them)}: {SERIES.get(name, name)}"
         for number, name in enumerate(("policy", *them), start=1)

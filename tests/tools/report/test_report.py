@@ -90,7 +90,7 @@ def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_
     assert len(gather([run]).held_out) == 0
     evaluate(run, episodes=2, beside=others)
     judged = gather([run]).held_out
-    assert judged[["policy", "episodes"]].to_numpy().tolist() == [["white", 2]]
+    assert judged[["policy", "episodes"]].to_numpy().tolist() == [["demonstration", 2], ["white", 2]]
 
 
 def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):
