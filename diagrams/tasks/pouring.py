@@ -37,6 +37,7 @@ POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
 START_HEIGHT = (0.08, 0.19)  # [m]
+DRAWS = 20  # of a start, before it is said that the arm can't reach it
 
 
 @register_task("Pouring")
@@ -111,31 +112,39 @@ class Pouring(Task):
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Places the mug, the upright thermos and the balls; everything is drawn, even what an option replaces."""
+        """Places the mug, the upright thermos and the balls; everything is drawn, even what an option replaces.
+
+        What was drawn where the arm can't reach is drawn again.
+        """
         assert isinstance(station, PouringStation)
         episode = episode_stream(rng, options.held_out)
-        azimuth = np.deg2rad(episode.uniform(*START_AZIMUTH_DEG))
-        radius, height = episode.uniform(*START_RADIUS), episode.uniform(*START_HEIGHT)
-        p_MP = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-        p_TMug = self.options.mug_offset * episode.uniform(-1.0, 1.0, 2)
-        p_MP = p_MP if options.start is None else np.array(options.start)
-        p_TMug = p_TMug if options.mug_position is None else np.array(options.mug_position)
-        if np.abs(p_TMug).max() > MAX_MUG_OFFSET:
-            raise InputError(
-                f"the mug can be moved by {MAX_MUG_OFFSET} m along x and y, where the arm reaches: not more"
-            )
-        error = draw_error(episode, self.options, options)
-        # Where it is believed to be stays where the arm reaches; it is the mug that stands elsewhere.
-        believed, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
-        frames = frames_of(self._skill, believed)
+        for _ in range(DRAWS):
+            azimuth = np.deg2rad(episode.uniform(*START_AZIMUTH_DEG))
+            radius, height = episode.uniform(*START_RADIUS), episode.uniform(*START_HEIGHT)
+            p_MP = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
+            p_TMug = self.options.mug_offset * episode.uniform(-1.0, 1.0, 2)
+            p_MP = p_MP if options.start is None else np.array(options.start)
+            p_TMug = p_TMug if options.mug_position is None else np.array(options.mug_position)
+            if np.abs(p_TMug).max() > MAX_MUG_OFFSET:
+                raise InputError(f"the mug can be moved by {MAX_MUG_OFFSET} m along x and y: not more")
+            error = draw_error(episode, self.options, options)
+            # Where it is believed to be stays where the arm reaches; it is the mug that stands elsewhere.
+            believed, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
+            frames = frames_of(self._skill, believed)
+            # Turned as the template wants it, whether or not that guides: all kinds of guidance start alike.
+            X_TP = self._skill.project(self._skill.initial_state, RigidTransform(believed @ p_MP), frames)
+            try:
+                station.set_pose(context, transform_to_pose(X_TP))
+                break
+            except InputError as error_of_reach:
+                unreachable = error_of_reach
+        else:
+            raise unreachable
         station.set_mug(context, RigidTransform([*p_TMug, 0.0]))
         if isinstance(guidance, Guidance):
             guidance.set_frames(context, frames)
         if self.options.aim:
             self.drawn["mug_error"].set(context, error)
-        # Turned as the template wants it, whether or not that guides: all kinds of guidance start alike.
-        X_TP = self._skill.project(self._skill.initial_state, RigidTransform(believed @ p_MP), frames)
-        station.set_pose(context, transform_to_pose(X_TP))
         return {"start": p_MP, "mug_position": p_TMug} | ({"mug_error": error} if error.any() else {})
 
     def camera(self) -> Camera:

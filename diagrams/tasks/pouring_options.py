@@ -13,7 +13,7 @@ from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, Ball
 
-MAX_MUG_OFFSET = 0.04  # [m] along x and y: as far as the arm reaches around the mug
+MAX_MUG_OFFSET = 0.04  # [m] along x and y: farther off the arm would reach few of the starts
 MAX_MUG_ERROR = 0.06  # [m] as far as an aimed Pour leads from where the mug is believed
 
 HARD: Mapping[str, Any] = {

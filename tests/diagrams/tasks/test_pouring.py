@@ -217,3 +217,12 @@ def test_refuses_what_makes_no_sense(arguments, said):
 def test_refuses_reset_options_that_make_no_sense(env, options):
     with pytest.raises(InputError):
         env.reset(options=options)
+
+
+def test_a_start_that_the_arm_can_not_reach_is_drawn_again_and_one_that_was_asked_for_is_refused():
+    env = gymnasium.make("guiderail/Pouring-v0", guidance="sct", mug_offset=0.04)
+    _, info = env.reset(seed=11)  # whose first draw is beyond a joint's limit
+    far = {"start": [-0.15, -0.26, 0.19], "mug_position": [-0.04, -0.04]}
+    with pytest.raises(InputError, match="joint's limit"):
+        env.reset(seed=11, options=far)
+    assert np.abs(info["mug_position"]).max() <= 0.04
