@@ -79,14 +79,14 @@ class Task(ABC):
         learner: the algorithm and the preset that `guiderail train` uses unless told otherwise.
         num_steps: control steps after which an episode is over; must be given, in the class or in `__init__`.
         clip: the largest absolute value in an observation; larger ones are clipped.
-        collision: the signal that the ledger's `collisions` counts, and its limit; any contact force unless given. A
-            `Condition` that ends an episode as a collision is not counted by itself.
+        collision: the signal that the ledger's `collisions` counts, and its limit; any contact force unless given, and
+            then an evaluation leaves the count out. A `Condition` that ends an episode as a collision is not counted by
+            itself.
         isotropic_groups: indices of outputs of one unit, group by group; residual learning moves all outputs of a group
             alike. None is one group of all.
         pushable: whether `GuidedEnv.push` may displace the robot.
         options: the task's own options, checked: an instance of `Options`.
         choice: what every environment is made with.
-        collision: the signal that the ledger counts collisions of; unless declared, none are counted as known.
         draws_held_out: whether `reset` draws from conditions that training never draws where `options.held_out` is
             true. Without it an evaluation repeats conditions of training, and says so.
         drawn: what `signals` adds to a diagram and a reset sets, by name. A diagram is used again by whoever asks for

@@ -7,7 +7,6 @@ one after the other, so that their ratio is of one machine in one state. The see
 
 from __future__ import annotations
 
-import os
 import statistics
 import subprocess
 import sys
@@ -73,7 +72,7 @@ def _train(task: str, options: Mapping[str, Any], episodes: int, seed: int, pipe
     for name, value in options.items():
         words += ["--env", f"{name}={value}"]
     start = time.perf_counter()
-    ended = subprocess.run(words, env=os.environ, capture_output=True, text=True)
+    ended = subprocess.run(words, capture_output=True, text=True)
     seconds = time.perf_counter() - start
     if ended.returncode:
         raise InputError(f"a run failed: {ended.stderr.strip().splitlines()[-1]}")
