@@ -20,10 +20,9 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
 
 from guiderail.tools.benchmarks import told
+from guiderail.tools.benchmarks.plain_learners import PlainSac, PlainTqc
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
 from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.rollouts.rollout import Decision
@@ -42,21 +41,9 @@ class _Spaces(gymnasium.Env):
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
-class _PlainSac(OffPolicyLearner):
-    """With Stable-Baselines3's own gradient step."""
-
-    algorithm = SAC
-
-
-class _PlainTqc(OffPolicyLearner):
-    """With Stable-Baselines3's own gradient step."""
-
-    algorithm = TQC
-
-
 LEARNERS: dict[str, tuple[type[OffPolicyLearner], type[OffPolicyLearner]]] = {
-    "tqc": (_PlainTqc, TqcLearner),
-    "sac": (_PlainSac, SacLearner),
+    "tqc": (PlainTqc, TqcLearner),
+    "sac": (PlainSac, SacLearner),
 }
 
 
