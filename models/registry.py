@@ -113,12 +113,12 @@ class Registry(Generic[Entry]):
         return {point.name: point for point in metadata.entry_points(group=self._group)} if self._group else {}
 
 
-def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The end of a sentence about an unknown name: the nearest known one, else all of them."""
+def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:
+    """The end of a sentence about an unknown name: the nearest known one, else all of them and what else helps."""
     known = sorted(known)
     lower = {word.lower(): word for word in known}
     near = difflib.get_close_matches(str(name).lower(), lower, n=1)
-    return f"did you mean {lower[near[0]]}?" if near else f"choose one of {', '.join(known) or 'none'}"
+    return f"did you mean {lower[near[0]]}?" if near else f"choose one of {', '.join(known) or 'none'}{otherwise}"
 
 
 def _registered(source: str, decorator: str) -> Iterator[str]:

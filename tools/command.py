@@ -884,7 +884,10 @@ def list_(
         declared = as_json and what in listing.TASKS.names()
         _print(listing.task(what) if declared else listing.options_in_words(what), as_json, "_")
     else:
-        raise InputError(f"there is no list of {what!r}: {did_you_mean(what, [*CHOICES['listed'](), 'metrics'])}")
+        from guiderail.tools.tasks import IMPORTED
+
+        known = did_you_mean(what, [*CHOICES["listed"](), "metrics"], IMPORTED)
+        raise InputError(f"there is no list of {what!r}: {known}")
 
 
 def _listing() -> Any:

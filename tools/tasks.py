@@ -25,6 +25,7 @@ from guiderail.models.yaml_files import parse_yaml
 
 _IMPORTED: dict[Path, bytes] = {}
 """What each file said when it was imported."""
+IMPORTED = ", or --import the file that registers it"  # how a name is found that nothing installed has
 
 
 def known_tasks() -> list[str]:
@@ -141,11 +142,7 @@ def task_options(task: str) -> dict[str, Any]:
     if task in TASKS.names():
         return check_environment(task, {})
     if task not in known_tasks():
-        remedy = did_you_mean(task, known_tasks())
-        raise InputError(
-            f"there is no task {brief(task)}: {remedy}"
-            + ("" if remedy.endswith("?") else ", or --import the file that registers it")
-        )
+        raise InputError(f"there is no task {brief(task)}: {did_you_mean(task, known_tasks(), IMPORTED)}")
     entry = gymnasium.spec(environment_id(task)).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
     taken = inspect.signature(creator).parameters.items()

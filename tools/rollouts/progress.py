@@ -69,10 +69,11 @@ class EpisodeProgress:
             )
 
     def says(self) -> str:
-        """Success and return of the last episodes, and the worst violation of all that were seen."""
+        """Success and return of the last episodes, how many those are, and the worst violation of all that were seen."""
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
         worst = "none" if self._worst <= TOLERANCE else f"{self._worst:.1e}"
-        return f"success {success:.0%}  return {returns:.1f}  violation {worst}"
+        of_last = "" if self._window is None else f"last {len(self._recent)}: "
+        return f"{of_last}success {success:.0%}  return {returns:.1f}  worst violation {worst}"
 
     def _left(self, now: float) -> str:
         if self._done == self._episodes:

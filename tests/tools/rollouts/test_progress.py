@@ -35,8 +35,8 @@ def test_an_evaluation_says_the_mean_of_all_its_episodes():
     for i in range(40):
         for progress in (last, whole):
             progress.update({"episode": i, "success": int(i >= 30), "return": 0.0, "worst_violation": -1.0})
-    assert "success 100%" in last.says()
-    assert "success 25%" in whole.says()
+    assert last.says().startswith("last 10: success 100%")
+    assert whole.says().startswith("success 25%")
 
 
 def test_a_terminal_gets_a_bar():
