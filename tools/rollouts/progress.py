@@ -69,7 +69,7 @@ class EpisodeProgress:
             )
 
     def says(self) -> str:
-        """Success and return of the last episodes, how many those are, and the worst violation of all that were seen."""
+        """Success and return of the last episodes, how many they are, and the worst violation of all that were seen."""
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
         worst = "none" if self._worst <= TOLERANCE else f"{self._worst:.1e}"
         of_last = "" if self._window is None else f"last {len(self._recent)}: "
