@@ -14,12 +14,7 @@ STILL = 1e-3
 _SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])
 
 
-def is_regular(J: np.ndarray) -> bool:
-    """Whether a Jacobian (6, n), [rotational, translational], gives every tool velocity with moderate joint speeds."""
-    return bool(np.linalg.svd(_SCALE[:, None] * J, compute_uv=False)[-1] >= REGULAR)
-
-
-def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray) -> np.ndarray:
+def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray) -> tuple[np.ndarray, bool]:
     """v = J⁺ V + (1 − J⁺ J) v_preferred, J⁺ a pseudoinverse that is damped in directions that are nearly lost, (n,).
 
     Each singular value σ below σ₀ = `REGULAR` is inverted as σ / (σ² + λ²) with λ² = σ₀² − σ², which is σ / σ₀²
@@ -31,11 +26,15 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
         J: Jacobian (6, n), [rotational, translational], six joints or more.
         V: tool velocity (6,), in the same order [rad/s, m/s].
         preferred: joint velocities (n,) that the tool need not notice [rad/s].
+
+    Returns:
+        v (n,), and whether J is regular: nothing was damped, and J v = V.
     """
     U, sigma, WT = np.linalg.svd(_SCALE[:, None] * J, full_matrices=False)
     inverse = sigma / np.maximum(sigma, REGULAR) ** 2
     wanted = WT @ preferred
-    return preferred + WT.T @ (inverse * (U.T @ (_SCALE * V)) - inverse * sigma * wanted)
+    v = preferred + WT.T @ (inverse * (U.T @ (_SCALE * V)) - inverse * sigma * wanted)
+    return v, bool(sigma[-1] >= REGULAR)
 
 
 def follows(J: np.ndarray, v: np.ndarray, V: np.ndarray) -> bool:

@@ -21,7 +21,7 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.damped_inverse import damped_joint_velocities, follows, is_regular
+from guiderail.models.damped_inverse import damped_joint_velocities, follows
 from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.systems.support.caching import declare_plant_context
@@ -51,12 +51,12 @@ class CartesianPositionController(LeafSystem):
 
         q[k+1] = clip(q[k] + v·period), J v = the velocity that reaches the desired pose in one period, within limits
 
-    (`pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics`). The optimization keeps the direction of
-    the tool's motion and every joint's limits of position and velocity; where both can't be had, the motion slows down
-    or stops. Where commands stop, the joint command is held: while the desired pose is not finite, older than a timeout
-    or more than a period from the future (`CommandCheck`). Near a singular posture a damped pseudoinverse takes over
-    (`models.damped_inverse`): the tool leaves its direction a little, the joints stay slow, and the return to the
-    posture leads out.
+    (`pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics`; in closed form while no limit of a joint
+    binds, which is the same optimum). The optimization keeps the direction of the tool's motion and every joint's
+    limits of position and velocity; where both can't be had, the motion slows down or stops. Where commands stop, the
+    joint command is held: while the desired pose is not finite, older than a timeout or more than a period from the
+    future (`CommandCheck`). Near a singular posture a damped pseudoinverse takes over (`models.damped_inverse`): the
+    tool leaves its direction a little, the joints stay slow, and the return to the posture leads out.
 
     .. pydrake_system::
 
@@ -119,8 +119,10 @@ class CartesianPositionController(LeafSystem):
         parameters.set_time_step(period)
         parameters.set_nominal_joint_position(np.asarray(posture, dtype=float))
         parameters.set_joint_centering_gain(posture_gain * np.eye(num_joints))
-        parameters.set_joint_position_limits((plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()))
-        parameters.set_joint_velocity_limits((plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()))
+        self._position_limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
+        self._velocity_limits = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
+        parameters.set_joint_position_limits(self._position_limits)
+        parameters.set_joint_velocity_limits(self._velocity_limits)
         self._parameters = parameters
 
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
@@ -197,9 +199,7 @@ class CartesianPositionController(LeafSystem):
         discrete_state.set_value(self._is_stuck, [float(is_stuck)])
         if velocities is not None:
             # The solver keeps limits to its own tolerance only; what is sent keeps them exactly.
-            lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
-            moved = np.clip(q + self._period * velocities, lower, upper)
-            discrete_state.set_value(self._command, moved)
+            discrete_state.set_value(self._command, np.clip(q + self._period * velocities, *self._position_limits))
         return EventStatus.Succeeded()
 
     def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
@@ -214,16 +214,22 @@ class CartesianPositionController(LeafSystem):
 
     def _joint_velocities(self, q: np.ndarray, V: np.ndarray, J: np.ndarray) -> tuple[np.ndarray | None, bool]:
         """For the tool velocity V, or None where there are none; and whether V's direction can't be followed."""
-        if is_regular(J):
-            result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
-            return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound
-        velocities = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
-        velocities /= max(1.0, float((np.abs(velocities) / self._plant.GetVelocityUpperLimits()).max()))
-        return velocities, not follows(J, velocities, V)
+        velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
+        if not is_regular:
+            velocities /= max(1.0, float((np.abs(velocities) / self._velocity_limits[1]).max()))
+            return velocities, not follows(J, velocities, V)
+        if _within(velocities, self._velocity_limits) and _within(q + self._period * velocities, self._position_limits):
+            return velocities, False  # no limit binds: the optimum, without the time that its solver takes
+        result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
+        return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:
         X_TP = self._tool_centre.CalcPose(self._plant_context.Eval(context), self._target)
         output.SetFromVector(transform_to_pose(X_TP))
+
+
+def _within(values: np.ndarray, limits: tuple[np.ndarray, np.ndarray]) -> bool:
+    return bool((limits[0] <= values).all() and (values <= limits[1]).all())
 
 
 def _limited(velocity: np.ndarray, limit: float) -> np.ndarray:

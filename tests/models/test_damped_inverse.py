@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.damped_inverse import LEVER, REGULAR, damped_joint_velocities, follows, is_regular
+from guiderail.models.damped_inverse import LEVER, REGULAR, damped_joint_velocities, follows
 
 SCALE = np.array([LEVER] * 3 + [1.0] * 3)
 
@@ -19,8 +19,8 @@ def test_regular_it_is_the_plain_pseudoinverse(num_joints):
     for _ in range(20):
         J = jacobian(rng.uniform(REGULAR, 1.0, 6), num_joints, rng)
         V, preferred = rng.standard_normal(6), rng.standard_normal(num_joints)
-        v = damped_joint_velocities(J, V, preferred)
-        assert is_regular(J)
+        v, is_regular = damped_joint_velocities(J, V, preferred)
+        assert is_regular
         np.testing.assert_allclose(J @ v, V, atol=1e-9)
         still = np.eye(num_joints) - np.linalg.pinv(J) @ J
         np.testing.assert_allclose(still @ (v - preferred), 0.0, atol=1e-9)
@@ -33,9 +33,9 @@ def test_near_a_singularity_joint_speeds_stay_bounded():
         J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, left]), 6, rng)
         V = rng.standard_normal(6)
         V /= np.linalg.norm(SCALE * V)
-        speed = np.linalg.norm(damped_joint_velocities(J, V, np.zeros(6)))
-        assert speed <= 1.0 / REGULAR + 1e-6
-        assert is_regular(J) == (left >= REGULAR)
+        v, is_regular = damped_joint_velocities(J, V, np.zeros(6))
+        assert np.linalg.norm(v) <= 1.0 / REGULAR + 1e-6
+        assert is_regular == (left >= REGULAR)
 
 
 def test_is_continuous_where_damping_begins():
@@ -45,7 +45,7 @@ def test_is_continuous_where_damping_begins():
     sides = []
     for left in (REGULAR * (1 - 1e-9), REGULAR * (1 + 1e-9)):
         J = (U * [1.0, 0.9, 0.5, 0.3, 0.2, left]) @ W.T / SCALE[:, None]
-        sides.append(damped_joint_velocities(J, V, preferred))
+        sides.append(damped_joint_velocities(J, V, preferred)[0])
     np.testing.assert_allclose(*sides, rtol=1e-5)
 
 
@@ -53,7 +53,7 @@ def test_a_lost_direction_is_left_to_what_is_preferred():
     rng = np.random.default_rng(3)
     J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, 0.0]), 6, rng)
     lost = np.linalg.svd(J)[2][-1]
-    v = damped_joint_velocities(J, rng.standard_normal(6), 0.7 * lost)
+    v, _ = damped_joint_velocities(J, rng.standard_normal(6), 0.7 * lost)
     assert v @ lost == pytest.approx(0.7)
 
 

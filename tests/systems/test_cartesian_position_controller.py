@@ -8,6 +8,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.systems import cartesian_position_controller
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 
 READY_POSTURE = np.array(IIWA14.home)
@@ -78,6 +79,33 @@ def test_arrives_at_the_desired_pose(arm):
     commanded.advance(2.0)
     np.testing.assert_allclose(commanded.pose, GOAL, atol=1e-5)
     assert commanded.stuck == 0.0
+
+
+def test_where_no_limit_binds_the_closed_form_is_the_optimum(arm, monkeypatch):
+    quick, slow = Commanded(arm), Commanded(arm)
+    for commanded in (quick, slow):
+        commanded.command(GOAL)
+    quick.advance(1.0)
+    monkeypatch.setattr(cartesian_position_controller, "_within", lambda values, limits: False)
+    slow.advance(1.0)
+    np.testing.assert_allclose(quick.joints, slow.joints, atol=1e-6)
+    assert np.abs(quick.joints - quick.q_start).max() > 0.1
+
+
+def test_where_a_joint_would_be_too_fast_the_tool_slows_down_and_keeps_its_direction(arm):
+    commanded = Commanded(arm, speed_limits=SpeedLimits(translational=50.0, rotational=50.0))
+    commanded.command(GOAL)
+    limit = commanded.plant.GetVelocityUpperLimits()
+    # Looked at between steps, which are at multiples of the period.
+    commanded.advance(0.005)
+    way = GOAL[:3] - START[:3]
+    for _ in range(20):
+        q = commanded.joints
+        commanded.advance(0.01)
+        assert (np.abs(commanded.joints - q) / 0.01 <= limit + 1e-6).all()
+        moved = commanded.pose[:3] - START[:3]
+        assert np.linalg.norm(np.cross(moved, way)) <= 0.02 * np.linalg.norm(way) * max(np.linalg.norm(moved), 1e-3)
+    np.testing.assert_allclose(commanded.pose, GOAL, atol=1e-4)
 
 
 def test_is_no_faster_than_its_limits(arm):

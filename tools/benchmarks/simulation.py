@@ -18,15 +18,18 @@ from guiderail.diagrams.make import make_env
 from guiderail.diagrams.recording import DrivenStation, along
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
+from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS
 from guiderail.models.objects.bnc_motion import insert_and_lock
 from guiderail.models.pose_coordinates import POSE_SIZE
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
+from guiderail.systems.cartesian_position_controller import CartesianPositionController
 from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.contact_watch import ContactWatch
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.pose_wrench import PoseWrench
 from guiderail.systems.recorder import Recorder
 from guiderail.systems.support.command_watch import CommandWatch
@@ -38,6 +41,9 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
     (PoseWrench, "_calc_wrench"),
     (CartesianImpedanceController, "_calc_law"),
+    (CartesianPositionController, "_step"),
+    (MeasuredPose, "_calc_pose"),
+    (ContactWatch, "_update"),
     (CommandWatch, "_update"),
     (CommandWatchdog, "_calc_safe_pose"),
     (ImpedanceMonitor, "_calc_contact_force"),
@@ -49,8 +55,24 @@ CONTACT = (3.8, 7.6)
 # The clamp is dragged over the table into its holes and pushed until it has snapped in: times [s], and x and z [m].
 CLAMP_TIMES, CLAMP_X, CLAMP_Z = (0.0, 0.4, 2.4, 4.0), (-0.003, -0.003, 0.0, 0.0), (0.014, 0.009, 0.009, -0.005)
 CLAMP_CONTACT = (0.4, 4.0)
-REQUIRED_FACTOR = {"rails": 10.0, "arm": 6.0}
-REQUIRED_CLAMP_FACTOR = 10.0
+# The thermos is brought beside the mug, tilted on the way, and emptied: times [s], and poses of its tip in the target.
+POUR_TIMES = (0.0, 1.0, 2.0, 4.5, 5.0, 7.6)
+POUR_POSES = (
+    (-0.063, -0.292, 0.169, -0.213, 0.0, 0.0),
+    (0.012, -0.217, 0.225, 0.055, 0.0, 0.0),
+    (0.056, -0.153, 0.176, 0.349, 0.0, -0.001),
+    (0.018, -0.049, 0.076, 0.349, 0.0, -1.052),
+    (0.013, -0.036, 0.072, 0.349, 0.0, -1.182),
+    (0.013, -0.036, 0.075, 0.349, 0.0, -1.804),
+)
+POUR_CONTACT = (2.0, 7.6)  # the balls roll, and fall
+# What is driven along what, and how many times real time it is to be.
+REQUIRED_FACTOR = {
+    "rails": ("BncConnector", 10.0),
+    "arm": ("BncConnector", 6.0),
+    "grid_clamp": ("GridClamp", 10.0),
+    "pouring": ("Pouring", 10.0),
+}
 REQUIRED_SECONDS = 1.0
 REPEATS = 3
 
@@ -84,16 +106,16 @@ def timed_callbacks() -> Iterator[Callable[[], float]]:
             setattr(system, name, method)
 
 
-def real_time_factor(name: str, task: str = "BncConnector") -> dict[str, float]:
-    """The best of `REPEATS` runs, which is the least disturbed one."""
-    return max((_one_run(name, task) for _ in range(REPEATS)), key=lambda run: run["real_time_factor"])
+def real_time_factor(name: str) -> dict[str, float]:
+    """The best of `REPEATS` runs, which is the least disturbed one, of one of `REQUIRED_FACTOR`."""
+    return max((_one_run(name) for _ in range(REPEATS)), key=lambda run: run["real_time_factor"])
 
 
-def _one_run(name: str, task: str) -> dict[str, float]:
-    """Simulated seconds per second of CPU time while the plug is seated, turned and locked, or the clamp snaps in."""
-    workcell, times, poses, contact = scripted_motion(task)
+def _one_run(name: str) -> dict[str, float]:
+    """Simulated seconds per second of CPU time while there is contact."""
+    world, times, poses, contact = scripted_motion(REQUIRED_FACTOR[name][0])
     with timed_callbacks() as spent:
-        station = STATIONS.get(name).build(workcell)
+        station = STATIONS.get(name if name in STATIONS.names() else "rails").build(world)
         driven = DrivenStation(station, along(times, poses), num_samples=NUM_STEPS)
         driven.start(poses[0])
         first, last = (round(t / CONTROL_PERIOD) for t in contact)
@@ -106,10 +128,12 @@ def _one_run(name: str, task: str) -> dict[str, float]:
     return {"real_time_factor": simulated / seconds, "python_share": python_seconds / seconds}
 
 
-def scripted_motion(task: str) -> tuple[Workcell, np.ndarray, np.ndarray, tuple[float, float]]:
-    """The workcell, what is commanded at which times, and from when to when there is contact."""
+def scripted_motion(task: str) -> tuple[Any, np.ndarray, np.ndarray, tuple[float, float]]:
+    """The world of a task's stations, what is commanded at which times, and from when to when there is contact."""
     if task == "BncConnector":
         return BncWorkcell(), *insert_and_lock(), CONTACT
+    if task == "Pouring":
+        return PouringConfig(), np.array(POUR_TIMES), np.array(POUR_POSES), POUR_CONTACT
     poses = np.zeros((len(CLAMP_TIMES), POSE_SIZE))
     poses[:, 0], poses[:, 2] = CLAMP_X, CLAMP_Z
     return GridClampWorkcell(), np.array(CLAMP_TIMES), poses, CLAMP_CONTACT
@@ -134,12 +158,10 @@ def env_seconds(guidance: str = "kgrl") -> float:
 def measure() -> dict[str, Any]:
     """All of it, as a program may read it."""
     measurements: dict[str, Callable[[], Any]] = {name: partial(real_time_factor, name) for name in REQUIRED_FACTOR}
-    measurements["grid_clamp"] = partial(real_time_factor, "rails", "GridClamp")
     measurements["env_seconds_per_400_steps"] = env_seconds
     results: dict[str, Any] = {name: measurements[name]() for name in told(measurements, "simulation")}
     results["fast_enough"] = (
-        results["grid_clamp"]["real_time_factor"] >= REQUIRED_CLAMP_FACTOR
-        and all(results[name]["real_time_factor"] >= factor for name, factor in REQUIRED_FACTOR.items())
+        all(results[name]["real_time_factor"] >= factor for name, (_, factor) in REQUIRED_FACTOR.items())
         and results["env_seconds_per_400_steps"] <= REQUIRED_SECONDS
     )
     return results
@@ -147,7 +169,7 @@ def measure() -> dict[str, Any]:
 
 def show(results: dict[str, Any]) -> None:
     """Prints what was measured."""
-    for name, factor in (REQUIRED_FACTOR | {"grid_clamp": REQUIRED_CLAMP_FACTOR}).items():
+    for name, (_, factor) in REQUIRED_FACTOR.items():
         row = results[name]
         print(
             f"{name:10s}  {row['real_time_factor']:4.1f} times real time in contact (at least {factor:.0f}), "

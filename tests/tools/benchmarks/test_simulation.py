@@ -1,8 +1,12 @@
+import numpy as np
 import pytest
 
+from guiderail.diagrams.recording import DrivenStation, along
+from guiderail.diagrams.stations.pouring import PouringStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.systems.wrench_sensor import WrenchSensor
 from guiderail.tools.benchmarks import simulation as bench_simulation
-from guiderail.tools.benchmarks.simulation import CALLBACKS, real_time_factor, timed_callbacks
+from guiderail.tools.benchmarks.simulation import CALLBACKS, real_time_factor, scripted_motion, timed_callbacks
 
 
 def test_systems_are_left_as_they_were():
@@ -12,11 +16,24 @@ def test_systems_are_left_as_they_were():
     assert [getattr(system, name) for system, name in CALLBACKS] == before
 
 
-@pytest.mark.parametrize(("task", "contact"), [("BncConnector", "CONTACT"), ("GridClamp", "CLAMP_CONTACT")])
-def test_pythons_share_is_a_part_of_the_whole(monkeypatch, task, contact):
+@pytest.mark.parametrize(
+    ("name", "contact"), [("rails", "CONTACT"), ("grid_clamp", "CLAMP_CONTACT"), ("pouring", "POUR_CONTACT")]
+)
+def test_pythons_share_is_a_part_of_the_whole(monkeypatch, name, contact):
     monkeypatch.setattr("guiderail.tools.benchmarks.simulation.REPEATS", 1)
     first, _ = getattr(bench_simulation, contact)
     monkeypatch.setattr(f"guiderail.tools.benchmarks.simulation.{contact}", (first, first + 0.8))
-    result = real_time_factor("rails", task)
+    result = real_time_factor(name)
     assert result["real_time_factor"] > 0.0
     assert 0.0 < result["python_share"] < 1.0
+
+
+def test_the_pour_that_is_timed_empties_the_thermos():
+    config, times, poses, _ = scripted_motion("Pouring")
+    station = PouringStation(config)
+    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    driven.start(poses[0])
+    driven.run()
+    balls = station.GetOutputPort("balls_in_mug").Eval(station.GetMyContextFromRoot(driven.context)).reshape(-1, 6)
+    assert (balls[:, 2] < 0.0).all()
+    assert (np.hypot(balls[:, 0], balls[:, 1]) < config.mug.inner_diameter / 2).all()
