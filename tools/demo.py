@@ -43,7 +43,15 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         "and a zone was forbidden. It now learns by trial and error to go around the one, and never enters the other."
     )
     _clear(out)
-    summary = run("NarrowPassage", out, environment={"guidance": "skgrl"}, preset=PRESET, settings={"pipelined": True}, episodes=episodes, seed=seed)
+    summary = run(
+        "NarrowPassage",
+        out,
+        environment={"guidance": "skgrl"},
+        preset=PRESET,
+        settings={"pipelined": True},
+        episodes=episodes,
+        seed=seed,
+    )
     before, after = _evaluate(out)
     picture = _draw(out, before, after)
     rows = RunFolder(out).episodes()

@@ -21,6 +21,7 @@ BENCHMARKS = (
     "learner",
     "training",
     "cold_start",
+    "many_envs",
 )
 OF_A_TASK = ("training", "cold_start")  # those that are told which task, and how it is set up
 DRAWN = ("time_step", "engines")  # those that can be drawn
