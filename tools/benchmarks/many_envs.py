@@ -18,7 +18,7 @@ import gymnasium
 from guiderail.tools.benchmarks import told
 
 ENVIRONMENT = "guiderail.diagrams:guiderail/BncConnector-v0"
-OPTIONS = {"guidance": "kgrl", "uncertainty": "disc", "hold": 5}
+OPTIONS: dict[str, Any] = {"guidance": "kgrl", "uncertainty": "disc", "hold": 5}
 ASKED = 16  # cores
 STEPS = 300  # of the vector environment, in each measurement
 
