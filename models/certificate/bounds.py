@@ -31,7 +31,7 @@ from guiderail.models.certificate.prices import Budget, Budgeted, budgeted
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
-CELLS = {1: 16, 2: 12, 3: 3}  # along each action, by how many actions there are; one for more
+CELLS = {1: 16, 2: 24, 3: 3}  # along each action, by how many actions there are; one for more
 MOST_ACTIONS = 6  # of which all corners are looked at
 ROUNDING = 1e-6  # of a squared correction: a radius below its root is none
 

@@ -194,17 +194,17 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, kept: Any, alpha
     v, short = alphas @ rows_L, c - free @ rows.T
     slack = v @ rows_L.T - short + KEEPS * (1 + np.abs(c))
     require((slack >= 0).all(), f"step {n}: the correction that is shown breaks a constraint")
-    least, commands, found = alphas @ short.T, free[:, :outs] + v @ L.T, []
-    for first in itertools.product(range(along), repeat=A):
-        i = np.flatnonzero(((places >= first) & (places <= np.add(first, 1))).all(axis=1))
-        squared, apart = (v[i] ** 2).sum(axis=1), ((v[i][:, None] - v[i]) ** 2).sum(axis=2)
-        radii = []
-        for k in i:
-            d = least[k, i] / max(np.linalg.norm(v[k]), 1e-300) * (least[k, i] >= 0).all()
-            radii.append((squared - d**2).max() + max(((d[:, None] - d) ** 2 - apart).max(), 0) / 2)
-        radius = np.linalg.norm(L, axis=1) * np.sqrt(max(min(radii), ROUNDING * squared.max()))
-        found.append((commands[i].min(axis=0) - radius, commands[i].max(axis=0) + radius))
-    return np.min(found, axis=0)[0], np.max(found, axis=0)[1]
+    least, commands, norms = alphas @ short.T, free[:, :outs] + v @ L.T, np.linalg.norm(L, axis=1)
+    weights = (along + 1) ** np.arange(A)[::-1]
+    near = np.array(list(itertools.product((0, 1), repeat=A))) @ weights
+    i = (places[(places < along).all(axis=1)] @ weights)[:, None] + near  # corners of every cell
+    squared, apart = (v[i] ** 2).sum(axis=2), ((v[i][:, :, None] - v[i][:, None]) ** 2).sum(axis=3)
+    said = least[i[:, :, None], i[:, None]]
+    d = said * (said >= 0).all(axis=2, keepdims=True) / np.maximum(np.sqrt(squared), 1e-300)[..., None]
+    between = ((d[..., None] - d[..., None, :]) ** 2 - apart[:, None]).max(axis=(2, 3))
+    radii = (squared[:, None] - d**2).max(axis=2) + np.maximum(between, 0) / 2
+    radius = np.sqrt(np.maximum(radii.min(axis=1), ROUNDING * squared.max(axis=1)))[:, None] * norms
+    return (commands[i].min(axis=1) - radius).min(axis=0), (commands[i].max(axis=1) + radius).max(axis=0)
 
 
 def compare(claims: dict[str, Any], found: dict[str, Arrays]) -> None:
