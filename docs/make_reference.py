@@ -554,8 +554,8 @@ def studies() -> str:
         f"{', '.join(f'`{n}`' for n in declaration.shipped_studies())} come along. A field of two words is written "
         "with a space: `judged on`. What is unknown is refused.\n\n"
     )
-    kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.JudgedOn, declaration.Ratio)
-    for kind in (*kinds, declaration.Smoothness):
+    kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.JudgedOn, declaration.Sweep)
+    for kind in (*kinds, declaration.Ratio, *declaration.PROGRAMS.values(), declaration.Certifiable):
         words, kinds_of = field_words(kind), field_types(kind)
         page += f"## {kind.__name__}\n\n{prose(inspect.getdoc(kind) or '')}\n\n"
         rows = []

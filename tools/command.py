@@ -531,10 +531,9 @@ def study(
     from guiderail.tools.studies import declaration
 
     declared = declaration.load_study(file)
-    if isinstance(declared, declaration.Smoothness):
-        from guiderail.tools.studies.smoothness import smoothness
-
-        _print(smoothness(out, **declared.model_dump(exclude={"program", "name"})), as_json)
+    if not isinstance(declared, declaration.Study):
+        program = import_module(f"guiderail.tools.studies.{declared.program}")
+        _print(getattr(program, declared.program)(out, **declared.model_dump(exclude={"program", "name"})), as_json)
         return
     try:
         numbers = None if seeds is None else [int(number) for number in seeds.split(",")]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
 from guiderail.models.yaml_files import load_yaml
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
@@ -158,12 +158,32 @@ class Smoothness(_Strict):
     seed: int = Field(default=0, ge=0)  # of the actions
 
 
+class Certifiable(_Strict):
+    """A skill whose guidance follows a law that is certified."""
+
+    task: str  # its name
+    env: dict[str, Any] = {}  # options of its environment
+
+
+class Certificates(_Strict):
+    """Certificates of skills, and an attack on each: a program of its own."""
+
+    program: Literal["certificates"]  # what makes it this kind of study
+    name: FolderName  # of the table
+    skills: dict[FolderName, Certifiable] = Field(min_length=1)  # by name
+    attack: int = Field(default=1_000_000, ge=1)  # steps of the adversary, on each
+
+
+Program = Smoothness | Certificates
+PROGRAMS: dict[str, type[Program]] = {"smoothness": Smoothness, "certificates": Certificates}
+
+
 def shipped_studies() -> list[str]:
     """The names of the studies that come along."""
     return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
 
 
-def load_study(file: Path | str) -> Study | Smoothness:
+def load_study(file: Path | str) -> Study | Program:
     """The study of a YAML file, or one that comes along by its name.
 
     Raises:
@@ -179,7 +199,10 @@ def load_study(file: Path | str) -> Study | Smoothness:
     data = load_yaml(path, "study")
     if not isinstance(data, dict):
         raise InputError(f"{path} is no study: it needs at least name, task, methods and seeds")
-    kind = Smoothness if "program" in data else Study
+    program = data.get("program")
+    if program is not None and (not isinstance(program, str) or program not in PROGRAMS):
+        raise InputError(f"{path}: there is no program {brief(program)}: {did_you_mean(program, PROGRAMS)}")
+    kind = Study if program is None else PROGRAMS[program]
     try:
         return kind.model_validate(data)
     except ValidationError as error:
@@ -191,7 +214,9 @@ def _sentence(error: ValidationError) -> str:
     first = error.errors()[0]
     where = ", ".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        kinds: tuple[type[BaseModel], ...] = (Study, Method, LearnerChoice, JudgedOn, Sweep, Ratio, Smoothness)
+        kinds: tuple[type[BaseModel], ...] = (
+            Study, Method, LearnerChoice, JudgedOn, Sweep, Ratio, Certifiable, *PROGRAMS.values()
+        )  # fmt: skip
         known = {str(field.alias) for kind in kinds for field in kind.model_fields.values()}
         return f"{where} is nothing that a study has: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":

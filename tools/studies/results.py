@@ -36,7 +36,7 @@ COLUMNS = (
     "collisions in training", "hours",
 )  # fmt: skip
 
-# Of the benchmark of smoothness, whose table has three dozen columns.
+# Of programs, some of whose tables have dozens of columns.
 OF_SMOOTHNESS = (
     "method", "place", "jerk_commanded_linear", "jerk_commanded_angular", "times_below_kgrl_linear",
     "times_below_kgrl_angular", "success_rate", "peak_force", "worst_violation",
@@ -113,7 +113,7 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     study = load_study(name)
     lines = [f"## {name}", "", f"`guiderail study {name} --out studies`, and the table `{name}.csv`.", ""]
     if not isinstance(study, Study):
-        told = rows[list(OF_SMOOTHNESS)]
+        told = rows[list(OF_SMOOTHNESS)] if study.program == "smoothness" else rows
         lines += [f"| {' | '.join(map(_words, told))} |", "|" + "---|" * len(told.columns)]
         lines += [f"| {' | '.join(map(cell, row))} |" for row in told.itertuples(index=False)]
         return "\n".join([*lines, ""])

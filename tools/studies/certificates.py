@@ -1,0 +1,70 @@
+"""The study `certificates`: what shipped skills can command at all, beside the worst that an adversary found.
+
+Each skill is certified, checked by the checker that shares nothing with the primitive, and attacked. A bound is as
+tight as the worst found says; both are the largest over all steps, apart for those at which a constraint can be active.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from guiderail.models.certificate.checker import check
+from guiderail.tools.certify import certify_skill
+from guiderail.tools.rollouts.evaluate import cached
+from guiderail.tools.tables import write_table
+
+UNITS = {0: "x", 1: "y", 2: "z", 3: "Rz", 4: "Ry", 5: "Rx"}  # of an output's number
+
+
+def certificates(out: Path, *, skills: Mapping[str, Mapping[str, Any]], attack: int) -> dict[str, Any]:
+    """Certifies and attacks skills; a skill whose table is in the folder is not attacked again.
+
+    Args:
+        out: the folder; each skill's certificate is in a folder of its own in it.
+        skills: by name, the `task` and the arguments of its environment, `env`.
+        attack: steps of the adversary, on each.
+
+    Raises:
+        InputError: if a skill can't be certified.
+    """
+    rows = []
+    for name, skill in skills.items():
+        folder = out / "certificates" / name
+        rows.append(cached(folder / f"told-{attack}.csv", partial(_told, skill, folder, attack)))
+        rows[-1].insert(0, "skill", name)
+    table = pd.concat(rows, ignore_index=True)
+    return {"table": str(write_table(out / "certificates", table.to_dict("records"))), "skills": len(table)}
+
+
+def _told(skill: Mapping[str, Any], folder: Path, attack: int) -> pd.DataFrame:
+    """One row."""
+    found = certify_skill(skill["task"], skill["env"], out=folder, attack=attack)
+    start = time.perf_counter()
+    check(folder)
+    seconds = time.perf_counter() - start
+    rows = pd.DataFrame(found["attack"])
+    tight = rows[rows["ratio"].notna()]
+    active = tight["constraint"] == "can be active"
+    told: dict[str, Any] = {
+        "checker": found["checker"],
+        "checker_seconds": seconds,
+        "steps": found["steps"],
+        "steps_constraints_can_touch": found["steps_that_constraints_can_touch"],
+        "attack_steps": found["attack_steps"],
+        "attack_corrected": found["attack_corrected"],
+        "bounds_left": int(rows["left"].sum()),
+        "budget_spent": found.get("budget_spent"),
+        "worst_ratio_free": tight.loc[~active, "ratio"].max(),
+        "worst_ratio_active": tight.loc[active, "ratio"].max(),
+        "median_ratio_active": tight.loc[active, "ratio"].median(),
+    }
+    if active.any():
+        worst = tight[active].nlargest(1, "ratio").iloc[0]
+        told["worst_active"] = f"{worst['quantity']} of {UNITS[int(worst['output'])]}"
+    return pd.DataFrame([told])
