@@ -17,6 +17,7 @@ from guiderail.models.contact_lever import contact_lever
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.objects.bnc_motion import poses
 from guiderail.models.units import MM
+from guiderail.systems.recorder import Recording
 from guiderail.tools.benchmarks import told
 from guiderail.tools.benchmarks.simulation import scripted_motion
 from guiderail.tools.viewing.style import legend, new_figure, save_figure
@@ -28,6 +29,9 @@ OFFSETS = (0.8, 1.25, 2.0, 3.0)  # [mm], of a plug on the rim
 MODULI = (0.01, 0.1, 1.0, 10.0)  # times the contact's own, in Drake
 PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
 LEAST_FORCE = 0.5  # [N] below which a lever says nothing
+NARROW = BncDimensions(mouth_chamfer=0.1 * MM)  # of the connector at its hardest
+IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that has dropped in, and an offset from which none does
+HALVINGS = 6  # of that offset
 
 
 def measure() -> dict[str, Any]:
@@ -43,7 +47,9 @@ def measure() -> dict[str, Any]:
     }
     levers["two points, rigid"] = [rigid_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
-    return {"profiles": profiles, "offsets_mm": list(OFFSETS), "levers_mm": levers}
+    captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
+    captures |= {engine: _capture(station) / MM for engine, station in told(ENGINES.items(), "capture")}
+    return {"profiles": profiles, "offsets_mm": list(OFFSETS), "levers_mm": levers, "captures_mm": captures}
 
 
 def rigid_lever(d: BncDimensions, offset: float) -> float:
@@ -81,7 +87,22 @@ def _profile(task: str, station: str) -> dict[str, Any]:
 
 def _lever(name: str, offset: float, modulus: float) -> float:
     """From the plug's axis to where the rim pushes, at rest on it beside the barrel [m]."""
-    workcell = BncWorkcell()
+    recording = _pressed(name, BncWorkcell(), offset, modulus)
+    return float(np.linalg.norm(contact_lever(recording["wrench"][-10:].mean(axis=0), LEAST_FORCE)))
+
+
+def _capture(name: str) -> float:
+    """How far beside the jack a plug may be pressed on it that still drops in [m]."""
+    near, far = 0.0, FARTHEST
+    for _ in range(HALVINGS):
+        middle = 0.5 * (near + far)
+        dropped = _pressed(name, BncWorkcell(NARROW), middle)["pose"][-1, 2] < IN
+        near, far = (middle, far) if dropped else (near, middle)
+    return near
+
+
+def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1.0) -> Recording:
+    """A plug that is pressed on a jack that is this far beside it [m]."""
     motion = poses(np.array([11.0 * MM, PRESSED, PRESSED]), np.pi / 2)
     station = STATIONS.get(name).build(workcell)
     times = np.array([0.0, 0.6, 1.4])
@@ -90,8 +111,7 @@ def _lever(name: str, offset: float, modulus: float) -> float:
     if modulus != 1.0:
         station.set_contact(driven.context, 1.0, modulus)
     driven.start(motion[0])
-    wrench = driven.run()["wrench"][-10:].mean(axis=0)
-    return float(np.linalg.norm(contact_lever(wrench, LEAST_FORCE)))
+    return driven.run()
 
 
 def show(results: dict[str, Any]) -> None:
@@ -104,6 +124,7 @@ def show(results: dict[str, Any]) -> None:
     )
     for name, levers in results["levers_mm"].items():
         print(f"  {name}: {', '.join(f'{lever:.2f}' for lever in levers)}")
+    print("a plug drops in from", ", ".join(f"{mm:.2f} mm ({name})" for name, mm in results["captures_mm"].items()))
 
 
 def draw(results: dict[str, Any], path: Path) -> Path:

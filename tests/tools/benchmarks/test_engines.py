@@ -26,6 +26,15 @@ def test_as_hard_as_it_is_the_rim_bears_a_plug_nearly_where_the_other_engine_say
     assert rigid_lever(D, 2.0 * MM) < theirs < ours == pytest.approx(theirs, rel=0.4)
 
 
+def test_a_plug_drops_in_from_about_as_far_beside_as_it_is_drawn():
+    """Drake's surfaces let it in from up to half as far again, at the plant's step: nothing may make that worse."""
+    pytest.importorskip("mujoco")
+    drawn = engines.NARROW.bore_clearance + engines.NARROW.mouth_chamfer
+    ours, theirs = (engines._capture(station) for station in ("rails", "mujoco"))
+    assert theirs == pytest.approx(drawn, abs=0.02 * MM)
+    assert drawn < ours < 1.5 * drawn
+
+
 def test_the_picture_is_drawn(tmp_path):
     names = ("time", "height_mm", "push_n", "torque_nm")
     profiles = {
