@@ -19,6 +19,7 @@ from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.studies.declaration import LEARNED, Study, load_study, shipped_studies
 from guiderail.tools.studies.study import differences_of
 from guiderail.tools.tables import cell, read_table, table_text
+from guiderail.tools.tasks import import_modules
 
 # The figures of the thesis that a study stands beside.
 FIGURES = {
@@ -123,8 +124,9 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
         told = [method, mark or "–", judged or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
+    import_modules(study.imports)
     differing: dict[str, list[str]] = {}
-    for method in (method for method, one in study.methods.items() if one.policy == LEARNED):
+    for method in (m for m, one in study.methods.items() if one.policy == LEARNED and m in set(rows["method"])):
         differing.setdefault("; ".join(differences_of(study, method)), []).append(method)
     for words, methods in differing.items():
         lines += ["", f"Differs from the thesis in ({', '.join(methods)}): {words}."]
