@@ -36,7 +36,7 @@ def trained(bead_run):
         (["train", "Pooring", "--out", "new"], "did you mean Pouring?"),
         (["train", "Bead", "--out", "new", "--guidance", "magic"], "kmp or skgrl"),
         (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "kmp, none, residual, safe_residual"),
-        (["train", "Bead", "--out", "new", "--algorithm", "ppo"], "choose one of sac, tqc"),
+        (["train", "Bead", "--out", "new", "--algorithm", "ppo"], "sac, tqc"),
         (["train", "Bead", "--out", "new", "--preset", "robst"], "did you mean robust?"),
         (["train", "Bead", "--out", "new", "--uncertainty", "disc"], "no option 'uncertainty'"),
         (["train", "Bead", "--out", "new", "--episodes", "0"], "at least one episode"),
