@@ -6,6 +6,7 @@ import hashlib
 import itertools
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -98,10 +99,13 @@ def certify_skill(
     limits = None if pushes is None else np.array(pushes.limits)
     for name, content in certificate_files(skill, certified, stiffness, limits, about).items():
         write_atomically(out / name, content)
+    begin = time.perf_counter()
     word = subprocess.run([sys.executable, checker.__file__, str(out)], capture_output=True, text=True)
+    seconds = time.perf_counter() - begin
     found: dict[str, Any] = {
         "certificate": str(out / CERTIFICATE),
         "checker": (word.stdout or word.stderr).strip(),
+        "checker_seconds": round(seconds, 1),
         "steps": primitive.num_steps,
         "steps_that_constraints_can_touch": int(certified.touched.sum()),
     }

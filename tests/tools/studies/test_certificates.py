@@ -19,6 +19,9 @@ def test_a_row_for_each_skill_and_nothing_is_attacked_twice(tmp_path, monkeypatc
     assert row["attack_steps"] >= 2000
     monkeypatch.setattr("guiderail.tools.studies.certificates.certify_skill", None)
     assert certificates(tmp_path, skills=SKILLS, attack=2000)["table"] == found["table"]
+    other = {"passage": {"task": "NarrowPassage", "env": {"guidance": "skgrl"}}}
+    with pytest.raises(TypeError):  # another skill of the same name is no finished one
+        certificates(tmp_path, skills=other, attack=2000)
 
 
 def test_the_program_is_named(tmp_path):
