@@ -1,5 +1,6 @@
 """Projects requested poses into the active constraints (thesis, equation 2.21)."""
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -147,10 +148,11 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """The command (6,), and 1 if it is the last safe one, else 0."""
-        last, measured = np.split(context.get_discrete_state(self._last).value(), 2)
+        value = context.get_discrete_state(self._last).value()
+        last, measured = value[:6], value[6:]
         requested = self._requested_pose_port.Eval(context)
         if not np.isfinite(requested).all():
-            return np.append(last, 1.0)
+            return np.array([*last, 1.0])
         command = self._skill.command(
             int(self._state_port.Eval(context)[0]),
             pose_to_transform(last),
@@ -159,10 +161,10 @@ class ActiveConstraintProjector(LeafSystem):
             self._period,
         )
         desired = transform_to_pose(command.X_WE)
-        tracking_error = np.linalg.norm(last[:3] - measured[:3])
-        if tracking_error > self._max_tracking_error and np.linalg.norm(desired[:3] - measured[:3]) >= tracking_error:
-            return np.append(last, 1.0)
-        return np.append(desired, 0.0)
+        tracking_error = math.dist(last[:3], measured[:3])
+        if tracking_error > self._max_tracking_error and math.dist(desired[:3], measured[:3]) >= tracking_error:
+            return np.array([*last, 1.0])
+        return np.array([*desired, 0.0])
 
     def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._command.Eval(context)[:6])

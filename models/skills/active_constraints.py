@@ -6,6 +6,7 @@ those on orientation that depend on the position come after those on the positio
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,12 +17,11 @@ from guiderail.models.skills.geometry import (
     WORLD,
     Frames,
     about,
-    angle_about,
     angle_between,
     bearing,
-    position_in,
+    chord_angle,
+    pose_in,
     rotation_deg,
-    tilt_axis,
     with_position_in,
 )
 from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, interpolate, register, require, require_three
@@ -51,20 +51,78 @@ class ActiveConstraint(ABC):
         return () if frame == WORLD else (frame,)
 
 
-class PositionConstraint(ActiveConstraint):
-    """A constraint on p_FE alone; the orientation is kept."""
+class FrameConstraint(ActiveConstraint):
+    """A constraint on the pose in one frame F, as arrays: a template converts a pose once for all that share F."""
 
     frame: str
+
+    @abstractmethod
+    def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The allowed rotation matrix (3, 3) and position (3,) [m]; what is allowed is returned as the same object."""
+
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
+        return ConstraintGroup((self,)).project(X_WE, frames)
+
+    def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
+        return ConstraintGroup((self,)).violation(X_WE, frames)
+
+
+@dataclass(frozen=True)
+class ConstraintGroup:
+    """Constraints in one and the same frame, at least one, applied in their order."""
+
+    constraints: tuple[FrameConstraint, ...]
+
+    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
+        """The allowed pose for X_WE; X_WE itself where that is allowed."""
+        frame = self.constraints[0].frame
+        R_FE, p_FE = R, p = pose_in(frame, X_WE, frames)
+        for constraint in self.constraints:
+            R, p = constraint.project_in_frame(R, p)
+        # What is allowed is returned untouched: the way through the frame and back would cost the last digits.
+        if p is not p_FE:
+            X_WE = with_position_in(frame, p, X_WE, frames)
+        if R is not R_FE:
+            X_WE = RigidTransform(axes(frame, frames).multiply(RotationMatrix(R)), X_WE.translation())
+        return X_WE
+
+    def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
+        """How far X_WE is from the worst of them, each by itself: the larger of metres and radians; 0 inside."""
+        R_FE, p_FE = pose_in(self.constraints[0].frame, X_WE, frames)
+        worst = 0.0
+        for constraint in self.constraints:
+            R, p = constraint.project_in_frame(R_FE, p_FE)
+            if p is not p_FE:
+                moved = p - p_FE
+                worst = max(worst, math.sqrt(moved @ moved))
+            if R is not R_FE:
+                worst = max(worst, chord_angle(R, R_FE))
+        return worst
+
+
+def grouped(constraints: Iterable[ActiveConstraint]) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
+    """The same constraints in the same order, those put together that follow one another in one frame."""
+    groups: list[ActiveConstraint | ConstraintGroup] = []
+    for constraint in constraints:
+        last = groups[-1] if groups else None
+        if not isinstance(constraint, FrameConstraint):
+            groups.append(constraint)
+        elif isinstance(last, ConstraintGroup) and last.constraints[0].frame == constraint.frame:
+            groups[-1] = ConstraintGroup((*last.constraints, constraint))
+        else:
+            groups.append(ConstraintGroup((constraint,)))
+    return tuple(groups)
+
+
+class PositionConstraint(FrameConstraint):
+    """A constraint on p_FE alone; the orientation is kept."""
 
     @abstractmethod
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         """The allowed position for p_FE [m]; a new array or the very same one where it is allowed."""
 
-    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        p_FE = position_in(self.frame, X_WE, frames)
-        p_FP = self.project_position(p_FE)
-        # An allowed pose is returned untouched: the way through the frame and back would cost the last digits.
-        return X_WE if p_FP is p_FE else with_position_in(self.frame, p_FP, X_WE, frames)
+    def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return R_FE, self.project_position(p_FE)
 
 
 @register(ACTIVE_CONSTRAINTS, "half_space")
@@ -167,7 +225,7 @@ def settled(wanted: float, direction: np.ndarray, least: float, most: float) -> 
 
 @register(ACTIVE_CONSTRAINTS, "keep_above")
 @dataclass(frozen=True)
-class KeepAbove(ActiveConstraint):
+class KeepAbove(FrameConstraint):
     """Points that are fixed to the end effector stay at or above height_m in F; it is lifted along F's z.
 
     Without points_m, the end effector's own origin is the point.
@@ -180,15 +238,13 @@ class KeepAbove(ActiveConstraint):
     def __post_init__(self) -> None:
         require(len(self.points_m) > 0 and all(len(p) == 3 for p in self.points_m), "points_m are (x, y, z) each.")
 
-    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        p_WP = X_WE.rotation().matrix() @ np.array(self.points_m).T + X_WE.translation()[:, np.newaxis]
-        if self.frame == WORLD:
-            up_W, origin = np.array([0.0, 0.0, 1.0]), 0.0
-        else:
-            up_W = frames[self.frame].rotation().matrix()[:, 2]
-            origin = float(up_W @ frames[self.frame].translation())
-        short = self.height_m - (float(np.min(up_W @ p_WP)) - origin)
-        return X_WE if short <= 0 else RigidTransform(X_WE.rotation(), X_WE.translation() + short * up_W)
+    @cached_property
+    def _points(self) -> np.ndarray:
+        return np.array(self.points_m).T
+
+    def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        short = self.height_m - (float((R_FE[2] @ self._points).min()) + p_FE[2])
+        return R_FE, p_FE if short <= 0 else np.array([p_FE[0], p_FE[1], p_FE[2] + short])
 
 
 @register(ACTIVE_CONSTRAINTS, "funnel")
@@ -212,7 +268,7 @@ class Funnel(PositionConstraint):
 
 @register(ACTIVE_CONSTRAINTS, "fixed_orientation")
 @dataclass(frozen=True)
-class FixedOrientation(ActiveConstraint):
+class FixedOrientation(FrameConstraint):
     """R_FE is one given rotation."""
 
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE
@@ -221,13 +277,15 @@ class FixedOrientation(ActiveConstraint):
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")
 
-    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        R_FE = rotation_deg(self.rpy_deg)
-        R_WE = R_FE if self.frame == WORLD else frames[self.frame].rotation().multiply(R_FE)
-        return RigidTransform(R_WE, X_WE.translation())
+    @cached_property
+    def _wanted(self) -> np.ndarray:
+        return rotation_deg(self.rpy_deg).matrix()
+
+    def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._wanted, p_FE
 
 
-class TiltConstraint(ActiveConstraint):
+class TiltConstraint(FrameConstraint):
     """The orientation is `rpy_deg` at rest, tilted towards F's z axis by an angle from an interval.
 
     The interval may depend on the distance to F's origin. The nearest such rotation is taken. With `turns_along`, the
@@ -235,7 +293,6 @@ class TiltConstraint(ActiveConstraint):
     `rpy_deg` is then for a bearing along F's x axis. Without, it keeps its heading and tilts about another one.
     """
 
-    frame: str
     rpy_deg: tuple[float, ...]
     turns_along: bool
 
@@ -245,28 +302,34 @@ class TiltConstraint(ActiveConstraint):
 
     def tilt(self, X_WE: RigidTransform, frames: Frames) -> float:
         """The tilt [rad] of the nearest rotation that is tilted towards F's axis and nothing else."""
-        p_FE = position_in(self.frame, X_WE, frames)
-        return self._tilt(tilt_axis(p_FE), self._at_rest(p_FE), X_WE, frames)
+        R_FE, p_FE = pose_in(self.frame, X_WE, frames)
+        return self._tilt(self._heading(p_FE), R_FE)
 
-    def _at_rest(self, p_FE: np.ndarray) -> RotationMatrix:
-        """R_FE without a tilt."""
+    @cached_property
+    def _at_rest(self) -> np.ndarray:
+        return rotation_deg(self.rpy_deg).matrix()
+
+    @staticmethod
+    def _heading(p_FE: np.ndarray) -> np.ndarray:
+        """R_FH: H has its z axis along F's, and its x axis along the bearing; y is the axis of a tilt."""
+        x, y, _ = bearing(p_FE).tolist()
+        return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
+
+    def _tilt(self, R_FH: np.ndarray, R_FE: np.ndarray) -> float:
+        """Of R_FE = R_FH Ry(tilt) R_HRest, the angle for which that comes nearest (in the Frobenius norm)."""
+        R = R_FH.T @ R_FE @ self._at_rest.T
         if not self.turns_along:
-            return rotation_deg(self.rpy_deg)
-        towards = bearing(p_FE)
-        heading = RotationMatrix.MakeZRotation(math.atan2(towards[1], towards[0]))
-        return heading.multiply(rotation_deg(self.rpy_deg))
+            R = R @ R_FH
+        return math.atan2(R[0, 2] - R[2, 0], R[0, 0] + R[2, 2])
 
-    def _tilt(self, axis: np.ndarray, R_FRest: RotationMatrix, X_WE: RigidTransform, frames: Frames) -> float:
-        R_FE = axes(self.frame, frames).InvertAndCompose(X_WE.rotation())
-        return angle_about(axis, R_FE.multiply(R_FRest.inverse()).matrix())
-
-    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        p_FE = position_in(self.frame, X_WE, frames)
-        axis, R_FRest = tilt_axis(p_FE), self._at_rest(p_FE)
+    def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        R_FH = self._heading(p_FE)
         least, most = (math.radians(limit) for limit in self.limits_deg(math.sqrt(p_FE @ p_FE)))
-        tilt = nearest_turn(self._tilt(axis, R_FRest, X_WE, frames), 0.5 * (least + most))
-        R_FE = about(axis, min(max(tilt, least), most)).multiply(R_FRest)
-        return RigidTransform(axes(self.frame, frames).multiply(R_FE), X_WE.translation())
+        tilt = nearest_turn(self._tilt(R_FH, R_FE), 0.5 * (least + most))
+        tilt = min(max(tilt, least), most)
+        c, s = math.cos(tilt), math.sin(tilt)
+        R = R_FH @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return (R if self.turns_along else R @ R_FH.T) @ self._at_rest, p_FE
 
 
 def axes(frame: str, frames: Frames) -> RotationMatrix:
@@ -324,7 +387,7 @@ class TiltByDistance(TiltConstraint):
 
 @register(ACTIVE_CONSTRAINTS, "arc")
 @dataclass(frozen=True)
-class Arc(ActiveConstraint):
+class Arc(FrameConstraint):
     """On a circle about F's z axis, the orientation turning along with it: a door handle.
 
     At angle 0 the end effector is on F's x axis with R_FE = rpy_deg.
@@ -342,12 +405,9 @@ class Arc(ActiveConstraint):
         require_three(self.rpy_deg, "rpy_deg")
         require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
 
-    def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-        p_FE = position_in(self.frame, X_WE, frames)
-        least, most = np.deg2rad([self.min_deg, self.max_deg])
-        angle = float(np.arctan2(p_FE[1], p_FE[0]))
-        angle = float(np.clip(nearest_turn(angle, 0.5 * (least + most)), least, most))
-        p_FP = np.array([self.radius_m * np.cos(angle), self.radius_m * np.sin(angle), self.height_m])
-        R_FP = about(np.array([0.0, 0.0, 1.0]), angle).multiply(rotation_deg(self.rpy_deg))
-        X_FP = RigidTransform(R_FP, p_FP)
-        return X_FP if self.frame == WORLD else frames[self.frame].multiply(X_FP)
+    def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        least, most = math.radians(self.min_deg), math.radians(self.max_deg)
+        angle = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (least + most))
+        angle = min(max(angle, least), most)
+        p_FP = np.array([self.radius_m * math.cos(angle), self.radius_m * math.sin(angle), self.height_m])
+        return about(np.array([0.0, 0.0, 1.0]), angle).multiply(rotation_deg(self.rpy_deg)).matrix(), p_FP

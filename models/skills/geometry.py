@@ -33,6 +33,16 @@ def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
     return X_WF.rotation().matrix().T @ (X_WE.translation() - X_WF.translation())
 
 
+def pose_in(frame: str, X_WE: RigidTransform, frames: Frames) -> tuple[np.ndarray, np.ndarray]:
+    """R_FE (3, 3) and p_FE (3,) [m]: the end effector's pose in the frame F called `frame`."""
+    R_WE = X_WE.rotation().matrix()
+    if frame == WORLD:
+        return R_WE, X_WE.translation()
+    X_WF = frames[frame]
+    R_FW = X_WF.rotation().matrix().T
+    return R_FW @ R_WE, R_FW @ (X_WE.translation() - X_WF.translation())
+
+
 def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
     """X_WE moved so that its origin is at p_FE [m] in the frame F; the orientation is kept."""
     if frame == WORLD:
@@ -55,12 +65,6 @@ def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
     return np.array([-towards[1], towards[0], 0.0])
 
 
-def angle_about(axis: np.ndarray, R: np.ndarray) -> float:
-    """The angle [rad] of the rotation about `axis` that is nearest to R (in the Frobenius norm)."""
-    vee = axis[0] * (R[2, 1] - R[1, 2]) + axis[1] * (R[0, 2] - R[2, 0]) + axis[2] * (R[1, 0] - R[0, 1])
-    return math.atan2(vee, R[0, 0] + R[1, 1] + R[2, 2] - axis @ R @ axis)
-
-
 def about(axis: Any, angle: float) -> RotationMatrix:
     """The rotation by `angle` [rad] about the unit vector `axis`."""
     return RotationMatrix(AngleAxis(angle, axis))
@@ -68,18 +72,25 @@ def about(axis: Any, angle: float) -> RotationMatrix:
 
 def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
     """The angle [rad] of the rotation from A to B, accurate for small angles too."""
+    return chord_angle(R_WA.matrix(), R_WB.matrix())
+
+
+def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
+    """`angle_between` of rotation matrices (3, 3)."""
     # ‖A − B‖ = 2√2 sin(θ/2) in the Frobenius norm; a trace loses half of the digits near zero.
-    difference = R_WA.matrix() - R_WB.matrix()
+    difference = R_WA - R_WB
     chord = math.sqrt(float(np.vdot(difference, difference)))
     return 2.0 * math.asin(min(1.0, chord / math.sqrt(8.0)))
 
 
 def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> RigidTransform:
     """The pose a fraction of the way from A to B: straight in position, about one axis in orientation."""
+    if fraction == 1.0:
+        return X_WB
+    if fraction == 0.0:
+        return X_WA
     p_WA, p_WB = X_WA.translation(), X_WB.translation()
     p_WX = p_WA + fraction * (p_WB - p_WA)
-    if fraction in (0.0, 1.0):
-        return RigidTransform(X_WB.rotation() if fraction == 1.0 else X_WA.rotation(), p_WX)
     R_AB = X_WA.rotation().InvertAndCompose(X_WB.rotation()).ToAngleAxis()
     R_AX = RotationMatrix(AngleAxis(fraction * R_AB.angle(), R_AB.axis()))
     return RigidTransform(X_WA.rotation().multiply(R_AX), p_WX)

@@ -3,13 +3,13 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.models.errors import InputError
-from guiderail.models.skills.active_constraints import ActiveConstraint
+from guiderail.models.skills.active_constraints import ActiveConstraint, ConstraintGroup, grouped
 from guiderail.models.skills.geometry import Frames, angle_between, between
 from guiderail.models.skills.input_mappings import InputMapping
 from guiderail.models.skills.kinds import did_you_mean
@@ -50,6 +50,11 @@ class SkillState:
         parts: list[InputMapping | ActiveConstraint | TransitionDistance] = [*self.input_mapping]
         parts += [*self.active_constraints, self.transition_distance]
         return {frame for part in parts for frame in part.frame_names}
+
+    @cached_property
+    def grouped_constraints(self) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
+        """The active constraints, those in one frame together."""
+        return grouped(self.active_constraints)
 
 
 @dataclass(frozen=True)
@@ -107,10 +112,7 @@ class Skill:
         """map_q, equation 2.19: the displacement ΔH that the inputs (n,), clipped to [−1, 1], ask for in one period."""
         inputs = np.clip(inputs, -1.0, 1.0)
         parts = [m.displacement(inputs, X_WE, frames, period_s) for m in self.states[state].input_mapping]
-        total = RigidTransform()
-        for part in parts:
-            total = self.displace(total, part)
-        return total
+        return reduce(self.displace, parts) if parts else RigidTransform()
 
     @staticmethod
     def displace(X_WE: RigidTransform, displacement: RigidTransform) -> RigidTransform:
@@ -121,13 +123,13 @@ class Skill:
 
     def project(self, state: int, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
         """project_q, equation 2.21: H^ac, the state's active constraints applied in their order."""
-        for constraint in self.states[state].active_constraints:
+        for constraint in self.states[state].grouped_constraints:
             X_WE = constraint.project(X_WE, frames)
         return X_WE
 
     def violation(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
         """How far X_WE is outside of the worst active constraint, the larger of [m] and [rad]; 0 inside."""
-        return max((c.violation(X_WE, frames) for c in self.states[state].active_constraints), default=0.0)
+        return max((c.violation(X_WE, frames) for c in self.states[state].grouped_constraints), default=0.0)
 
     def command(
         self, state: int, X_WLast: RigidTransform, X_WRequest: RigidTransform, frames: Frames, period_s: float

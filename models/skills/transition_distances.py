@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -81,9 +82,12 @@ class TiltToGo(TransitionDistance):
         require_three(self.rpy_deg, "rpy_deg")
         require(-180 <= self.until_deg <= 180, f"until_deg must be between −180 and 180, not {self.until_deg}.")
 
+    @cached_property
+    def _any_tilt(self) -> TiltLimits:
+        return TiltLimits(self.frame, -180.0, 180.0, self.rpy_deg, self.turns_along)
+
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
-        tilt = TiltLimits(self.frame, -180.0, 180.0, self.rpy_deg, self.turns_along).tilt(X_WE, frames)
-        return float(np.deg2rad(self.until_deg) - tilt)
+        return math.radians(self.until_deg) - self._any_tilt.tilt(X_WE, frames)
 
 
 @register(TRANSITION_DISTANCES, "rotation_to_go")

@@ -44,8 +44,9 @@ def main() -> int:
     """Prints a line now and then; 1 if anything was wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=480.0)
+    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    rng, bus = np.random.default_rng(0), Bus()
+    rng, bus = np.random.default_rng(arguments.seed), Bus()
     started, said, wrong, number = time.monotonic(), 0.0, 0, 0
     grown: list[tuple[float, float]] = []
     for injection in stops(rng):

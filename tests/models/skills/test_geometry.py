@@ -57,24 +57,6 @@ def test_on_the_axis_the_bearing_is_x():
     np.testing.assert_array_equal(g.tilt_axis(np.zeros(3)), [0, 1, 0])
 
 
-@given(SEEDS)
-def test_angle_about_is_the_nearest_turn_about_an_axis(seed):
-    rng = np.random.default_rng(seed)
-    axis = rng.standard_normal(3)
-    axis /= np.linalg.norm(axis)
-    R = Rotation.random(rng=rng).as_matrix()
-    angle = g.angle_about(axis, R)
-    assert -math.pi <= angle <= math.pi
-
-    def distance(a):
-        return np.linalg.norm(R - Rotation.from_rotvec(a * axis).as_matrix())
-
-    others = np.linspace(-math.pi, math.pi, 400)
-    assert distance(angle) <= min(distance(a) for a in others) + 1e-12
-    turned = rng.uniform(-3, 3)
-    assert g.angle_about(axis, Rotation.from_rotvec(turned * axis).as_matrix()) == pytest.approx(turned, abs=1e-9)
-
-
 @given(SEEDS, st.sampled_from([1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0, math.pi]))
 def test_angle_between_is_accurate_from_tiny_to_half_a_turn(seed, angle):
     rng = np.random.default_rng(seed)
