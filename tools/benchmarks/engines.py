@@ -12,10 +12,12 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.recording import DrivenStation, along
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
+from guiderail.diagrams.tasks.bnc_options import HARD
 from guiderail.models.contact_lever import contact_lever
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.objects.bnc_motion import poses
+from guiderail.models.objects.bnc_sdf import FRICTION
 from guiderail.models.units import MM
 from guiderail.systems.recorder import Recording
 from guiderail.tools.benchmarks import told
@@ -29,9 +31,10 @@ OFFSETS = (0.8, 1.25, 2.0, 3.0)  # [mm], of a plug on the rim
 MODULI = (0.01, 0.1, 1.0, 10.0)  # times the contact's own, in Drake
 PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
 LEAST_FORCE = 0.5  # [N] below which a lever says nothing
-NARROW = BncDimensions(mouth_chamfer=0.1 * MM)  # of the connector at its hardest
+NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
 IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that has dropped in, and an offset from which none does
 HALVINGS = 6  # of that offset
+BESIDE, DRAGGED = 2.0 * MM, 3.0 * MM  # offset of a plug on the rim that is dragged away from the jack, and how far
 
 
 def measure() -> dict[str, Any]:
@@ -49,7 +52,12 @@ def measure() -> dict[str, Any]:
     levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
     captures |= {engine: _capture(station) / MM for engine, station in told(ENGINES.items(), "capture")}
-    return {"profiles": profiles, "offsets_mm": list(OFFSETS), "levers_mm": levers, "captures_mm": captures}
+    jobs = [(engine, step) for engine in ENGINES for step in (PLANT_PERIOD, PLANT_PERIOD / 2)]
+    drags = {f"{engine}, {1e3 * step:g} ms": _drag(ENGINES[engine], step) for engine, step in told(jobs, "drag")} | {
+        "as drawn": FRICTION
+    }
+    measured = {"levers_mm": levers, "captures_mm": captures, "drags": drags}
+    return {"profiles": profiles, "offsets_mm": list(OFFSETS), **measured}
 
 
 def rigid_lever(d: BncDimensions, offset: float) -> float:
@@ -101,11 +109,26 @@ def _capture(name: str) -> float:
     return near
 
 
-def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1.0) -> Recording:
-    """A plug that is pressed on a jack that is this far beside it [m]."""
-    motion = poses(np.array([11.0 * MM, PRESSED, PRESSED]), np.pi / 2)
-    station = STATIONS.get(name).build(workcell)
-    times = np.array([0.0, 0.6, 1.4])
+def _drag(name: str, time_step: float) -> float:
+    """Drag over push of a plug that slides over the rim, away from the jack: the friction that it feels."""
+    wrench = _pressed(name, BncWorkcell(NARROW), BESIDE, time_step=time_step, dragged=-DRAGGED)["wrench"][-20:]
+    return float(np.linalg.norm(wrench[:, :2], axis=1).mean() / wrench[:, 2].mean())
+
+
+def _pressed(
+    name: str,
+    workcell: BncWorkcell,
+    offset: float,
+    modulus: float = 1.0,
+    *,
+    time_step: float = PLANT_PERIOD,
+    dragged: float = 0.0,
+) -> Recording:
+    """A plug that is pressed on a jack that is this far beside it [m], and then dragged along x [m]."""
+    motion = poses(np.array([11.0 * MM, PRESSED, PRESSED, PRESSED]), np.pi / 2)
+    motion[3, 0] += dragged
+    station = STATIONS.get(name).build(workcell, time_step=time_step)
+    times = np.array([0.0, 0.6, 1.4, 2.4]) if dragged else np.array([0.0, 0.6, 1.0, 1.4])
     driven = DrivenStation(station, along(times, motion), round(times[-1] / CONTROL_PERIOD))
     workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform([offset, 0.0, 0.0]))
     if modulus != 1.0:
@@ -125,6 +148,8 @@ def show(results: dict[str, Any]) -> None:
     for name, levers in results["levers_mm"].items():
         print(f"  {name}: {', '.join(f'{lever:.2f}' for lever in levers)}")
     print("a plug drops in from", ", ".join(f"{mm:.2f} mm ({name})" for name, mm in results["captures_mm"].items()))
+    drags = ", ".join(f"{drag:.2f} ({name})" for name, drag in results["drags"].items())
+    print("a plug that slides over the rim drags, of its push:", drags)
 
 
 def draw(results: dict[str, Any], path: Path) -> Path:
