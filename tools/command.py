@@ -45,6 +45,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "benchmarks": _known("tools.benchmarks", "BENCHMARKS"),
     "generated": _known("tools.recording.generate", "GENERATED"),
     "pictures": _known("tools.files", "PICTURES"),
+    "nulls": _known("tools.rollouts.null_policies", "NULL_POLICIES"),
     "axes": lambda: [axis.name for axis in import_module("guiderail.tools.robustness.axes").AXES],
     "listed": lambda: [*LISTED, *CHOICES["tasks"]()],
 }
@@ -249,8 +250,9 @@ def evaluate(
     beside: Annotated[
         str | None,
         _opt(
-            "Who else meets the same episodes, or none; the demonstration alone always does.  "
-            "[default: zero, white and constant actions, and the rule]"
+            "Who else meets the same episodes, comma-separated: rule, {nulls}; or none. The demonstration alone always "
+            "does, where there is one, and no action, zero, is the same.  "
+            "[default: white, constant and rule; zero too where nothing is demonstrated]"
         ),
     ] = None,
     fresh: Annotated[bool, _opt("Draw anew in every episode what is hidden in the run.", "--fresh")] = False,
@@ -269,10 +271,10 @@ def evaluate(
     found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others, fresh=fresh)
     for name in others:
         if name not in found["beside"]:
-            _say(f"{name} is left out: it sees or moves other things than this environment")
-    differs = [] if as_json else found.pop("differs_from_thesis")
+            _say(f"{name} is left out: it was written for other inputs, or to see other things, than there are here")
+    # The numbers last: they are what a person looks for.
+    _print_differences([] if as_json else found.pop("differs_from_thesis"))
     _print(found, as_json)
-    _print_differences(differs)
 
 
 @command("robustness runs/connector --env station=mujoco --episodes 50")
@@ -283,7 +285,8 @@ def robustness(
     axes: Annotated[str | None, _opt("What is changed, comma-separated: {axes}.  [default: all]")] = None,
     env: Env = None,
     beside: Annotated[
-        str | None, _opt("Who else meets the same episodes, or none.  [default: white actions, and the rule]")
+        str | None,
+        _opt("Who else meets the same episodes, comma-separated: rule, {nulls}; or none.  [default: white, rule]"),
     ] = None,
     out: Annotated[
         Path | None, _opt("The folder to write, which several runs need.  [default: robustness/STATION in the run]")
@@ -1087,10 +1090,14 @@ def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
         known = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
         typer.echo(json.dumps(known, allow_nan=False))
         return
+    from guiderail.tools.rollouts.metrics import STATISTICS, SYMBOLS
     from guiderail.tools.tables import cell
 
     columns = [*result.get("beside", ())]
-    width = max(len(key) for key in result)
+    said = {key: key if " " in key else key.replace("_", space) for key in result}
+    units = {key: STATISTICS[key].unit for key in {*result} & {*STATISTICS}}
+    said |= {key: f"{said[key]} [{unit}]" for key, unit in units.items() if unit in SYMBOLS}
+    width = max(len(words) for words in said.values())
     titles = ["policy", *("demonstration alone" if name == "demonstration" else name for name in columns)]
     if columns:
         typer.echo("  ".join([" " * width, *(f"{title:<{COLUMN}}" for title in titles)]).rstrip())
@@ -1098,5 +1105,4 @@ def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
         if key == "beside" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
             continue
         cells = [cell(value), *(cell(result[f"{name}_{key}"]) for name in columns if f"{name}_{key}" in result)]
-        words = key if " " in key else key.replace("_", space)
-        typer.echo("  ".join([f"{words:<{width}}", *(f"{one:<{COLUMN}}" for one in cells)]).rstrip())
+        typer.echo("  ".join([f"{said[key]:<{width}}", *(f"{one:<{COLUMN}}" for one in cells)]).rstrip())

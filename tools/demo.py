@@ -1,6 +1,7 @@
 """`guiderail demo`: a skill learned before your eyes, and what it leaves behind."""
 
 import shutil
+import sys
 import time
 from pathlib import Path
 
@@ -76,7 +77,14 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         (out / "learning_curve.png", "the same, drawn"),
     ):
         console.print(f"  {path}\n      {what}")
-    console.print(f"\nNext: guiderail evaluate {out}, guiderail reproduce 5.6, guiderail train --help")
+    called = _called()
+    console.print(f"\nNext: {called} evaluate {out}, {called} reproduce 5.6, {called} train --help")
+
+
+def _called() -> str:
+    """What to write for this command: its path where the shell does not find it by its name."""
+    path = Path(sys.argv[0])
+    return str(path) if path.name == "guiderail" and shutil.which("guiderail") is None else "guiderail"
 
 
 def _clear(out: Path) -> None:
@@ -108,22 +116,22 @@ def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _outcome(rows: pd.DataFrame) -> str:
-    cost = abs(rows["reward_obstacle_cost"].mean())
-    return f"{rows['success'].mean():.0%} reach the goal, obstacle cost {cost:.1f}, return {rows['return'].mean():.1f}"
+    reach, earned, near = (rows[name].mean() for name in ("success", "return", "reward_obstacle_cost"))
+    return f"{reach:.0%} reach the goal, return {earned:.1f}, {near:+.1f} of it at the obstacle"
 
 
 def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
     """The plane with the paths before and after, and the return over the episodes."""
     figure, ((plane, curve),) = new_figure(1, 2, (11, 5.2))
-    draw_world(plane)
+    draw_world(plane, named=True)
     for index, path in enumerate(after["measured"]):
         plane.plot(*path.T, color=colour("skgrl"), linewidth=1.2, label="" if index else "after learning")
     plane.plot(*before["measured"][0].T, color="black", linewidth=1.2, label="before learning")
-    plane.legend(frameon=False, loc="upper left", fontsize=8)
+    plane.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8)
     rows = RunFolder(out).episodes()
     episodes = np.arange(1, len(rows) + 1)
     curve.plot(episodes, rows["return"], "o-", markersize=3, color=colour("skgrl"), label="return")
-    curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="obstacle cost")
+    curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="of it at the obstacle")
     curve.axhline(before["return"].mean(), color="black", linewidth=0.8, linestyle=":", label="return before learning")
     curve.set(xlabel="training episode")
     curve.legend(frameon=False, fontsize=8)

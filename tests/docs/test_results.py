@@ -66,3 +66,22 @@ def test_kgrl_stays_clear_of_the_passages_walls_and_safe_residual_learning_gets_
     assert (of("narrow_passage", "kgrl")["training_collisions"] == 0).all()
     assert (of("narrow_passage", "residual")["training_collisions"] > 0).all()
     assert (of("narrow_passage", "safe_residual")["training_success_rate"] < 0.5).all()
+
+
+def test_in_the_other_engine_every_policy_of_the_clamp_inserts_all_and_white_noise_most():
+    policies, white = (of("grid_clamp_transfer", method) for method in ("sct", "white"))
+    assert len(policies) == 9
+    assert (policies["success_rate"] == 1.0).all()
+    assert (policies["episodes"] == 100).all()
+    assert (white["success_rate"] > 0.5).all()
+
+
+def test_certificates_hold_and_the_loosest_bound_is_the_connectors_turn_under_skgrl():
+    table = read_table(RESULTS / "certificates.csv")
+    assert (table["checker"] == "yes").all()
+    assert (table["bounds_left"] == 0).all()
+    assert (table["attack_steps"] >= 1_000_000).all()
+    assert table["worst_ratio_free"].to_numpy() == pytest.approx(1.0, abs=1e-3)
+    loosest = table.loc[table["worst_ratio_active"].idxmax()]
+    assert (loosest["skill"], loosest["worst_active"]) == ("connector_skgrl", "pose of Rz")
+    assert loosest["worst_ratio_active"] == pytest.approx(2.5, abs=0.1)

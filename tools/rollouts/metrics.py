@@ -211,6 +211,8 @@ _STATISTICS = (
     Metric("avoids_obstacle_from", "episode", "whose obstacle cost stays below 1, from 1", avoids_obstacle_from),
 )
 STATISTICS = {metric.name: metric for metric in _STATISTICS}
+SYMBOLS = ("N", "N²", "s", *JERKS.values())
+"""Units that are symbols, and no words: those that a table has room for."""
 
 
 def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "") -> dict[str, Any]:
