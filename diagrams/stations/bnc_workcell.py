@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.stations.workcell import exclude_contacts, movable_frame
 from guiderail.models.objects.bnc_connector import JACK_SDF, PLUG_SDF, BncDimensions
-from guiderail.models.objects.bnc_sdf import FRICTION
+from guiderail.models.objects.bnc_sdf import FRICTION, MARGIN
 from guiderail.models.objects.bnc_surfaces import jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.objects.write_bnc import folder_of
@@ -45,11 +45,13 @@ class BncWorkcell:
         dimensions: of the connector.
         p_WJ: where the jack stands, (3,) [m].
         friction: of the connector's metal.
+        margin: from which on Drake feels the jack's metal before it is touched [m]; MuJoCo has none.
     """
 
     dimensions: BncDimensions = field(default_factory=BncDimensions)
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)
     friction: float = FRICTION
+    margin: float = MARGIN
 
     @property
     def X_WJ(self) -> RigidTransform:
@@ -70,7 +72,7 @@ class BncWorkcell:
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Adds the jack, on a frame that `set_jack_offset` moves, and a board under it to look at."""
-        model = add_model(plant, folder_of(self.dimensions, self.friction) / JACK_SDF.name)
+        model = add_model(plant, folder_of(self.dimensions, self.friction, self.margin) / JACK_SDF.name)
         mount = plant.AddFrame(FixedOffsetFrame("jack_mount", plant.world_frame(), self.X_WJ))
         plant.WeldFrames(mount, plant.GetFrameByName("jack", model))
         depth, width, thickness = BOARD
@@ -79,7 +81,7 @@ class BncWorkcell:
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
         """Adds the plug, on a frame that `set_grasp_offset` moves."""
-        model = add_model(plant, folder_of(self.dimensions, self.friction) / PLUG_SDF.name)
+        model = add_model(plant, folder_of(self.dimensions, self.friction, self.margin) / PLUG_SDF.name)
         grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
         plug = plant.GetBodyByName("plug", model)
         plant.WeldFrames(grasp, plug.body_frame())

@@ -14,7 +14,7 @@ from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE
 from guiderail.diagrams.tasks.hidden_place import HiddenPlace
 from guiderail.models.insertion import COLLISION_FORCE
 from guiderail.models.objects.bnc_connector import BncDimensions
-from guiderail.models.objects.bnc_sdf import FRICTION
+from guiderail.models.objects.bnc_sdf import FRICTION, MARGIN
 from guiderail.models.units import MM
 
 ALIGNMENT = 2.0 * MM  # |x|, |y| of every command: equation 4.26
@@ -40,6 +40,9 @@ class BncOptions(HiddenPlace):
         DRAWN.slot_clearance, ge=0.05 * MM, le=0.2 * MM, description="between lug and slot, a side [m]"
     )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="of the connector's metal")
+    contact_margin: Number = Field(
+        MARGIN, ge=0, le=0.5 * MM, description="from which on Drake feels the jack's metal before it is touched [m]"
+    )
     demonstrations: str = Field("insert", description="what was demonstrated: insert, search, or a file of one's own")
 
     @field_validator("demonstrations")
@@ -59,7 +62,7 @@ class BncOptions(HiddenPlace):
             mouth_chamfer=self.mouth_chamfer,
             slot_clearance=self.slot_clearance,
         )
-        return BncWorkcell(dimensions, friction=self.friction)
+        return BncWorkcell(dimensions, friction=self.friction, margin=self.contact_margin)
 
 
 HARD: dict[str, Any] = {

@@ -13,7 +13,8 @@ BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 
 
 
 FRICTION = 0.2  # of metal on metal
-# Without it a step of 10 ms leaps as far into metal as the plug moves in it, and the next one throws the plug out.
+# Without it a step of 10 ms leaps as far into metal as the plug moves in it, and the next one throws the plug out. With
+# it, what slides fast is held back by more than friction (`guiderail bench engines`): shorter steps need none.
 MARGIN = 0.1 * MM
 # As stiff as brass. A softer barrel spreads a rim's load evenly, and a plug that stands beside the jack feels a torque
 # that no metal has (docs/experiments.md, "Where a plug on the rim feels its force").
@@ -26,9 +27,10 @@ SEAT = ContactMaterial(friction=0.05)
 PLUG_MASS = 0.03  # [kg]
 
 
-def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
+def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN) -> str:
     """The jack: link `jack` is frame J. Geometry `barrel`, `pad`, `lug_0`, `lug_1`."""
-    d, barrel_material, lug_material = dimensions, *(replace(metal, friction=friction) for metal in (BARREL, LUG))
+    d = dimensions
+    barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
     barrel = (at(z=d.barrel_height / 2), cylinder(d.barrel_radius, d.barrel_height))
     pad = (
         at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2),

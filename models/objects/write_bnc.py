@@ -5,26 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 
 from guiderail.models.objects.bnc_connector import FOLDER, BncDimensions, bore_mesh, ring_mesh, slot_mesh
-from guiderail.models.objects.bnc_sdf import FRICTION, jack_sdf, plug_sdf
+from guiderail.models.objects.bnc_sdf import FRICTION, MARGIN, jack_sdf, plug_sdf
 from guiderail.models.objects.made import made
 
 
-def files(dimensions: BncDimensions, friction: float = FRICTION) -> dict[str, str]:
+def files(dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN) -> dict[str, str]:
     """What each file holds, by name."""
     return {
         "bnc_bore.obj": bore_mesh(dimensions).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
         "bnc_ring.obj": ring_mesh(dimensions).to_obj(),
-        "bnc_jack.sdf": jack_sdf(dimensions, friction),
+        "bnc_jack.sdf": jack_sdf(dimensions, friction, margin),
         "bnc_plug.sdf": plug_sdf(dimensions, friction),
     }
 
 
-def folder_of(dimensions: BncDimensions, friction: float = FRICTION) -> Path:
+def folder_of(dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN) -> Path:
     """Where the files of a connector lie: beside this one, or made to measure."""
-    if (dimensions, friction) == (BncDimensions(), FRICTION):
+    if (dimensions, friction, margin) == (BncDimensions(), FRICTION, MARGIN):
         return FOLDER
-    return made(files, dimensions, friction)
+    return made(files, dimensions, friction, margin)
 
 
 def main(folder: Path = FOLDER) -> None:

@@ -49,6 +49,11 @@ def test_at_hard_all_three_learn_the_connector_and_only_residual_learning_leaves
     assert SMOOTHER * jerk["skgrl_adaptive"].max() < min(jerk["kgrl"].min(), jerk["residual"].min())
 
 
+def test_what_was_learned_at_hard_is_harder_in_the_other_engine():
+    rates = [of("connector_hard_transfer", method, "MuJoCo")["success_rate"] for method in ("kgrl", "skgrl_adaptive")]
+    assert (min(rate.min() for rate in rates), max(rate.max() for rate in rates)) == (0.38, 0.83)
+
+
 def test_a_template_inserts_the_clamp_with_the_least_force_and_residual_learning_with_the_most():
     force = {
         method: of(study, method)["peak_force"].max()

@@ -17,7 +17,7 @@ from guiderail.diagrams.tasks.bnc_options import HARD
 from guiderail.models.contact_lever import contact_lever
 from guiderail.models.objects.bnc_connector import BncDimensions
 from guiderail.models.objects.bnc_motion import poses
-from guiderail.models.objects.bnc_sdf import FRICTION
+from guiderail.models.objects.bnc_sdf import FRICTION, MARGIN
 from guiderail.models.units import MM
 from guiderail.systems.recorder import Recording
 from guiderail.tools.benchmarks import told
@@ -34,7 +34,13 @@ LEAST_FORCE = 0.5  # [N] below which a lever says nothing
 NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
 IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that has dropped in, and an offset from which none does
 HALVINGS = 6  # of that offset
-BESIDE, DRAGGED = 2.0 * MM, 3.0 * MM  # offset of a plug on the rim that is dragged away from the jack, and how far
+AROUND, SPEEDS = 3.0 * MM, (0.003, 0.02, 0.04)  # circle about the jack on which a plug slides over the rim [m, m/s]
+CONTACTS = {  # station, step [s] and margin [m]
+    "Drake, 10 ms": ("rails", PLANT_PERIOD, MARGIN),
+    "Drake, 2.5 ms": ("rails", PLANT_PERIOD / 4, MARGIN),
+    "Drake, 2.5 ms, no margin": ("rails", PLANT_PERIOD / 4, 0.0),
+    "MuJoCo": ("mujoco", PLANT_PERIOD, MARGIN),
+}
 
 
 def measure() -> dict[str, Any]:
@@ -52,10 +58,7 @@ def measure() -> dict[str, Any]:
     levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
     captures |= {engine: _capture(station) / MM for engine, station in told(ENGINES.items(), "capture")}
-    jobs = [(engine, step) for engine in ENGINES for step in (PLANT_PERIOD, PLANT_PERIOD / 2)]
-    drags = {f"{engine}, {1e3 * step:g} ms": _drag(ENGINES[engine], step) for engine, step in told(jobs, "drag")} | {
-        "as drawn": FRICTION
-    }
+    drags = {contact: [drag(*how, speed) for speed in SPEEDS] for contact, how in told(CONTACTS.items(), "drag")}
     measured = {"levers_mm": levers, "captures_mm": captures, "drags": drags}
     return {"profiles": profiles, "offsets_mm": list(OFFSETS), **measured}
 
@@ -109,26 +112,27 @@ def _capture(name: str) -> float:
     return near
 
 
-def _drag(name: str, time_step: float) -> float:
-    """Drag over push of a plug that slides over the rim, away from the jack: the friction that it feels."""
-    wrench = _pressed(name, BncWorkcell(NARROW), BESIDE, time_step=time_step, dragged=-DRAGGED)["wrench"][-20:]
-    return float(np.linalg.norm(wrench[:, :2], axis=1).mean() / wrench[:, 2].mean())
+def drag(station: str, time_step: float, margin: float, speed: float) -> float:
+    """Drag over push of a plug that slides over a sharp rim: the friction that it feels."""
+    workcell = BncWorkcell(NARROW, margin=margin)
+    down = poses(np.array([11.0 * MM, PRESSED]), np.pi / 2)
+    times = np.concatenate([[0.0], np.linspace(0.6, 1.4, 81)])
+    motion = np.concatenate([down[:1], np.tile(down[1], (81, 1))])
+    angles = speed / AROUND * np.maximum(times - 0.6, 0.0)
+    motion[:, :2] += AROUND * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    built = STATIONS.get(station).build(workcell, time_step=time_step)
+    driven = DrivenStation(built, along(times, motion), round(times[-1] / CONTROL_PERIOD))
+    driven.start(motion[0])
+    wrench = driven.run()["wrench"][45:]
+    wrench = wrench[wrench[:, 2] > LEAST_FORCE]
+    return float(np.median(np.linalg.norm(wrench[:, :2], axis=1) / wrench[:, 2]))
 
 
-def _pressed(
-    name: str,
-    workcell: BncWorkcell,
-    offset: float,
-    modulus: float = 1.0,
-    *,
-    time_step: float = PLANT_PERIOD,
-    dragged: float = 0.0,
-) -> Recording:
-    """A plug that is pressed on a jack that is this far beside it [m], and then dragged along x [m]."""
-    motion = poses(np.array([11.0 * MM, PRESSED, PRESSED, PRESSED]), np.pi / 2)
-    motion[3, 0] += dragged
-    station = STATIONS.get(name).build(workcell, time_step=time_step)
-    times = np.array([0.0, 0.6, 1.4, 2.4]) if dragged else np.array([0.0, 0.6, 1.0, 1.4])
+def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1.0) -> Recording:
+    """A plug that is pressed on a jack that is this far beside it [m]."""
+    motion = poses(np.array([11.0 * MM, PRESSED, PRESSED]), np.pi / 2)
+    station = STATIONS.get(name).build(workcell)
+    times = np.array([0.0, 0.6, 1.4])
     driven = DrivenStation(station, along(times, motion), round(times[-1] / CONTROL_PERIOD))
     workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform([offset, 0.0, 0.0]))
     if modulus != 1.0:
@@ -148,8 +152,10 @@ def show(results: dict[str, Any]) -> None:
     for name, levers in results["levers_mm"].items():
         print(f"  {name}: {', '.join(f'{lever:.2f}' for lever in levers)}")
     print("a plug drops in from", ", ".join(f"{mm:.2f} mm ({name})" for name, mm in results["captures_mm"].items()))
-    drags = ", ".join(f"{drag:.2f} ({name})" for name, drag in results["drags"].items())
-    print("a plug that slides over the rim drags, of its push:", drags)
+    speeds = ", ".join(f"{1e3 * speed:g}" for speed in SPEEDS)
+    print(f"drag of a plug that slides over a sharp rim, of its push, at {speeds} mm/s; its friction is {FRICTION:g}")
+    for name, drags in results["drags"].items():
+        print(f"  {name}: {', '.join(f'{share:.2f}' for share in drags)}")
 
 
 def draw(results: dict[str, Any], path: Path) -> Path:

@@ -52,6 +52,7 @@ def plot_run(run: Path) -> Path:
         axis.plot(episodes, column[second], color="0.5", linewidth=1, label=names[1])
         axis.set(ylabel=words)
     violation.axhline(0, color="firebrick", linewidth=0.8)
+    force.set_ylim(0.0, max(1.0, force.get_ylim()[1]))  # nothing was touched: that is a flat line, and no noise
     jerk.set(yscale="log" if (column["jerk_commanded_linear"] > 0).all() else "linear")
     for axis in (terms, violation, force, jerk):
         axis.legend(frameon=False, fontsize=8)

@@ -35,16 +35,16 @@ def test_a_plug_drops_in_from_about_as_far_beside_as_it_is_drawn():
     assert drawn < ours < 1.5 * drawn
 
 
-def test_a_plug_that_slides_over_a_sharp_rim_drags_as_its_friction_says_where_the_step_is_short():
-    """At the step that is taken it drags half as much again: nothing may make that worse."""
-    taken, shorter = (engines._drag("rails", step) for step in (engines.PLANT_PERIOD, engines.PLANT_PERIOD / 2))
-    assert shorter == pytest.approx(engines.FRICTION, rel=0.15)
-    assert shorter < taken < 1.7 * engines.FRICTION
+def test_a_plug_that_slides_fast_over_a_sharp_rim_is_held_back_by_friction_alone_where_steps_are_short():
+    """At the step and the margin that are taken it is held back four times as much: nothing may make that worse."""
+    fine, taken = (engines.drag(*engines.CONTACTS[how], 0.02) for how in ("Drake, 2.5 ms, no margin", "Drake, 10 ms"))
+    assert fine == pytest.approx(engines.FRICTION, rel=0.25)
+    assert fine < taken < 4.2 * engines.FRICTION
 
 
-def test_a_plug_that_slides_over_the_other_engines_rim_drags_as_its_friction_says():
+def test_a_plug_that_slides_over_the_other_engines_rim_is_held_back_by_friction_alone():
     pytest.importorskip("mujoco")
-    assert engines._drag("mujoco", engines.PLANT_PERIOD) == pytest.approx(engines.FRICTION, rel=0.05)
+    assert engines.drag(*engines.CONTACTS["MuJoCo"], 0.02) == pytest.approx(engines.FRICTION, rel=0.05)
 
 
 def test_the_picture_is_drawn(tmp_path):
