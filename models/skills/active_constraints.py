@@ -6,7 +6,7 @@ those on orientation that depend on the position come after those on the positio
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +20,7 @@ from guiderail.models.skills.geometry import (
     angle_between,
     bearing,
     chord_angle,
+    largest,
     pose_in,
     rotation_deg,
     with_position_in,
@@ -88,16 +89,16 @@ class ConstraintGroup:
 
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
         """How far X_WE is from the worst of them, each by itself: the larger of metres and radians; 0 inside."""
-        R_FE, p_FE = pose_in(self.constraints[0].frame, X_WE, frames)
-        worst = 0.0
+        return largest(self._distances(*pose_in(self.constraints[0].frame, X_WE, frames)))
+
+    def _distances(self, R_FE: np.ndarray, p_FE: np.ndarray) -> Iterator[float]:
         for constraint in self.constraints:
             R, p = constraint.project_in_frame(R_FE, p_FE)
             if p is not p_FE:
                 moved = p - p_FE
-                worst = max(worst, math.sqrt(moved @ moved))
+                yield math.sqrt(moved @ moved)
             if R is not R_FE:
-                worst = max(worst, chord_angle(R, R_FE))
-        return worst
+                yield chord_angle(R, R_FE)
 
 
 def grouped(constraints: Iterable[ActiveConstraint]) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
@@ -338,8 +339,9 @@ def axes(frame: str, frames: Frames) -> RotationMatrix:
 
 
 def nearest_turn(angle: float, centre: float) -> float:
-    """The same angle, a whole number of turns away, within half a turn of `centre`."""
-    return angle - math.tau * round((angle - centre) / math.tau)
+    """The same angle, a whole number of turns away, within half a turn of `centre`; not a number where it is none."""
+    turns = (angle - centre) / math.tau
+    return angle - math.tau * round(turns) if math.isfinite(turns) else math.nan
 
 
 @register(ACTIVE_CONSTRAINTS, "tilt_limits")

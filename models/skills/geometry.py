@@ -5,7 +5,7 @@ horizontal axis that is perpendicular to the bearing, the horizontal direction f
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -81,6 +81,17 @@ def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
     difference = R_WA - R_WB
     chord = math.sqrt(float(np.vdot(difference, difference)))
     return 2.0 * math.asin(min(1.0, chord / math.sqrt(8.0)))
+
+
+def largest(violations: Iterable[float]) -> float:
+    """The largest of them, at least 0; not a number where one of them is none, which `max` would hide."""
+    worst = 0.0
+    for violation in violations:
+        if not violation <= worst:
+            if math.isnan(violation):
+                return violation
+            worst = violation
+    return worst
 
 
 def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> RigidTransform:

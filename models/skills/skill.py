@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.models.errors import InputError
 from guiderail.models.skills.active_constraints import ActiveConstraint, ConstraintGroup, grouped
-from guiderail.models.skills.geometry import Frames, angle_between, between
+from guiderail.models.skills.geometry import Frames, angle_between, between, largest
 from guiderail.models.skills.input_mappings import InputMapping
 from guiderail.models.skills.kinds import did_you_mean
 from guiderail.models.skills.transition_distances import TransitionDistance
@@ -129,7 +129,7 @@ class Skill:
 
     def violation(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
         """How far X_WE is outside of the worst active constraint, the larger of [m] and [rad]; 0 inside."""
-        return max((c.violation(X_WE, frames) for c in self.states[state].grouped_constraints), default=0.0)
+        return largest(c.violation(X_WE, frames) for c in self.states[state].grouped_constraints)
 
     def command(
         self, state: int, X_WLast: RigidTransform, X_WRequest: RigidTransform, frames: Frames, period_s: float

@@ -6,8 +6,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.errors import InputError
+from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.models.skills import active_constraints as ac
-from guiderail.models.skills.geometry import angle_between, position_in
+from guiderail.models.skills.geometry import angle_between, largest, position_in
 
 F = "object"
 CONSTRAINTS = [
@@ -134,3 +135,23 @@ def test_keep_above_lifts_the_lowest_point():
 def test_refuses_what_allows_nothing(make):
     with pytest.raises(InputError):
         make()
+
+
+@pytest.mark.parametrize("constraint", CONSTRAINTS, ids=IDS)
+def test_what_is_no_number_is_never_inside(constraint):
+    for lost in (np.s_[:], np.s_[:3]):
+        pose = np.array([0.1, 0.0, 0.1, 0.3, 0.2, 0.1])
+        pose[lost] = np.nan
+        X_WE = pose_to_transform(pose)
+        frames = {F: RigidTransform()}
+        group = ac.ConstraintGroup((ac.FixedOrientation(frame=F), constraint, ac.Box((-1.0,) * 3, (1.0,) * 3, F)))
+        assert not group.violation(X_WE, frames) <= 1e-9
+        if lost != np.s_[:3] or not isinstance(constraint, ac.FixedOrientation):
+            assert not constraint.violation(X_WE, frames) <= 1e-9
+
+
+def test_the_largest_of_what_is_no_number_is_none():
+    assert np.isnan(largest([0.1, np.nan, 0.2]))
+    assert np.isnan(largest([np.nan, 0.2]))
+    assert largest([]) == 0.0
+    assert largest([0.1, 0.3, 0.2]) == 0.3
