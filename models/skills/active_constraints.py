@@ -16,7 +16,6 @@ from pydrake.math import RigidTransform, RotationMatrix
 from guiderail.models.skills.geometry import (
     WORLD,
     Frames,
-    about,
     angle_between,
     bearing,
     chord_angle,
@@ -40,10 +39,7 @@ class ActiveConstraint(ABC):
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
         """How far X_WE is from its projection: the larger of metres and radians; zero where it is allowed."""
         X_WP = self.project(X_WE, frames)
-        if X_WP is X_WE:
-            return 0.0
-        moved = X_WP.translation() - X_WE.translation()
-        return max(math.sqrt(moved @ moved), angle_between(X_WP.rotation(), X_WE.rotation()))
+        return max(math.dist(X_WP.translation(), X_WE.translation()), angle_between(X_WP.rotation(), X_WE.rotation()))
 
     @property
     def frame_names(self) -> tuple[str, ...]:
@@ -95,8 +91,7 @@ class ConstraintGroup:
         for constraint in self.constraints:
             R, p = constraint.project_in_frame(R_FE, p_FE)
             if p is not p_FE:
-                moved = p - p_FE
-                yield math.sqrt(moved @ moved)
+                yield math.dist(p, p_FE)
             if R is not R_FE:
                 yield chord_angle(R, R_FE)
 
@@ -411,5 +406,6 @@ class Arc(FrameConstraint):
         least, most = math.radians(self.min_deg), math.radians(self.max_deg)
         angle = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (least + most))
         angle = min(max(angle, least), most)
-        p_FP = np.array([self.radius_m * math.cos(angle), self.radius_m * math.sin(angle), self.height_m])
-        return about(np.array([0.0, 0.0, 1.0]), angle).multiply(rotation_deg(self.rpy_deg)).matrix(), p_FP
+        c, s = math.cos(angle), math.sin(angle)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotation_deg(self.rpy_deg).matrix()
+        return R, np.array([self.radius_m * c, self.radius_m * s, self.height_m])

@@ -238,8 +238,9 @@ class Tilted(ac.ActiveConstraint):
 
 
 def test_a_violation_is_the_larger_of_metres_and_radians():
-    assert Tilted(0.1).violation(RigidTransform(), {}) == pytest.approx(0.3)
-    assert Tilted(0.5).violation(RigidTransform(), {}) == pytest.approx(0.5)
+    X_WE = RigidTransform(RotationMatrix.MakeYRotation(0.7), [0.1, -0.2, 0.5])
+    assert Tilted(0.1).violation(X_WE, {}) == pytest.approx(0.3)
+    assert Tilted(0.5).violation(X_WE, {}) == pytest.approx(0.5)
     assert Tilted(0.0).frame_names == ()
 
 

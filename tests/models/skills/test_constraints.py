@@ -155,3 +155,12 @@ def test_the_largest_of_what_is_no_number_is_none():
     assert np.isnan(largest([np.nan, 0.2]))
     assert largest([]) == 0.0
     assert largest([0.1, 0.3, 0.2]) == 0.3
+
+
+@pytest.mark.parametrize("constraint", CONSTRAINTS, ids=IDS)
+def test_others_can_follow_in_a_group(constraint):
+    box = ac.Box((-0.02,) * 3, (0.02,) * 3, F)
+    for X_WE, frames in scenes(3, 5):
+        together = ac.ConstraintGroup((constraint, box, constraint)).project(X_WE, frames)
+        X_WP = constraint.project(box.project(constraint.project(X_WE, frames), frames), frames)
+        np.testing.assert_allclose(together.GetAsMatrix34(), X_WP.GetAsMatrix34(), atol=1e-12)

@@ -55,6 +55,9 @@ def test_on_the_axis_the_bearing_is_x():
         np.testing.assert_array_equal(g.bearing(np.array(p)), [1, 0, 0])
     np.testing.assert_allclose(g.bearing(np.array([0, 2e-9, 0])), [0, -1, 0], atol=1e-12)
     np.testing.assert_array_equal(g.tilt_axis(np.zeros(3)), [0, 1, 0])
+    np.testing.assert_allclose(g.bearing(np.array([0, g.NEAR_AXIS, 0])), [0, -1, 0], atol=1e-12)
+    for vector in (g.bearing(np.zeros(3)), g.tilt_axis(np.zeros(3)), g.tilt_axis(np.ones(3))):
+        assert vector.shape == (3,)
 
 
 @given(SEEDS, st.sampled_from([1e-9, 1e-6, 1e-3, 0.1, 1.0, 3.0, math.pi]))
