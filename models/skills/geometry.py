@@ -87,10 +87,9 @@ def largest(violations: Iterable[float]) -> float:
     """The largest of them, at least 0; not a number where one of them is none, which `max` would hide."""
     worst = 0.0
     for violation in violations:
-        if not violation <= worst:
-            if math.isnan(violation):
-                return violation
-            worst = violation
+        if math.isnan(violation):
+            return violation
+        worst = max(worst, violation)
     return worst
 
 
@@ -98,8 +97,6 @@ def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> Rigi
     """The pose a fraction of the way from A to B: straight in position, about one axis in orientation."""
     if fraction == 1.0:
         return X_WB
-    if fraction == 0.0:
-        return X_WA
     p_WA, p_WB = X_WA.translation(), X_WB.translation()
     p_WX = p_WA + fraction * (p_WB - p_WA)
     R_AB = X_WA.rotation().InvertAndCompose(X_WB.rotation()).ToAngleAxis()

@@ -1,5 +1,7 @@
 """The laws of a skill: mapping, displacement, command, transitions and progress."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
@@ -80,6 +82,12 @@ def test_inputs_beyond_one_are_one(pouring):
     one = pouring.map(0, np.array([1.0, -1.0, 0.0]), X_WE, MUG, PERIOD)
     much = pouring.map(0, np.array([50.0, -7.0, 0.0]), X_WE, MUG, PERIOD)
     assert one.IsExactlyEqualTo(much)
+
+
+def test_a_state_that_maps_no_input_stands_still(pouring):
+    deaf = replace(pouring, states=tuple(replace(state, input_mapping=()) for state in pouring.states))
+    moved = deaf.map(0, np.ones(3), in_mug([0.2, 0.0, 0.2]), {"mug_tip": RigidTransform()}, 0.01)
+    np.testing.assert_array_equal(moved.GetAsMatrix34(), RigidTransform().GetAsMatrix34())
 
 
 def test_adversarial_inputs_never_leave_the_constraints_or_exceed_the_speeds(pouring):
