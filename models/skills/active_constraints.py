@@ -406,6 +406,9 @@ class Arc(FrameConstraint):
         least, most = math.radians(self.min_deg), math.radians(self.max_deg)
         angle = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (least + most))
         angle = min(max(angle, least), most)
-        R_FP = RotationMatrix.MakeZRotation(angle).multiply(rotation_deg(self.rpy_deg))
-        p_FP = np.array([self.radius_m * math.cos(angle), self.radius_m * math.sin(angle), self.height_m])
-        return R_FP.matrix(), p_FP
+        c, s = math.cos(angle), math.sin(angle)
+        # Not by Drake's rotations, which refuse an angle that is no number.
+        R_F = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return R_F.dot(rotation_deg(self.rpy_deg).matrix()), np.array(
+            [self.radius_m * c, self.radius_m * s, self.height_m]
+        )
