@@ -20,8 +20,8 @@ from guiderail.models.skills.geometry import (
     bearing,
     chord_angle,
     largest,
+    matrix_deg,
     pose_in,
-    rotation_deg,
     with_position_in,
 )
 from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, interpolate, register, require, require_three
@@ -273,12 +273,8 @@ class FixedOrientation(FrameConstraint):
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")
 
-    @cached_property
-    def _wanted(self) -> np.ndarray:
-        return rotation_deg(self.rpy_deg).matrix()
-
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._wanted, p_FE
+        return matrix_deg(self.rpy_deg), p_FE
 
 
 class TiltConstraint(FrameConstraint):
@@ -301,10 +297,6 @@ class TiltConstraint(FrameConstraint):
         R_FE, p_FE = pose_in(self.frame, X_WE, frames)
         return self._tilt(self._heading(p_FE), R_FE)
 
-    @cached_property
-    def _at_rest(self) -> np.ndarray:
-        return rotation_deg(self.rpy_deg).matrix()
-
     @staticmethod
     def _heading(p_FE: np.ndarray) -> np.ndarray:
         """R_FH: H has its z axis along F's, and its x axis along the bearing; y is the axis of a tilt."""
@@ -313,7 +305,7 @@ class TiltConstraint(FrameConstraint):
 
     def _tilt(self, R_FH: np.ndarray, R_FE: np.ndarray) -> float:
         """Of R_FE = R_FH Ry(tilt) R_HRest, the angle for which that comes nearest (in the Frobenius norm)."""
-        R = R_FH.T @ R_FE @ self._at_rest.T
+        R = R_FH.T @ R_FE @ matrix_deg(self.rpy_deg).T
         if not self.turns_along:
             R = R @ R_FH
         return math.atan2(R[0, 2] - R[2, 0], R[0, 0] + R[2, 2])
@@ -325,7 +317,7 @@ class TiltConstraint(FrameConstraint):
         tilt = min(max(tilt, least), most)
         c, s = math.cos(tilt), math.sin(tilt)
         R = R_FH @ np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
-        return (R if self.turns_along else R @ R_FH.T) @ self._at_rest, p_FE
+        return (R if self.turns_along else R @ R_FH.T) @ matrix_deg(self.rpy_deg), p_FE
 
 
 def axes(frame: str, frames: Frames) -> RotationMatrix:
@@ -408,7 +400,5 @@ class Arc(FrameConstraint):
         angle = min(max(angle, least), most)
         c, s = math.cos(angle), math.sin(angle)
         # Not by Drake's rotations, which refuse an angle that is no number.
-        R_F = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return R_F.dot(rotation_deg(self.rpy_deg).matrix()), np.array(
-            [self.radius_m * c, self.radius_m * s, self.height_m]
-        )
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return turned.dot(matrix_deg(self.rpy_deg)), np.array([self.radius_m * c, self.radius_m * s, self.height_m])

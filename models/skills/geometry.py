@@ -25,6 +25,14 @@ def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
     return RotationMatrix(RollPitchYaw(*np.deg2rad(rpy_deg)))
 
 
+@lru_cache(maxsize=64)
+def matrix_deg(rpy_deg: tuple[float, ...]) -> np.ndarray:
+    """`rotation_deg` as a matrix (3, 3), which nobody may write to."""
+    matrix = rotation_deg(rpy_deg).matrix()
+    matrix.setflags(write=False)
+    return matrix
+
+
 def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
     """p_FE [m]: where the end effector's origin is in the frame F called `frame`."""
     if frame == WORLD:

@@ -112,7 +112,7 @@ class Skill:
         """map_q, equation 2.19: the displacement ΔH that the inputs (n,), clipped to [−1, 1], ask for in one period."""
         inputs = np.clip(inputs, -1.0, 1.0)
         parts = [m.displacement(inputs, X_WE, frames, period_s) for m in self.states[state].input_mapping]
-        return reduce(self.displace, parts) if parts else RigidTransform()
+        return reduce(self.displace, parts, RigidTransform())
 
     @staticmethod
     def displace(X_WE: RigidTransform, displacement: RigidTransform) -> RigidTransform:

@@ -416,6 +416,8 @@ def main() -> int:
     parser.add_argument("--results", type=Path, help="a JSON file that keeps what was tried")
     parser.add_argument("--again", action="store_true", help="try those again that survived")
     arguments = parser.parse_args()
+    if unknown := {*arguments.files} - {Path(file).stem for file in TARGETS}:
+        parser.error(f"none of the safety code's files is called {min(unknown)}")
     os.chdir(ROOT)
     for name in HEAVY:
         importlib.import_module(name)

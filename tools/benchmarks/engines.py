@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.recording import DrivenStation, along
+from guiderail.diagrams.recording import DrivenStation, along, drive_along
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
@@ -121,9 +121,7 @@ def drag(station: str, time_step: float, margin: float, speed: float) -> float:
     angles = speed / AROUND * np.maximum(times - 0.6, 0.0)
     motion[:, :2] += AROUND * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     built = STATIONS.get(station).build(workcell, time_step=time_step)
-    driven = DrivenStation(built, along(times, motion), round(times[-1] / CONTROL_PERIOD))
-    driven.start(motion[0])
-    wrench = driven.run()["wrench"][45:]
+    wrench = drive_along(built, times, motion)[1]["wrench"][45:]
     wrench = wrench[wrench[:, 2] > LEAST_FORCE]
     return float(np.median(np.linalg.norm(wrench[:, :2], axis=1) / wrench[:, 2]))
 
