@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from guiderail.models.errors import InputError
+from guiderail.models.skills import Command, Skill, SkillState, Transition, load_skill
+from guiderail.models.skills import active_constraints as ac
 from guiderail.models.skills import input_mappings as im
-from guiderail.models.skills import load_skill
+from guiderail.models.skills import transition_distances as td
 from guiderail.models.skills.geometry import angle_between
 
 PERIOD = 0.01
@@ -200,3 +203,102 @@ def test_the_length_of_an_axis_multiplies_the_speed():
         for length in (1.0, 2.0)
     ]
     np.testing.assert_allclose(moved[1].translation(), 2 * moved[0].translation())
+
+
+REACH = 0.125  # [m] of one step of the skills below, and a number that arithmetic keeps to the last bit
+
+
+class UpTo(ac.ActiveConstraint):
+    """Says how far x is beyond a limit, and projects nothing: only a shorter displacement gets inside."""
+
+    frame_names = ()
+
+    def __init__(self, limit):
+        self.limit = limit
+
+    def project(self, X_WE, frames):
+        return RigidTransform(X_WE)
+
+    def violation(self, X_WE, frames):
+        return max(0.0, X_WE.translation()[0] - self.limit)
+
+
+def one_state(*constraints, name="only", **numbers):
+    numbers = {"starts_at": 1.0, "ends_at": 0.0, **numbers}
+    return SkillState(name, (im.Translation((0, 1, 2), 1.0),), constraints, td.Height("world"), **numbers)
+
+
+def one(*constraints):
+    return Skill("one", 3, (), (one_state(*constraints),), 0, REACH, 1.0)
+
+
+def shifted(x):
+    return RigidTransform([x, 0.0, 0.0])
+
+
+def floor_and_ceiling(floor, ceiling):
+    return one(ac.HalfSpace((0.0, 0.0, 1.0), floor), ac.HalfSpace((0.0, 0.0, -1.0), -ceiling))
+
+
+def test_a_nanometre_outside_is_inside_and_more_is_not():
+    """A floor above a ceiling: what the ceiling leaves is outside of the floor by their distance."""
+    X = RigidTransform()
+    for floor, fraction in ((1e-9, 1.0), (1.5e-9, 0.0)):
+        assert floor_and_ceiling(floor, 0.0).command(0, X, X, {}, 1.0).fraction == fraction
+        assert floor_and_ceiling(floor, 0.0).can_enter(0, X, {}, 1.0) == (fraction == 1.0)
+
+
+@pytest.mark.parametrize("halvings", range(9))
+def test_a_displacement_is_halved_until_it_is_inside_seven_times_at_most(halvings):
+    skill = one(UpTo(0.75 * 0.5 ** (halvings - 1) * 0.0625))
+    command = skill.command(0, RigidTransform(), shifted(0.0625), {}, 1.0)
+    fraction = 0.5**halvings if halvings < 8 else 0.0
+    assert command.fraction == fraction
+    assert command.X_WE.translation()[0] == pytest.approx(0.0625 * fraction, abs=1e-15)
+
+
+def test_the_whole_reach_is_within_reach():
+    there = shifted(REACH)
+    assert one().command(0, RigidTransform(), there, {}, 1.0) == Command(there, 1.0)
+    assert one(UpTo(0.75 * REACH)).command(0, RigidTransform(), there, {}, 1.0).fraction == 0.5
+    beyond = one(ac.HalfSpace((1.0, 0.0, 0.0), REACH))
+    assert beyond.can_enter(0, RigidTransform(), {}, 1.0)
+    assert beyond.can_enter(0, shifted(0.5 * REACH), {}, 1.0)
+    assert not beyond.can_enter(0, shifted(-1e-6), {}, 1.0)
+
+
+def test_who_may_not_move_keeps_the_last_command_itself():
+    X_WLast = shifted(0.0)
+    command = one(UpTo(0.0)).command(0, X_WLast, shifted(0.1), {}, 1.0)
+    assert command.X_WE is X_WLast
+    assert command.fraction == 0.0
+
+
+def test_who_is_led_inside_goes_no_further_than_the_constraints_say():
+    led = floor_and_ceiling(0.0, -0.02).command(0, RigidTransform([0.0, 0.0, 0.04]), RigidTransform(), {}, 1.0)
+    assert led == Command(led.X_WE, 0.0)
+    np.testing.assert_allclose(led.X_WE.translation(), [0.0, 0.0, -0.02], atol=1e-15)
+
+
+def test_a_request_out_of_all_proportion_still_slides_along_a_wall():
+    """Brought within reach before it is projected, however far away it is: as far along the wall as one step goes."""
+    skill = one(ac.Box((-1.0, -1.0, -1.0), (0.0, 1e9, 1.0), "world"))
+    for far in (1.0, 1e4, 1e8):
+        command = skill.command(0, RigidTransform(), RigidTransform([far, far, 0.0]), {}, 1.0)
+        np.testing.assert_allclose(command.X_WE.translation(), [0.0, REACH / np.sqrt(2), 0.0], rtol=1e-7, atol=1e-9)
+
+
+def test_what_is_not_said_of_a_skill():
+    skill = one()
+    assert skill.parameters == {}
+    assert skill.states[0].weight == 1.0
+    with pytest.raises(InputError, match=r"one has no state 'onyl'.*did you mean only"):
+        skill.index("onyl")
+
+
+def test_the_progress_of_states_that_go_round_ends():
+    a, b, c = (
+        one_state(name=name, transitions=(Transition(to, 0.5),)) for name, to in (("a", "b"), ("b", "c"), ("c", "b"))
+    )
+    skill = Skill("round", 3, (), (a, b, c), 0, REACH, 1.0)
+    assert [skill.progress(number, RigidTransform(), {}) for number in range(3)] == [1.0, 2.0, 3.0]
