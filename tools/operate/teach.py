@@ -20,6 +20,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 
 from guiderail.diagrams.cameras import add_meshcat
 from guiderail.diagrams.make import make_station, resolve
+from guiderail.diagrams.scene import Viewpoint
 from guiderail.diagrams.stations.station import POSE_SIZE
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.demonstrations.bnc_connector import NAMES
@@ -27,6 +28,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.demonstrated_bounds import demonstrated_bounds
 from guiderail.models.units import DEGREE, MM
+from guiderail.tools.operate.force_gauge import ForceGauge
 
 # Of each output: how far from its start the slider goes, its step, and the keys that lower and raise it.
 SLIDERS = {
@@ -51,9 +53,7 @@ DEAD_ZONE = 0.15
 SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])  # of the command, a second
 SLOWLY = 0.25  # times real time
 SNAPSHOT = 1.0  # [s] that one undo takes back
-FORCE_LENGTH = 2.0 * MM  # of the arrow, for each newton
 FORCE_EVERY = 5  # control steps: a page that is sent more than it draws falls behind
-BAR = 30.0  # [N] a full bar
 LEAST_SAMPLES = 10
 REST = 0.1  # [s] for which the command may stay where it is in a demonstration
 NEAREST = 1.0 * MM  # that a page's camera sees
@@ -104,7 +104,8 @@ class Teaching:
         self._pristine = self.simulator.get_context().Clone()
         self._clicks: dict[str, int] = {}
         self._slow = False
-        look_at(self.meshcat, self.task)
+        view = look_at(self.meshcat, self.task)
+        self.gauge = None if view is None else ForceGauge(self.meshcat, view, self.task.collision.above)
         for name, (reach, step, lower, higher, _) in SLIDERS.items():
             self.meshcat.AddSlider(name, -reach, reach, step, 0.0, lower, higher)
         for name, key in BUTTONS.items():
@@ -156,8 +157,8 @@ class Teaching:
         self.taken.commands.append(self.command.copy())
         self.steps += 1
         self.simulator.AdvanceTo(self.steps * self._period)
-        if self.steps % FORCE_EVERY == 0:
-            self._show_force()
+        if self.gauge is not None and self.steps % FORCE_EVERY == 0:
+            self.gauge.show(self._force())
 
     def undo(self) -> None:
         """Takes the last second back: robot, parts, command and sliders. Where nothing was shown there is none."""
@@ -275,20 +276,11 @@ class Teaching:
                 value = self.meshcat.GetSliderValue(name) + sign * stick * speed * self._period
                 self.meshcat.SetSliderValue(name, float(np.clip(value, -reach, reach)))
 
-    def _show_force(self) -> None:
-        """The contact's force as an arrow at the tool, and its size as a bar that turns red at the limit."""
+    def _force(self) -> np.ndarray:
+        """What the part feels, (3,) in the world [N]."""
         context = self.station.GetMyContextFromRoot(self.simulator.get_context())
         force = self.station.get_wrench_output_port().Eval(context)[:3]
-        pose = self.station.get_pose_output_port().Eval(context)
-        X_WT = self.task.world().X_WT
-        tip = X_WT.multiply(pose[:3])
-        ends = np.column_stack([tip, tip + X_WT.rotation().multiply(force) * FORCE_LENGTH])
-        size = float(np.linalg.norm(force))
-        red = Rgba(0.9, 0.15, 0.1, 1.0) if size > 0.7 * self.task.collision.above else Rgba(0.1, 0.5, 0.9, 1.0)
-        self.meshcat.SetLine("/guiderail/force", ends, 4.0, red)
-        foot = X_WT.multiply(np.array([0.03, 0.0, 0.0]))
-        bar = np.column_stack([foot, foot + [0.0, 0.0, 0.03 * min(size / BAR, 1.0) + 1e-4]])
-        self.meshcat.SetLine("/guiderail/force_bar", bar, 12.0, red)
+        return np.asarray(self.task.world().X_WT.rotation().multiply(force))
 
     def _draw_tube(self, mean: np.ndarray, spread: np.ndarray) -> None:
         X_WT: RigidTransform = self.task.world().X_WT
@@ -321,12 +313,13 @@ def without_rests(period: float, commands: np.ndarray) -> tuple[np.ndarray, np.n
     return period * np.arange(len(kept)), commands[kept]
 
 
-def look_at(meshcat: Any, task: Any) -> None:
-    """Opens a page with the view of a task's scene, near enough to see parts of a centimetre."""
+def look_at(meshcat: Any, task: Any) -> Viewpoint | None:
+    """Opens a page with the view of a task's scene, near enough to see parts of a centimetre; returns it."""
     view = task.scene().viewpoint
     if view is not None:
         meshcat.SetProperty("/Cameras/default/rotated/<object>", "near", NEAREST)
         meshcat.SetCameraPose(*(np.array(point) for point in view))
+    return view
 
 
 def teach(

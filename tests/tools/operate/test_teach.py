@@ -9,6 +9,7 @@ from guiderail.models import writing
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.operate import teach as teaching
+from guiderail.tools.operate.force_gauge import CALM, LENGTH, PATH, RED, ForceGauge
 from guiderail.tools.operate.teach import BUTTONS, DISCARD, END, KEEP, SLIDERS, SLOW, UNDO, Teaching
 
 
@@ -18,6 +19,7 @@ class Page:
     def __init__(self):
         self.sliders, self.clicks, self.lines = {}, dict.fromkeys(BUTTONS, 0), {}
         self.gamepad = SimpleNamespace(index=None, axes=[])
+        self.poses, self.properties = {}, {}
 
     def AddSlider(self, name, low, high, step, value, lower, higher):
         self.sliders[name] = value
@@ -38,7 +40,13 @@ class Page:
         return self.gamepad
 
     def SetProperty(self, path, name, value):
+        self.properties[path, name] = value
+
+    def SetObject(self, path, shape, colour):
         pass
+
+    def SetTransform(self, path, pose):
+        self.poses[path] = np.array(pose)
 
     def SetCameraPose(self, eye, target):
         self.lines["camera"] = np.array([eye, target])
@@ -77,10 +85,28 @@ def test_the_robot_follows_and_its_force_is_shown(session):
     session.begin()
     lead(session, "x [mm]", 3.0, 15)  # beside the holes
     lead(session, "z [mm]", -12.0, 60)
-    arrow = session.meshcat.lines["/guiderail/force"]
-    assert (
-        np.linalg.norm(arrow[:, 1] - arrow[:, 0]) > teaching.FORCE_LENGTH
-    )  # more than a newton: it stands on something
+    force = session._force()
+    assert force[2] > 1.0  # it stands on something
+    shaft, bar = (session.meshcat.poses[f"{PATH}/{part}"] for part in ("shaft", "bar"))
+    # The arrow points where the force does, and is as long as its share of the limit.
+    full = np.linalg.norm(np.subtract(*session.meshcat.lines["camera"])) * LENGTH
+    share = np.linalg.norm(force) / session.task.collision.above
+    np.testing.assert_allclose(shaft[:3, 2], force / np.linalg.norm(force) * share * full, rtol=1e-9)
+    assert bar[2, 2] == pytest.approx(share * full)
+
+
+@pytest.mark.parametrize(("newtons", "share", "colour"), [(6.9, 0.69, CALM), (7.1, 0.71, RED), (80.0, 1.0, RED)])
+def test_the_bar_is_full_at_the_limit_and_red_before(newtons, share, colour):
+    page = Page()
+    gauge = ForceGauge(page, ((0.0, -2.0, 1.0), (0.0, 0.0, 1.0)), limit=10.0)
+    gauge.show(np.array([newtons, 0.0, 0.0]))
+    assert page.poses[f"{PATH}/bar"][2, 2] == pytest.approx(share * 2.0 * LENGTH)
+    np.testing.assert_allclose(page.poses[f"{PATH}/shaft"][:3, 2], [share * 2.0 * LENGTH, 0, 0], atol=1e-12)
+    assert page.properties[f"{PATH}/bar/<object>", "color"] == list(colour)
+    # The arrow stands right of the part, the bar left of it, as the camera looks along y.
+    assert page.poses[f"{PATH}/shaft"][0, 3] > 0.1 > -0.1 > page.poses[f"{PATH}/bar"][0, 3]
+    gauge.show(np.zeros(3))
+    assert all(np.isfinite(pose).all() and abs(np.linalg.det(pose)) > 0 for pose in page.poses.values())
 
 
 def test_undo_takes_a_second_back(session):
