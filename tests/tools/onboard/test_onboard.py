@@ -13,6 +13,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models import writing
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
+from guiderail.tools.onboard.onboard import rank
 from guiderail.tools.viewing import replay
 
 pytest.importorskip("trimesh")
@@ -50,6 +51,19 @@ def test_what_was_measured_is_what_was_drawn(folder):
     page = (folder / "preview.html").read_text()
     assert "plug" in page
     assert len(page) > 100_000
+
+
+def test_of_contacts_the_fastest_is_chosen_that_is_nowhere_too_deep_or_else_the_least_deep():
+    allowed = 1e-4
+    tried = {
+        "fast": rank(True, 0.9e-4, allowed, 3.0),
+        "shallow and slow": rank(True, 0.2e-4, allowed, 2.5),
+        "a little too deep": rank(True, 1.1e-4, allowed, 2.1),
+        "far too deep, and fast": rank(True, 2.3e-4, allowed, 4.4),
+        "not too deep, and unbearably slow": rank(True, 1.05e-4, allowed, 1.4),
+        "does not seat": rank(False, 0.1e-4, allowed, 9.0),
+    }
+    assert sorted(tried, key=tried.get, reverse=True) == list(tried)
 
 
 def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
