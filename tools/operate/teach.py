@@ -345,6 +345,8 @@ def teach(
     say(f"Teach at {url} (from elsewhere: ssh -L {session.meshcat.port()}:localhost:{session.meshcat.port()}).")
     keys = ", ".join(f"{low[-1]} and {high[-1]} {name.split()[0]}" for name, (_, _, low, high, _) in SLIDERS.items())
     say(f"Keys: {keys}; Enter keeps, Backspace discards, U undoes, M is slow motion, Escape ends.")
+    limit = session.task.collision.above
+    say(f"Sliders and buttons: Open Controls, upper right. The arrow is the force; at {limit:g} N the bar is full.")
     while wait and session.meshcat.GetNumActiveConnections() == 0:
         time.sleep(0.1)
     try:
