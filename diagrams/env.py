@@ -280,6 +280,8 @@ class GuidedEnv(DrakeGymEnv):
 
     def _checked(self, action) -> np.ndarray:
         try:
+            if np.iscomplexobj(action):
+                raise TypeError
             action = np.asarray(action, dtype=float)
         except (TypeError, ValueError):
             raise InputError(f"an action is {self._neutral.size} numbers in [-1, 1], not {action!r}") from None

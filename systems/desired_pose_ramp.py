@@ -89,6 +89,8 @@ class DesiredPoseRamp(LeafSystem):
             return self._pose_port.Eval(context)
         last = context.get_discrete_state(self._last).value()
         desired = self._desired_pose_port.Eval(context)
+        if not np.isfinite(desired).all():
+            return last  # or it would be no number for ever
         change = desired - last
         change[3:] = (change[3:] + np.pi) % (2.0 * np.pi) - np.pi
         distance = float(np.linalg.norm(change[:3]))

@@ -77,12 +77,18 @@ class LcNsKmpSystem(LeafSystem):
 
         Raises:
             InputError: if a gain has the wrong shape or is not finite, the period is not positive, or a shorter history
-                is not shorter.
+                is not shorter, has a length that another has, or other constraints.
         """
         super().__init__()
         outputs = primitive.num_outputs
         if any(not 0 < other.history < primitive.history for other, _ in shorter):
             raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
+        if len({other.history for other, _ in shorter}) < len(shorter):
+            raise InputError("two shorter histories are of one length")
+        for other, _ in shorter:
+            mine, its = primitive.constraints, other.constraints
+            if not (np.array_equal(mine.G, its.G) and np.array_equal(mine.c, its.c)):
+                raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
         check_period(period)
         self._primitive, self._period = primitive, period
         self._by_history_length = {
@@ -161,7 +167,7 @@ class LcNsKmpSystem(LeafSystem):
         return self._constraint_violation_port
 
     def get_fallback_output_port(self) -> OutputPort:
-        """1 where the last safe command is repeated, (1,)."""
+        """1 where the command is what is nearest to the last one within the constraints, (1,)."""
         return self._fallback_port
 
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -185,7 +191,9 @@ class LcNsKmpSystem(LeafSystem):
         try:
             output, fallback = primitive.predict(step, action, history).output, 0.0
         except UnsolvableError:
-            output, fallback = np.array(context.get_discrete_state(self._last_safe).value()), 1.0
+            # What was safe a step ago need not be now, where constraints change on the way.
+            last_safe = context.get_discrete_state(self._last_safe).value()
+            output, fallback = primitive.constraints.nearest(last_safe, step), 1.0
         return _Command(step, output, fallback)
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:

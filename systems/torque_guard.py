@@ -271,10 +271,12 @@ class TorqueGuard(LeafSystem):
 
     def stop(self, context: Context) -> None:
         """Stops the arm because somebody asks for it; `context` is this system's."""
-        memory = context.get_discrete_state(self._memory).value().copy()
-        if memory[_PHASE] in (Phase.WAITING, Phase.RAMPING, Phase.RUNNING):
-            memory[:] = [Phase.DAMPING, Fault.ASKED, 0.0, 0.0]
-            context.SetDiscreteState(self._memory, memory)
+        phase = context.get_discrete_state(self._memory).value()[_PHASE]
+        if phase == Phase.WAITING:
+            # Of an arm that was never taken over no speed is believed yet, and there is no last command to take back.
+            context.SetDiscreteState(self._memory, [Phase.OFF, Fault.ASKED, np.inf, 0.0])
+        elif phase in (Phase.RAMPING, Phase.RUNNING):
+            context.SetDiscreteState(self._memory, [Phase.DAMPING, Fault.ASKED, 0.0, 0.0])
 
     def resume(self, context: Context) -> None:
         """Goes on after a stop, from where the arm is; `context` is this system's.

@@ -29,6 +29,7 @@ def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[st
         from guiderail.models.skills.loader import shipped_skills
 
         if str(file) in shipped_skills():
+            _refuse_fit(fit)
             return check_skill(file, draw)
         raise InputError(
             f"there is no file {file}: name demonstrations (.npz, .csv, a folder), a skill (.yaml) or one of "
@@ -37,8 +38,14 @@ def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[st
     if file.suffix in ENDINGS or file.is_dir():
         return check_demonstrations(file, draw) | (fitted(file) if fit else {})
     if file.suffix in SKILLS:
+        _refuse_fit(fit)
         return check_skill(file, draw)
     raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv, a skill is .yaml")
+
+
+def _refuse_fit(fit: bool) -> None:
+    if fit:
+        raise InputError("--fit is of demonstrations, and this is a skill: leave it out")
 
 
 def check_demonstrations(file: Path, draw: Path | None = None) -> dict[str, Any]:

@@ -564,6 +564,7 @@ def report(
     episodes: Annotated[
         int, _opt("Held-out episodes to judge each run on that no study judged; what was judged is used again.")
     ] = 0,
+    as_json: Json = False,
 ) -> None:
     """Write what runs or a study came to as one page.
 
@@ -573,7 +574,8 @@ def report(
     """
     from guiderail.tools.report.report import write_report
 
-    typer.echo(write_report(runs, out, episodes=episodes))
+    page = write_report(runs, out, episodes=episodes)
+    typer.echo(json.dumps({"page": str(page)}) if as_json else page)
 
 
 @command("results studies --out docs/results")
@@ -647,6 +649,7 @@ def stress(
     ] = None,
     env: Env = None,
     imports: OwnTask = None,
+    as_json: Json = False,
 ) -> None:
     """Try to make a task fail by actions that no policy sends.
 
@@ -665,7 +668,7 @@ def stress(
         "environment": _environment(env),
     }
     found = stress_task(_named(task, imports)[0], say=_say, **how)
-    typer.echo(json.dumps(found, indent=2))
+    typer.echo(json.dumps(found, indent=None if as_json else 2))
     raise typer.Exit(1 if found["wrong"] else 0)
 
 

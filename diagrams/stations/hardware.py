@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time as wall_time
 from collections.abc import Sequence
 
 import numpy as np
@@ -59,8 +60,9 @@ def _encode_iiwa(time: float, torque: np.ndarray) -> bytes:
 
 
 def _encode_panda(time: float, torque: np.ndarray) -> bytes:
+    del time  # Drake's driver for a Panda drops what is not of about now, by the clock that machines agree on
     command = lcmt_panda_command()
-    command.utime = round(time / MICROSECOND)
+    command.utime = wall_time.time_ns() // 1000
     command.num_joint_torque, command.joint_torque = len(torque), torque.tolist()
     command.control_mode_expected = lcmt_panda_status.CONTROL_MODE_TORQUE
     return command.encode()

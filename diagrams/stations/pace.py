@@ -130,7 +130,9 @@ class RealTime:
     """Advances a hardware station by the wall's clock: a step for each status, as it arrives.
 
     Where none comes for one and a half periods a step goes without, and the station's watchdog notices. Of statuses
-    that came while this program was held up only the newest counts: it never hurries after the time that it lost.
+    that came while this program was held up only the newest counts: it never hurries after the time that it lost. Nor
+    does a robot that speaks more often than every period hurry it: a station's time is never more than half a period
+    ahead of the wall's.
 
     Attributes:
         gaps: between steps.
@@ -153,11 +155,13 @@ class RealTime:
         self._lcm, self._period, self._rate = lcm, period, rate
         self._statuses = NewMessages(lcm, channel)
         self._taken, self._last = 0, time.monotonic()
+        self._due = self._last  # the next step's time
 
     def begin(self) -> None:
         """Called when a simulator was initialized, with the newest status."""
         self._lcm.HandleSubscriptions(0)
         self._taken, self._last = self._statuses.count, time.monotonic()
+        self._due = self._last + self._period / self._rate
 
     def advance(self, simulator: Simulator, station: Clocked, steps: int) -> None:
         """Advances by so many statuses."""
@@ -168,6 +172,8 @@ class RealTime:
             self._taken, now = self._statuses.count, time.monotonic()
             self.gaps.add(now - self._last)
             self._last = now
+            period = self._period / self._rate
+            self._due = max(self._due, now - 0.5 * period) + period
             # What happens at an instant belongs to the clock of that instant, and Drake has left it for the next step.
             simulator.AdvancePendingEvents()
             station.tell_time(context, now * self._rate)
@@ -176,7 +182,7 @@ class RealTime:
     def _wait(self) -> None:
         # Whoever floods the bus doesn't set the pace.
         period = self._period / self._rate
-        time.sleep(max(self._last + 0.5 * period - time.monotonic(), 0.0))
+        time.sleep(max(self._last + 0.5 * period - time.monotonic(), self._due - 0.5 * period - time.monotonic(), 0.0))
         end = self._last + 1.5 * period
         while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
             self._lcm.HandleSubscriptions(max(1, int(1000 * left)))

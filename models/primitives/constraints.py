@@ -34,6 +34,8 @@ class LinearConstraints:
         if not (np.isfinite(self.G).all() and np.isfinite(self.c).all()):
             raise InputError("constraints must be finite: leave out the rows that do not constrain anything")
         self._refuse_contradictions()
+        for values in (self.G, self.c):
+            values.setflags(write=False)  # primitives of a process share it
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike) -> "LinearConstraints":

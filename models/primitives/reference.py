@@ -47,6 +47,8 @@ class ReferenceTrajectory:
         if not (np.diff(self.times) > 0).all():
             raise InputError("the reference's times must increase strictly")
         self._check_covariances()
+        for values in (self.times, self.means, self.covariances):
+            values.setflags(write=False)  # skills and environments of a process share it
         step = (self.times[-1] - self.times[0]) / (n - 1)
         grid = self.times[0] + step * np.arange(n)
         #: True if all time steps are the same up to rounding.

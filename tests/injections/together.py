@@ -5,7 +5,14 @@ from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa, saf
 
 
 class Together:
-    """A pace: steps both in turn; at some step something may happen."""
+    """A pace: steps both in turn; at some step something may happen.
+
+    Attributes:
+        clock: on the wall [s], where the station is told the time; it passes as the robot's does, and whatever else
+            takes time adds to it.
+    """
+
+    clock: float | None = None
 
     def __init__(self, workcell, lcm, start, deputy=True):
         self.robot = SimulatedIiwa(workcell, lcm)
@@ -27,4 +34,8 @@ class Together:
             self.happens.get(self.step, lambda: None)()
             if not self.is_silent:
                 self.simulator.AdvanceTo(self.step * IIWA_DRIVER.period)
+            if self.clock is not None:
+                self.clock += IIWA_DRIVER.period
+                simulator.AdvancePendingEvents()
+                station.tell_time(simulator.get_mutable_context(), self.clock)
             simulator.AdvanceTo(start + (step + 1) * IIWA_DRIVER.period)

@@ -78,3 +78,12 @@ def test_what_keeps_to_the_speed_is_passed_on_as_it_is():
 def test_refuses_what_makes_no_sense(wrong):
     with pytest.raises(InputError):
         DesiredPoseRamp(**({"period": PERIOD} | wrong))
+
+
+def test_a_pose_that_is_no_number_is_not_remembered():
+    ramped = Ramped(MEASURED + 0.01).take_over()
+    before = ramped.go(4)[-1]
+    ramped.desired.GetMutableData().set_value([np.nan, *MEASURED[1:]])
+    np.testing.assert_array_equal(ramped.go(2)[-1], before)
+    ramped.desired.GetMutableData().set_value(MEASURED)
+    np.testing.assert_allclose(ramped.go(4)[-1], MEASURED)

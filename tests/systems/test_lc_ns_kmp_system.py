@@ -135,6 +135,28 @@ def test_repeats_the_last_safe_command_where_there_is_no_solution_and_says_so():
     assert (outputs[:, 6] != outputs[:, 4]).any()
 
 
+def test_where_constraints_change_on_the_way_a_fallback_is_within_those_of_its_own_step():
+    """What was safe a step ago may be outside now; nothing that was not checked is sent."""
+    upper = np.linspace(0.3, -0.4, 50)
+    c = np.tile(LinearConstraints.box([-np.inf, -np.inf], [0.0, np.inf]).c, (50, 1)) - upper[:, None]
+    G = np.tile(LinearConstraints.box([-np.inf, -np.inf], [0.0, np.inf]).G, (50, 1, 1))
+    p = LcNsKmp(primitive().reference, history=0, horizon=8, constraints=LinearConstraints(G, c))
+
+    def never(*arguments):
+        raise UnsolvableError("no")
+
+    p.predict = never
+    system = LcNsKmpSystem(p, None, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    for step in range(50):
+        simulator.AdvanceTo(step * PERIOD + 1e-6)
+        assert system.get_output_output_port().Eval(context)[0] <= upper[step] + 1e-9
+        assert system.get_constraint_violation_output_port().Eval(context)[0] <= 1e-9
+        assert system.get_fallback_output_port().Eval(context)[0] == 1.0
+
+
 def test_first_fallback_is_within_the_constraints():
     p = primitive(history=0, upper=-0.5)
 
@@ -170,6 +192,15 @@ def test_the_history_length_selects_the_primitive_which_gets_the_newest_part():
 def test_refuses_a_shorter_history_that_is_not(history):
     with pytest.raises(InputError, match="shorter history has 1 to 2"):
         LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(primitive(history), np.ones(2))])
+
+
+@pytest.mark.parametrize(
+    ("shorter", "words"),
+    [([primitive(1, upper=0.4)], "other constraints"), ([primitive(1), primitive(1)], "of one length")],
+)
+def test_refuses_shorter_histories_that_are_another_skill(shorter, words):
+    with pytest.raises(InputError, match=words):
+        LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(one, np.ones(2)) for one in shorter])
 
 
 def test_without_constraints_the_violation_is_a_finite_number():

@@ -251,6 +251,21 @@ def test_stops_when_asked(plant):
     assert (guarded.phase, guarded.fault) == (Phase.OFF, Fault.ASKED)
 
 
+def test_an_arm_that_was_never_taken_over_is_stopped_without_a_word(plant):
+    """While statuses are not believed yet there is no speed to damp and nothing to take back."""
+    guarded = Guarded(plant, running=False)
+    guarded.set(status_fault=[Fault.NO_STATUS])
+    guarded.simulator.Initialize()
+    guarded.go(10 * PERIOD)
+    assert guarded.phase == Phase.WAITING
+    guarded.system.stop(guarded.context)
+    assert (guarded.phase, guarded.fault) == (Phase.OFF, Fault.ASKED)
+    for _ in range(100):
+        guarded.go(PERIOD)
+        assert guarded["sending"][0] == 0.0
+        np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
+
+
 def test_only_a_stopped_arm_goes_on(plant):
     guarded = Guarded(plant)
     with pytest.raises(InputError, match="is running"):

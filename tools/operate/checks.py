@@ -28,13 +28,14 @@ class Check:
     is_well: bool = True
 
 
-def check_robot(station: HardwareStation, context: Context, start: np.ndarray) -> list[Check]:
+def check_robot(station: HardwareStation, context: Context, start: np.ndarray, commands: int) -> list[Check]:
     """What the robot's statuses say, and what is assumed of it.
 
     Args:
         station: that has heard it for a moment.
         context: the root context, of a simulator of the station alone.
         start: where the skill starts, (6,).
+        commands: how many the robot was sent meanwhile, by whomever.
     """
     plant, arm = station.known.plant, station.known.arm
     pose = station.get_pose_output_port().Eval(context)
@@ -53,6 +54,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray) -
     load = station.load_of_force(positions).max()
     limits, has_deputy = station.limits, station.has_deputy(context)
     nobody = "nobody stands by: start guiderail stand-by on the driver's machine"
+    somebody = "somebody commands it: end the other program, or wait until the deputy has brought the arm to rest"
     by_itself = "needed by no driver of this kind: it stops by itself where commands stop"
     return [
         Check("robot", f"{name}, {len(positions)} joints, {station.driver.status_channel}"),
@@ -66,6 +68,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray) -
             f"{np.rad2deg(positions).round(1).tolist()} degrees",
             bool((lower < positions).all() and (positions < upper).all()),
         ),
+        Check("commands", somebody if commands else "nobody else commands it", not commands),
         Check("standstill", f"fastest joint {fastest:.3f} rad/s", fastest < STANDSTILL),
         Check("payload", f"{payload:.2f} kg bolted to the flange, as the robot must have been told"),
         Check("load", f"{force:.1f} N felt at rest", force < UNLOADED),

@@ -67,30 +67,36 @@ def evaluate_on_robot(
     environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
     config = replace(config, environment=environment)
     path = (out or run / "hardware") / f"episodes{'-' * bool(policy)}{policy}.csv"
-    if path.exists():
-        raise InputError(f"{path} already exists: name another folder with --out, or remove it")
     path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.touch(exist_ok=False)  # so that nobody else writes it meanwhile
+    except FileExistsError:
+        raise InputError(f"{path} already exists: name another folder with --out, or remove it") from None
     rows: list[dict[str, Any]] = []
 
     def write(rows: list[dict[str, Any]]) -> None:
         if rows:
             write_atomically(path, table_text(pd.DataFrame(rows)).encode())
 
-    with at_robot(config, other, yes=yes, say=say) as robot:
-        env = robot.env
-        act = learned if acting is None else acting(env)
-        assert act is not None
-        with no_pauses(), EpisodeProgress(episodes, name=policy or config.task, window=None) as progress:
-            try:
-                for index in range(episodes):
-                    rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.rehearse))
-                    env.idle()
-                    write(rows)
-                    env.idle()
-                    progress.update(rows[-1])
-            finally:
+    try:
+        with at_robot(config, other, yes=yes, say=say) as robot:
+            env = robot.env
+            act = learned if acting is None else acting(env)
+            assert act is not None
+            with no_pauses(), EpisodeProgress(episodes, name=policy or config.task, window=None) as progress:
                 try:
-                    env.rest()
+                    for index in range(episodes):
+                        rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.rehearse))
+                        env.idle()
+                        write(rows)
+                        env.idle()
+                        progress.update(rows[-1])
                 finally:
-                    write(rows)  # of the last episode too, where nobody let the arm go on
+                    try:
+                        env.rest()
+                    finally:
+                        write(rows)  # of the last episode too, where nobody let the arm go on
+    finally:
+        if not rows:
+            path.unlink(missing_ok=True)
     return {"rows": str(path), **summary(pd.DataFrame(rows), FOUND)}

@@ -52,21 +52,26 @@ class Other:
         if file is None:
             return cls(**given)
         said = load_scenario(file)
-        given |= {"lcm_url": said.lcm_url or given.get("lcm_url", ""), "robot": said.robot, "scenario": file}
-        return cls(**given | {"rehearse": said.is_simulated or given.get("rehearse", False)})
+        rehearse = said.is_simulated or given.get("rehearse", False)
+        url = given.get("lcm_url", "") if rehearse else said.lcm_url or given.get("lcm_url", "")
+        return cls(**given | {"lcm_url": url, "robot": said.robot, "scenario": file, "rehearse": rehearse})
 
     def __post_init__(self) -> None:
         if self.lockstep and not self.rehearse:
             raise InputError("a real robot waits for nobody: --lockstep is for a rehearsal")
         if self.rehearse and self.robot != DEFAULT_ROBOT:
             raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver to rehearse with, not {self.robot}")
+        if self.rehearse and self.lcm_url:
+            raise InputError(
+                "a rehearsal has a bus of its own, so that no real driver ever hears it: leave --lcm-url out"
+            )
         if not 0.0 < self.rate <= 1.0:
             raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {self.rate}")
 
     def environment(self, station: str) -> dict[str, Any]:
         """Options of an environment whose station is there."""
         url = self.lcm_url
-        if self.rehearse and not url:
+        if self.rehearse:
             # With a time to live of zero no message leaves this machine.
             url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
         options: dict[str, Any] = {"station": station, "lcm_url": url, "robot": self.robot}

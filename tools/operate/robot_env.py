@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.env import GuidedEnv
 from guiderail.diagrams.stations.hardware import HardwareStation
-from guiderail.diagrams.stations.pace import Pace
+from guiderail.diagrams.stations.pace import NewMessages, Pace
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import FAULTS, Fault
@@ -26,6 +26,7 @@ from guiderail.tools.operate.keys import Keys
 PULL, GIVES_WAY, LEAST_PULL = 3.0 * MM, 1.0 * MM, 1.5  # [m] commanded, [m] followed at most, [N] felt at least
 PULL_STEPS = 25  # control steps
 LISTENING = 20  # statuses before anything is judged
+LEVER = 0.1  # [m/rad] for which a turn counts where the nearest of several poses is looked for
 PATIENCE = 10.0  # [s] until an arm that was told to go on does
 
 Say = Callable[[str], None]
@@ -89,6 +90,7 @@ class RobotEnv(GuidedEnv):
         self._acting, self._is_in_step = elsewhere, False
         self._moving = self._initialized()
         # A deputy may need a status or two to be heard; nothing is sent so soon.
+        self._heard = NewMessages(self._elsewhere.lcm, self._elsewhere.driver.command_channel)
         self._pass(LISTENING)
         self._way_back: list[np.ndarray] = []
         self.fault = Fault.NONE
@@ -110,7 +112,7 @@ class RobotEnv(GuidedEnv):
 
     def checks(self) -> list[Check]:
         """What the robot's first statuses say, and what is assumed of it: before anything moves."""
-        return check_robot(self._elsewhere, self._moving.get_context(), self._start)
+        return check_robot(self._elsewhere, self._moving.get_context(), self._start, self._heard.count)
 
     def _initialized(self) -> Simulator:
         simulator = Simulator(self._elsewhere)
@@ -246,6 +248,21 @@ class RobotEnv(GuidedEnv):
             )
         gc.collect()
 
+    def _find_the_way(self) -> None:
+        """At a crawl to the way back, where it is nearest, if the arm was moved by hand meanwhile."""
+        here = self.pose
+        if not self._way_back or is_near(here, self._way_back[-1]):
+            return
+        apart = [away + LEVER * turned for away, turned in (distance(here, pose) for pose in self._way_back)]
+        nearest = int(np.argmin(apart))
+        del self._way_back[nearest + 1 :]
+        there = self._way_back[nearest]
+        away, turned = distance(here, there)
+        self._say(
+            f"the arm was moved: back to its way, {away / MM:.0f} mm and {np.rad2deg(turned):.0f} degrees, at a crawl"
+        )
+        self._way_back.extend(crawl(here, there, self.task.control_period)[::-1])
+
     def _crawl_to_start(self) -> None:
         for pose in crawl(self.pose, self._start, self.task.control_period):
             self._command(pose)
@@ -282,7 +299,11 @@ class RobotEnv(GuidedEnv):
             return
         fault = Fault(int(self._acting.get_fault_output_port().Eval(self._mine)[0]))
         self._go_on(FAULTS[fault])
+        # Nobody listened while the person thought: what is judged is a status of now, once statuses are believed again.
+        self._pace.begin()
+        self._pass(self._steps)
         self._keys.take_back()
+        self._find_the_way()
         if self._acting is self._elsewhere:
             self._elsewhere.get_desired_pose_input_port().FixValue(self._moving.get_mutable_context(), self.pose)
         for _ in range(round(PATIENCE / self.task.control_period)):

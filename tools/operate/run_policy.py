@@ -19,7 +19,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.make import make_skill, resolve
 from guiderail.diagrams.options import Options
 from guiderail.diagrams.stations.hardware import HardwareStation
-from guiderail.diagrams.stations.pace import Pace, hurry
+from guiderail.diagrams.stations.pace import NewMessages, Pace, hurry
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.assemble import SkillDiagram
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -83,6 +83,7 @@ class Operation:
         self._start = task.start(np.random.default_rng(0))
         self._simulator = self._initialized()
         # A deputy may need a status or two to be heard; nothing is sent so soon.
+        self._heard = NewMessages(self._station.lcm, self._station.driver.command_channel)
         pace.advance(self._simulator, self._station, LISTENING)
         self.trace = Trace(skill.num_steps, 6, skill.control_period, SIGNALS)
         self._joints: dict[str, list[np.ndarray]] = {name: [] for name in JOINT_SIGNALS}
@@ -96,7 +97,7 @@ class Operation:
 
     def checks(self) -> list[Check]:
         """What the robot's first statuses say, and what is assumed of it."""
-        return check_robot(self._station, self._simulator.get_context(), self._start)
+        return check_robot(self._station, self._simulator.get_context(), self._start, self._heard.count)
 
     def run(self, say: Say) -> Outcome:
         """Takes over where the arm is, approaches the skill's start at a crawl, executes it, and lets the arm rest.

@@ -49,8 +49,13 @@ def serve_iiwa(
         say: what a person is told.
 
     Raises:
-        InputError: if the task is none.
+        InputError: if the task is none, or a time or the rate is no positive number.
     """
+    for name, value in {"seconds": seconds, "patience": patience}.items():
+        if not 0.0 < value < np.inf:
+            raise InputError(f"{name} must be a positive number, not {value:g}")
+    if rate is not None and not 0.0 < rate <= 1.0:
+        raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {rate:g}")
     declared = resolve(task, {}).task
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: serve an insertion")

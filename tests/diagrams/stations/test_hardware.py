@@ -3,11 +3,12 @@
 import os
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_status
+from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
@@ -326,3 +327,11 @@ def test_all_stations_have_the_same_ports():
 def test_refuses_an_impedance_that_makes_no_sense(wrong):
     with pytest.raises(InputError):
         Impedance(**wrong)
+
+
+def test_a_pandas_commands_say_the_time_on_the_wall():
+    """Drake's driver for it drops what is older than a tenth of a second, by that clock."""
+    before = time.time_ns() // 1000
+    command = lcmt_panda_command.decode(find_driver("panda").encode(0.005, np.arange(7.0)))
+    assert before <= command.utime <= time.time_ns() // 1000
+    assert list(command.joint_torque) == list(range(7))

@@ -7,6 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
+from guiderail.diagrams.stations import pace as pace_module
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.driver import STATUS_PERIOD
 from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa
@@ -44,6 +45,44 @@ def test_a_step_for_each_status_and_without_one_after_a_while():
     assert simulator.get_context().get_time() == 5 * STATUS_PERIOD
     assert (np.diff(told.clocks) >= 0.5 * STATUS_PERIOD).all()
     assert (np.diff(told.clocks)[-2:] >= 1.5 * STATUS_PERIOD).all()
+
+
+@pytest.mark.parametrize("milliseconds", [1, 2, 4])
+def test_a_robot_that_speaks_too_often_does_not_hurry_it(monkeypatch, milliseconds):
+    """On a clock of its own, on which waiting passes time and every so often a status arrives."""
+    lcm, now, said = DrakeLcm("memq://"), 0.0, 0
+
+    def speak():
+        nonlocal said
+        while said * milliseconds <= 1000 * now:
+            lcm.Publish("STATUS", said.to_bytes(8, "big"))
+            said += 1
+
+    def sleep(seconds):
+        nonlocal now
+        now += seconds
+        speak()
+
+    class Bus:
+        def Subscribe(self, *arguments):
+            return lcm.Subscribe(*arguments)
+
+        def HandleSubscriptions(self, timeout):
+            if not lcm.HandleSubscriptions(0) and timeout:
+                sleep(1e-3)
+                lcm.HandleSubscriptions(0)
+
+    monkeypatch.setattr(pace_module.time, "monotonic", lambda: now)
+    monkeypatch.setattr(pace_module.time, "sleep", sleep)
+    pace, told = RealTime(Bus(), "STATUS"), Told()
+    simulator = Simulator(ConstantVectorSource([0.0]))
+    pace.begin()
+    pace.advance(simulator, told, 400)
+    assert told.clocks[-1] >= 399 * STATUS_PERIOD
+    # Held up once, it makes up for a step at most: from half of one behind to half of one ahead.
+    now += 1.0
+    pace.advance(simulator, told, 200)
+    assert told.clocks[-1] >= told.clocks[399] + 1.0 + 198 * STATUS_PERIOD - 1e-9
 
 
 def test_what_happens_at_an_instant_knows_the_clock_of_that_instant():

@@ -29,8 +29,12 @@ def test_one_word_switches_between_a_simulated_robot_and_a_real_one(written):
         Other.in_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
     )
     assert (simulated.rehearse, real.rehearse) == (True, False)
-    for other in (simulated, real):
-        assert (other.robot, other.environment("hardware")["lcm_url"]) == ("iiwa14", "udpm://239.255.76.67:7668?ttl=0")
+    assert (simulated.robot, real.robot) == ("iiwa14", "iiwa14")
+    assert real.environment("hardware")["lcm_url"] == "udpm://239.255.76.67:7668?ttl=0"
+    # A rehearsal never speaks where a driver may listen.
+    assert simulated.environment("hardware")["lcm_url"] != real.environment("hardware")["lcm_url"]
+    with pytest.raises(InputError, match="a bus of its own"):
+        Other(rehearse=True, lcm_url="udpm://239.255.76.67:7667")
     assert Other.in_scenario(None, robot="panda").robot == "panda"
     assert Other.in_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot == "panda"
 

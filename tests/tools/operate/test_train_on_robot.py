@@ -10,13 +10,16 @@ from injections.together import Together
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.make import make_guidance, make_station, resolve
+from guiderail.diagrams.stations.hardware import IIWA_DRIVER
 from guiderail.diagrams.tasks.assemble import assemble
 from guiderail.models.errors import InputError
 from guiderail.models.joint_status import Fault
 from guiderail.models.policy import Policy
+from guiderail.systems.torque_guard import Phase
 from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.operate.at_robot import AtRobot
+from guiderail.tools.operate.crawl import CRAWL
 from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
 from guiderail.tools.operate.keys import Keys
 from guiderail.tools.operate.rehearsal import Other
@@ -137,6 +140,57 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     assert env.asked == []
     env.reset()
     assert env.asked == ["somebody asked for it"]
+
+
+def test_an_arm_that_somebody_else_commands_is_left_alone(monkeypatch):
+    env = make(monkeypatch, START)
+
+    def check():
+        return {one.name: one.is_well for one in env.checks()}["commands"]
+
+    assert check()
+    env._elsewhere.lcm.Publish(IIWA_DRIVER.command_channel, IIWA_DRIVER.encode(1.0, np.zeros(7)))
+    env._pass(1)
+    assert not check()
+
+
+def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch):
+    """What is judged then is a status of now: not one from before the question, nor that nobody listened meanwhile."""
+    env = make(monkeypatch, START)
+    env.pace.clock = 100.0
+
+    def think(words):
+        env.asked.append(words)
+        env.pace.clock += 60.0
+
+    env._go_on = think
+    env.reset()
+    env.keys.press()
+    env.step(np.zeros(2))
+    env.reset()
+    assert env.asked == ["somebody asked for it"]
+    assert env._acting.get_phase_output_port().Eval(env._mine)[0] == Phase.RUNNING
+
+
+def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(env, monkeypatch):
+    """Not at the greatest speed that its commands may have, and not into what it was pulled out of."""
+    env.reset()
+    env.step(np.zeros(2))
+    env.keys.press()
+    env.step(np.zeros(2))
+    context = env.pace.simulator.get_mutable_context()
+    env.pace.robot.set_pose(context, env.pose + [0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
+    places, advance = [], env._advance
+
+    def watched():
+        advance()
+        places.append(env.pose[:3])
+
+    monkeypatch.setattr(env, "_advance", watched)
+    env.reset()
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / env.task.control_period
+    assert speeds.max() < 2.0 * CRAWL
+    assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
 def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought_to_rest(env):
