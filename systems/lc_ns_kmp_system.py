@@ -50,7 +50,7 @@ class LcNsKmpSystem(LeafSystem):
     history (`HistoryLengthSchedule`); each is given the newest part of ``history``, so that whichever is selected
     begins where the last command ended. ``output`` (O,) is the command. ``constraint_violation`` (1,) is max(c − G y)
     of that command: negative is slack, `UNCONSTRAINED` where there is no constraint. ``fallback`` (1,) is 1 where no
-    window within the constraints was found and the last safe command is repeated.
+    window within the constraints was found: then it is what is nearest to the last command within its own step's.
 
     The step is state and counts control periods since time zero; the output is a pure function of step, action and
     history, evaluated once a control step (see CONTRIBUTING.md, "Rates and the order of events").
