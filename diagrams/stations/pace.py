@@ -66,6 +66,16 @@ def check_handlers() -> None:
         )
 
 
+def check_rate(rate: float) -> None:
+    """Of a robot's clock to the wall's.
+
+    Raises:
+        InputError: if it is not positive, or above 1.
+    """
+    if not 0.0 < rate <= 1.0:
+        raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {rate:g}")
+
+
 class NewMessages:
     """Counts the messages of a channel; one that is sent again counts once, whatever torques it says by then.
 
@@ -149,8 +159,7 @@ class RealTime:
         Raises:
             InputError: if the rate is not positive, or above 1.
         """
-        if not 0.0 < rate <= 1.0:
-            raise InputError(f"a robot's clock goes as the wall's or slower, at a rate up to 1, not {rate}")
+        check_rate(rate)
         self.gaps = Gaps()
         self._lcm, self._period, self._rate = lcm, period, rate
         self._statuses = NewMessages(lcm, channel)
@@ -173,7 +182,7 @@ class RealTime:
             self.gaps.add(now - self._last)
             self._last = now
             period = self._period / self._rate
-            self._due = max(self._due, now - 0.5 * period) + period
+            self._due = max(self._due, now) + period
             # What happens at an instant belongs to the clock of that instant, and Drake has left it for the next step.
             simulator.AdvancePendingEvents()
             station.tell_time(context, now * self._rate)
@@ -182,7 +191,7 @@ class RealTime:
     def _wait(self) -> None:
         # Whoever floods the bus doesn't set the pace.
         period = self._period / self._rate
-        time.sleep(max(self._last + 0.5 * period - time.monotonic(), self._due - 0.5 * period - time.monotonic(), 0.0))
+        time.sleep(max(self._due - 0.5 * period - time.monotonic(), 0.0))
         end = self._last + 1.5 * period
         while self._statuses.count == self._taken and (left := end - time.monotonic()) > 0.0:
             self._lcm.HandleSubscriptions(max(1, int(1000 * left)))

@@ -106,9 +106,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
             lock.acquire()
         except filelock.Timeout:
-            raise InputError(
-                f"another process is training the run in {self.path}: wait for it, or name another folder"
-            ) from None
+            raise InputError(f"another process writes into {self.path}: wait for it, or name another folder") from None
         except OSError as error:
             raise InputError(
                 f"{self.path} cannot be written ({error.strerror}): choose a folder with room to write"

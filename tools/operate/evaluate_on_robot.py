@@ -67,18 +67,15 @@ def evaluate_on_robot(
     environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
     config = replace(config, environment=environment)
     path = (out or run / "hardware") / f"episodes{'-' * bool(policy)}{policy}.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        path.touch(exist_ok=False)  # so that nobody else writes it meanwhile
-    except FileExistsError:
-        raise InputError(f"{path} already exists: name another folder with --out, or remove it") from None
     rows: list[dict[str, Any]] = []
 
     def write(rows: list[dict[str, Any]]) -> None:
         if rows:
             write_atomically(path, table_text(pd.DataFrame(rows)).encode())
 
-    try:
+    with RunFolder(path.parent).locked():
+        if path.exists():
+            raise InputError(f"{path} already exists: name another folder with --out, or remove it")
         with at_robot(config, other, yes=yes, say=say) as robot:
             env = robot.env
             act = learned if acting is None else acting(env)
@@ -96,7 +93,4 @@ def evaluate_on_robot(
                         env.rest()
                     finally:
                         write(rows)  # of the last episode too, where nobody let the arm go on
-    finally:
-        if not rows:
-            path.unlink(missing_ok=True)
     return {"rows": str(path), **summary(pd.DataFrame(rows), FOUND)}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.stations.hardware import HardwareStation
-from guiderail.diagrams.stations.pace import Pace, RealTime, StepByStep
+from guiderail.diagrams.stations.pace import Pace, RealTime, StepByStep, check_rate
 from guiderail.models.errors import InputError
 from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.models.units import MM
@@ -65,8 +65,7 @@ class Other:
             raise InputError(
                 "a rehearsal has a bus of its own, so that no real driver ever hears it: leave --lcm-url out"
             )
-        if not 0.0 < self.rate <= 1.0:
-            raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {self.rate}")
+        check_rate(self.rate)
 
     def environment(self, station: str) -> dict[str, Any]:
         """Options of an environment whose station is there."""

@@ -10,7 +10,7 @@ from guiderail.diagrams.make import resolve
 from guiderail.diagrams.options import validated
 from guiderail.diagrams.stations.deputy import Deputy
 from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa, safety_limits
-from guiderail.diagrams.stations.pace import hurry, serve, serve_in_real_time
+from guiderail.diagrams.stations.pace import check_rate, hurry, serve, serve_in_real_time
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.errors import InputError
 from guiderail.tools.operate.places import put
@@ -54,8 +54,8 @@ def serve_iiwa(
     for name, value in {"seconds": seconds, "patience": patience}.items():
         if not 0.0 < value < np.inf:
             raise InputError(f"{name} must be a positive number, not {value:g}")
-    if rate is not None and not 0.0 < rate <= 1.0:
-        raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {rate:g}")
+    if rate is not None:
+        check_rate(rate)
     declared = resolve(task, {}).task
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: serve an insertion")

@@ -189,7 +189,7 @@ def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
     with subprocess.Popen([sys.executable, "-c", holds], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         other.stdout.readline()
-        with pytest.raises(InputError, match="another process is training"):
+        with pytest.raises(InputError, match="another process writes into"):
             train(folder, bead_config)
         other.kill()  # its lock file stays, and holds nobody back
     (folder.path / ".episodes.csv.1.part").write_text("from a process that was killed while writing")

@@ -103,6 +103,11 @@ def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_pat
         evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
     with pytest.raises(InputError, match="at least one"):
         evaluate_on_robot(tmp_path, Other(), 0)
+    # Two at once, neither of which has a row yet: nobody replaces the other's.
+    elsewhere = tmp_path / "elsewhere"
+    with RunFolder(elsewhere).locked(), pytest.raises(InputError, match="another process"):
+        evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still, out=elsewhere)
+    assert not list(elsewhere.glob("*.csv"))
 
 
 def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, tmp_path, forkserver):
