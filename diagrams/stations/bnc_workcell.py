@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Box, SceneGraph
@@ -46,12 +47,15 @@ class BncWorkcell:
         p_WJ: where the jack stands, (3,) [m].
         friction: of the connector's metal.
         margin: from which on Drake feels the jack's metal before it is touched [m]; MuJoCo has none.
+        equal_area: whether the polygons that stand for barrel and bore in Drake have the circles' areas; otherwise the
+            barrel's lies inside of its circle and the bore's around it, and the plug drops in from farther off.
     """
 
     dimensions: BncDimensions = field(default_factory=BncDimensions)
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)
     friction: float = FRICTION
     margin: float = MARGIN
+    equal_area: bool = False
 
     @property
     def X_WJ(self) -> RigidTransform:
@@ -72,7 +76,7 @@ class BncWorkcell:
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Adds the jack, on a frame that `set_jack_offset` moves, and a board under it to look at."""
-        model = add_model(plant, folder_of(self.dimensions, self.friction, self.margin) / JACK_SDF.name)
+        model = add_model(plant, self._folder() / JACK_SDF.name)
         mount = plant.AddFrame(FixedOffsetFrame("jack_mount", plant.world_frame(), self.X_WJ))
         plant.WeldFrames(mount, plant.GetFrameByName("jack", model))
         depth, width, thickness = BOARD
@@ -81,11 +85,14 @@ class BncWorkcell:
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
         """Adds the plug, on a frame that `set_grasp_offset` moves."""
-        model = add_model(plant, folder_of(self.dimensions, self.friction, self.margin) / PLUG_SDF.name)
+        model = add_model(plant, self._folder() / PLUG_SDF.name)
         grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
         plug = plant.GetBodyByName("plug", model)
         plant.WeldFrames(grasp, plug.body_frame())
         return plug
+
+    def _folder(self) -> Path:
+        return folder_of(self.dimensions, self.friction, self.margin, self.equal_area)
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Leaves the barrel to the bore, the lugs to the slots and the pad to the seat."""

@@ -43,6 +43,9 @@ class BncOptions(HiddenPlace):
     contact_margin: Number = Field(
         MARGIN, ge=0, le=0.5 * MM, description="from which on Drake feels the jack's metal before it is touched [m]"
     )
+    equal_area: bool = Field(
+        False, description="whether the polygons of barrel and bore in Drake have their circles' areas"
+    )
     demonstrations: str = Field("insert", description="what was demonstrated: insert, search, or a file of one's own")
 
     @field_validator("demonstrations")
@@ -62,7 +65,7 @@ class BncOptions(HiddenPlace):
             mouth_chamfer=self.mouth_chamfer,
             slot_clearance=self.slot_clearance,
         )
-        return BncWorkcell(dimensions, friction=self.friction, margin=self.contact_margin)
+        return BncWorkcell(dimensions, friction=self.friction, margin=self.contact_margin, equal_area=self.equal_area)
 
 
 HARD: dict[str, Any] = {

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, lathe, strip
+from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, equal_area_radius, lathe, strip
 
 MM = 1e-3
 FOLDER = Path(__file__).parent
@@ -185,15 +185,18 @@ def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
     return TriangleMesh.from_quads(_both_halves(np.concatenate([walls, face])))
 
 
-def bore_mesh(dimensions: BncDimensions, num_sides: int = BORE_SIDES) -> TriangleMesh:
-    """What the barrel touches: the mouth's face, its chamfer and the bore, a polygon around the true circle."""
+def bore_mesh(dimensions: BncDimensions, num_sides: int = BORE_SIDES, equal_area: bool = False) -> TriangleMesh:
+    """What the barrel touches: the mouth's face, its chamfer and the bore.
+
+    A polygon around the true circle, or with `equal_area` one of the circle's area.
+    """
     d = dimensions
-    circumscribed = 1.0 / np.cos(np.pi / num_sides)
+    corner = equal_area_radius(1.0, num_sides) if equal_area else 1.0 / float(np.cos(np.pi / num_sides))
     profile = [
         (d.ring_radius, 0.0),
-        ((d.bore_radius + d.mouth_chamfer) * circumscribed, 0.0),
-        (d.bore_radius * circumscribed, d.mouth_chamfer),
-        (d.bore_radius * circumscribed, d.ring_length),
+        ((d.bore_radius + d.mouth_chamfer) * corner, 0.0),
+        (d.bore_radius * corner, d.mouth_chamfer),
+        (d.bore_radius * corner, d.ring_length),
     ]
     return lathe(profile, num_sides)
 

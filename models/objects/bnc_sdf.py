@@ -8,6 +8,7 @@ import numpy as np
 
 from guiderail.models.objects.bnc_connector import MM, BncDimensions
 from guiderail.models.objects.sdf import ContactMaterial, at, box, collision, cylinder, mesh, model, visual
+from guiderail.models.objects.triangle_mesh import equal_area_radius
 
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 
@@ -27,18 +28,30 @@ SEAT = ContactMaterial(friction=0.05)
 PLUG_MASS = 0.03  # [kg]
 
 
-def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN) -> str:
-    """The jack: link `jack` is frame J. Geometry `barrel`, `pad`, `lug_0`, `lug_1`."""
+def barrel_sides(dimensions: BncDimensions) -> int:
+    """Of the polygon that Drake makes of the barrel: its sides are as long as the resolution hint, or shorter."""
+    assert BARREL.resolution is not None
+    return int(np.ceil(2.0 * np.pi * dimensions.barrel_radius / BARREL.resolution))
+
+
+def jack_sdf(
+    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
+) -> str:
+    """The jack: link `jack` is frame J. Geometry `barrel`, `pad`, `lug_0`, `lug_1`.
+
+    The barrel touches as a polygon whose corners lie on the circle, or with `equal_area` as one of the circle's area.
+    """
     d = dimensions
     barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
-    barrel = (at(z=d.barrel_height / 2), cylinder(d.barrel_radius, d.barrel_height))
+    place, barrel = at(z=d.barrel_height / 2), cylinder(d.barrel_radius, d.barrel_height)
+    touching = cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height) if equal_area else barrel
     pad = (
         at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2),
         cylinder(d.pad_radius, d.pad_thickness),
     )
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = collision("barrel", *barrel, barrel_material) + visual("barrel_visual", *barrel, NICKEL)
+    contents = collision("barrel", place, touching, barrel_material) + visual("barrel_visual", place, barrel, NICKEL)
     contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
         lug = (at(x=side * lug_centre, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))

@@ -15,6 +15,12 @@ def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: n
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
 
 
+def equal_area_radius(radius: float, num_sides: int) -> float:
+    """To the corners of the regular polygon that has the area of a circle of `radius`, both in [m]."""
+    turn = 2.0 * np.pi / num_sides
+    return radius * float(np.sqrt(turn / np.sin(turn)))
+
+
 def strip(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Quads between two polylines (N, 3), seen counter-clockwise from where `second` lies right of `first`."""
     return np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)

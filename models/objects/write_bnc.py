@@ -9,22 +9,26 @@ from guiderail.models.objects.bnc_sdf import FRICTION, MARGIN, jack_sdf, plug_sd
 from guiderail.models.objects.made import made
 
 
-def files(dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN) -> dict[str, str]:
+def files(
+    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
+) -> dict[str, str]:
     """What each file holds, by name."""
     return {
-        "bnc_bore.obj": bore_mesh(dimensions).to_obj(),
+        "bnc_bore.obj": bore_mesh(dimensions, equal_area=equal_area).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
         "bnc_ring.obj": ring_mesh(dimensions).to_obj(),
-        "bnc_jack.sdf": jack_sdf(dimensions, friction, margin),
+        "bnc_jack.sdf": jack_sdf(dimensions, friction, margin, equal_area),
         "bnc_plug.sdf": plug_sdf(dimensions, friction),
     }
 
 
-def folder_of(dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN) -> Path:
+def folder_of(
+    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
+) -> Path:
     """Where the files of a connector lie: beside this one, or made to measure."""
-    if (dimensions, friction, margin) == (BncDimensions(), FRICTION, MARGIN):
+    if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
         return FOLDER
-    return made(files, dimensions, friction, margin)
+    return made(files, dimensions, friction, margin, equal_area)
 
 
 def main(folder: Path = FOLDER) -> None:

@@ -35,6 +35,11 @@ NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
 IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that has dropped in, and an offset from which none does
 HALVINGS = 6  # of that offset
 AROUND, SPEEDS = 3.0 * MM, (0.003, 0.02, 0.04)  # circle about the jack on which a plug slides over the rim [m, m/s]
+CAPTURES = {  # station, and whether Drake's polygons have their circles' areas
+    "Drake": ("rails", False),
+    "Drake, equal areas": ("rails", True),
+    "MuJoCo": ("mujoco", False),
+}
 CONTACTS = {  # station, step [s] and margin [m]
     "Drake, 10 ms": ("rails", PLANT_PERIOD, MARGIN),
     "Drake, 2.5 ms": ("rails", PLANT_PERIOD / 4, MARGIN),
@@ -57,7 +62,7 @@ def measure() -> dict[str, Any]:
     levers["two points, rigid"] = [rigid_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
-    captures |= {engine: _capture(station) / MM for engine, station in told(ENGINES.items(), "capture")}
+    captures |= {engine: _capture(*how) / MM for engine, how in told(CAPTURES.items(), "capture")}
     drags = {contact: [drag(*how, speed) for speed in SPEEDS] for contact, how in told(CONTACTS.items(), "drag")}
     measured = {"levers_mm": levers, "captures_mm": captures, "drags": drags}
     return {"profiles": profiles, "offsets_mm": list(OFFSETS), **measured}
@@ -102,12 +107,13 @@ def _lever(name: str, offset: float, modulus: float) -> float:
     return float(np.linalg.norm(contact_lever(recording["wrench"][-10:].mean(axis=0), LEAST_FORCE)))
 
 
-def _capture(name: str) -> float:
+def _capture(name: str, equal_area: bool = False) -> float:
     """How far beside the jack a plug may be pressed on it that still drops in [m]."""
     near, far = 0.0, FARTHEST
     for _ in range(HALVINGS):
         middle = 0.5 * (near + far)
-        dropped = _pressed(name, BncWorkcell(NARROW), middle)["pose"][-1, 2] < IN
+        workcell = BncWorkcell(NARROW, equal_area=equal_area)
+        dropped = _pressed(name, workcell, middle)["pose"][-1, 2] < IN
         near, far = (middle, far) if dropped else (near, middle)
     return near
 

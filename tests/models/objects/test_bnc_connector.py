@@ -1,7 +1,16 @@
 import dataclasses
+import re
 
 import numpy as np
 import pytest
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    Cylinder,
+    GeometryInstance,
+    ProximityProperties,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform
 
 from guiderail.models.objects.bnc_connector import (
     FOLDER,
@@ -12,6 +21,7 @@ from guiderail.models.objects.bnc_connector import (
     slot_columns,
     slot_mesh,
 )
+from guiderail.models.objects.bnc_sdf import BARREL, barrel_sides, jack_sdf
 from guiderail.models.objects.triangle_mesh import TriangleMesh
 from guiderail.models.objects.write_bnc import files, main
 
@@ -47,6 +57,34 @@ def test_the_bore_lets_the_true_barrel_through():
     distance_of_planes = np.abs(np.einsum("ij,ij->i", mesh.normals()[wall], mesh.vertices[mesh.triangles[wall, 0]]))
     assert distance_of_planes.min() >= DIMENSIONS.bore_radius - 1e-8
     assert (np.einsum("ij,ij->i", mesh.normals()[wall], outward) < 0).all()
+
+
+def test_polygons_of_equal_area_have_their_circles_area():
+    """The barrel's as Drake makes it: what it touches is drawn that much wider."""
+    bore = bore_mesh(DIMENSIONS, equal_area=True)
+    corners = bore.vertices[bore.vertices[:, 2] > DIMENSIONS.mouth_chamfer + 1e-9, :2]
+    area = 0.5 * len(corners) * np.hypot(*corners.T).max() ** 2 * np.sin(2 * np.pi / len(corners))
+    assert area == pytest.approx(np.pi * DIMENSIONS.bore_radius**2, rel=1e-6)
+
+    radius = float(re.findall(r"<radius>([\d.]+)<", jack_sdf(DIMENSIONS, equal_area=True))[0])
+    sides = len(barrel_circle(radius))
+    assert sides == barrel_sides(DIMENSIONS)
+    area = 0.5 * sides * radius**2 * np.sin(2 * np.pi / sides)
+    assert area == pytest.approx(np.pi * DIMENSIONS.barrel_radius**2, rel=1e-4)
+    assert radius < DIMENSIONS.bore_radius
+
+
+def barrel_circle(radius: float) -> np.ndarray:
+    """The corners of the polygon that Drake makes of a barrel."""
+    scene_graph = SceneGraph()
+    source, properties = scene_graph.RegisterSource(), ProximityProperties()
+    AddCompliantHydroelasticProperties(BARREL.resolution, BARREL.modulus, properties)
+    geometry = GeometryInstance(RigidTransform(), Cylinder(radius, DIMENSIONS.barrel_height), "barrel")
+    geometry.set_proximity_properties(properties)
+    barrel = scene_graph.RegisterAnchoredGeometry(source, geometry)
+    mesh = scene_graph.model_inspector().maybe_get_hydroelastic_mesh(barrel)
+    corners = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+    return corners[(corners[:, 2] > 0) & np.isclose(np.hypot(*corners[:, :2].T), radius)]
 
 
 def test_a_lug_fits_everywhere_along_its_path():

@@ -33,6 +33,7 @@ def test_a_plug_drops_in_from_about_as_far_beside_as_it_is_drawn():
     ours, theirs = (engines._capture(station) for station in ("rails", "mujoco"))
     assert theirs == pytest.approx(drawn, abs=0.02 * MM)
     assert drawn < ours < 1.5 * drawn
+    assert engines._capture("rails", equal_area=True) == pytest.approx(drawn, abs=0.05 * MM)
 
 
 def test_a_plug_that_slides_fast_over_a_sharp_rim_is_held_back_by_friction_alone_where_steps_are_short():
