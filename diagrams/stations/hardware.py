@@ -9,7 +9,7 @@ import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
 from pydantic import Field
 from pydrake.common.value import Value
-from pydrake.lcm import DrakeLcm, DrakeLcmInterface
+from pydrake.lcm import DrakeLcmInterface
 from pydrake.manipulation import BuildIiwaControl, IiwaDriver
 from pydrake.multibody.parsing import ModelDirective
 from pydrake.multibody.plant import MultibodyPlant
@@ -21,6 +21,7 @@ from pydrake.systems.primitives import MatrixGain
 
 from guiderail.diagrams.options import Number, Options
 from guiderail.diagrams.stations.arm import ArmModel, KnownArm, add_arm
+from guiderail.diagrams.stations.bus import open_bus
 from guiderail.diagrams.stations.deputy import WordSerializer, word_channel
 from guiderail.diagrams.stations.driver import MICROSECOND, Driver
 from guiderail.diagrams.stations.impedance_control import add_controller
@@ -207,12 +208,12 @@ class HardwareStation(Station):
             status_limits: of the statuses; unless given, they follow from the joints' speeds and the period.
 
         Raises:
-            InputError: if nothing here speaks to such a robot.
+            InputError: if nothing here speaks to such a robot, or at such a URL.
         """
         super().__init__()
         robot = find_robot(robot)
         self.driver = driver = find_driver(robot)
-        self.lcm = bus = lcm or DrakeLcm(lcm_url)
+        self.lcm = bus = lcm or open_bus(lcm_url)
         self.lcm_url = lcm_url
         self.period = period = driver.period if period is None else period
         self.known = known = KnownArm(workcell, robot, end_effector)

@@ -377,7 +377,9 @@ class LcNsKmp:
         return x
 
     def _factor(self, step: int) -> StepFactor:
-        step = min(step, self.num_steps - 1)
+        if not float(step).is_integer():
+            raise InputError(f"a step is a whole number, not {brief(step)}")
+        step = min(int(step), self.num_steps - 1)
         factor = self._cache.get(step)
         if factor is None:
             factor = StepFactor(self._window(step, self.horizon), self._features(step), self.lambda_, self.beta)

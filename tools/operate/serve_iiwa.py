@@ -8,6 +8,7 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.make import resolve
 from guiderail.diagrams.options import validated
+from guiderail.diagrams.stations.bus import open_bus
 from guiderail.diagrams.stations.deputy import Deputy
 from guiderail.diagrams.stations.hardware import IIWA_DRIVER, SimulatedIiwa, safety_limits
 from guiderail.diagrams.stations.pace import check_rate, hurry, serve, serve_in_real_time
@@ -49,7 +50,7 @@ def serve_iiwa(
         say: what a person is told.
 
     Raises:
-        InputError: if the task is none, or a time or the rate is no positive number.
+        InputError: if the task or the bus is none, or a time or the rate is no positive number.
     """
     for name, value in {"seconds": seconds, "patience": patience}.items():
         if not 0.0 < value < np.inf:
@@ -61,9 +62,9 @@ def serve_iiwa(
         raise InputError(f"{task} is done by no arm with a tool: serve an insertion")
     start = START if task == TASK else declared.start(np.random.default_rng(0)) + ASIDE
     directives = [] if scenario is None else load_scenario(scenario).directives
-    lcm, driver = DrakeLcm(url), IIWA_DRIVER
+    lcm, driver = open_bus(url), IIWA_DRIVER
     # In real time, the deputy has ears of its own: beside a real driver it is another process.
-    within, ears = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, DrakeLcm(url))
+    within, ears = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
     robot = SimulatedIiwa(
         declared.world(), within, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
     )

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pydrake.lcm import DrakeLcm
-
 from guiderail.diagrams.make import resolve
 from guiderail.diagrams.stations.arm import KnownArm
+from guiderail.diagrams.stations.bus import open_bus
 from guiderail.diagrams.stations.deputy import Deputy
 from guiderail.diagrams.stations.hardware import find_driver, safety_limits
 from guiderail.diagrams.stations.pace import hurry
@@ -25,14 +24,14 @@ def stand_by(url: str, robot: str, task: str, *, say: Callable[[str], None] = pr
         say: what a person is told.
 
     Raises:
-        InputError: for a robot or a task that there is not.
+        InputError: for a robot, a task or a bus that there is not.
     """
     driver = find_driver(robot)
     declared = resolve(task, {}).task
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: name an insertion")
     plant = KnownArm(declared.world(), robot).plant
-    lcm = DrakeLcm(url)
+    lcm = open_bus(url)
     deputy = Deputy(lcm, driver, plant, safety_limits(plant, driver))
     words = "" if hurry() else "; the system serves this process as any other"
     say(f"standing by on {driver.command_channel} of {url or 'LCM'}{words}")

@@ -387,6 +387,8 @@ def test_refuses_at_construction(changes, names):
     ("step", "action", "history", "names"),
     [
         (-1, np.zeros(2), np.zeros((3, 2)), "step"),
+        (1.5, np.zeros(2), np.zeros((3, 2)), "whole number"),
+        (np.nan, np.zeros(2), np.zeros((3, 2)), "whole number"),
         (0, np.zeros(3), np.zeros((3, 2)), "null-space action"),
         (0, np.array([np.nan, 0]), np.zeros((3, 2)), "finite"),
         (0, np.array([np.inf, 0]), np.zeros((3, 2)), "finite"),

@@ -37,7 +37,7 @@ def operated(monkeypatch):
         lcm = DrakeLcm("memq://")
         with monkeypatch.context() as patch:
             # The skill's station makes its own bus from a URL, and a bus in memory is known to its maker alone.
-            patch.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
+            patch.setattr("guiderail.diagrams.stations.hardware.open_bus", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS)
         task = resolve("BncConnector", OPTIONS).task
         monkeypatch.setattr(task, "num_steps", num_steps)
@@ -81,7 +81,7 @@ def test_a_run_that_fails_leaves_what_was_recorded_beside_what_was_there(monkeyp
         imported.extend(imports)
         yield
 
-    monkeypatch.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
+    monkeypatch.setattr("guiderail.diagrams.stations.hardware.open_bus", lambda url: lcm)
     monkeypatch.setattr(run_policy.Policy, "load", lambda folder: policy)
     monkeypatch.setattr(run_policy, "hurry", lambda: True)
     monkeypatch.setattr(Other, "standing_in", standing_in)

@@ -37,7 +37,7 @@ def make(patch, start):
     lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
     patch.setattr(resolved.task, "num_steps", 10)
     with patch.context() as bus:
-        bus.setattr("guiderail.diagrams.stations.hardware.DrakeLcm", lambda url: lcm)
+        bus.setattr("guiderail.diagrams.stations.hardware.open_bus", lambda url: lcm)
         station = make_station(resolved)
     task = assemble(resolved.task, station, make_guidance(resolved, station))
     pace, keys, asked = Together(resolved.task.world(), lcm, start), Keys(), []
