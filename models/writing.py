@@ -1,6 +1,7 @@
 """Writing a file that is either complete or not there."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from guiderail.models.errors import InputError
@@ -21,5 +22,6 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # below a file there is no folder to remove anything from
+            temporary.unlink(missing_ok=True)
         raise InputError(f"{path} cannot be written ({error.strerror}): choose a folder with room to write") from error

@@ -1,5 +1,7 @@
 """Statistics of an episode's safety: violations, forces, collisions, saturation, fallbacks."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from pydrake.systems.framework import (
     BasicVector,
@@ -56,6 +58,17 @@ class SafetyLedger(LeafSystem):
         "fallbacks",
         "steps",
     )
+
+    @staticmethod
+    def counts(signals: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """The counts of steps whose signals are known, (n, size) each: for an episode that ended without its ledger."""
+        touches = np.append(False, signals["collision"][:, 0] > 0)
+        return {
+            "collisions": float((touches[1:] & ~touches[:-1]).sum()),
+            "collision_steps": float(touches.sum()),
+            "saturations": float(signals["saturation"].any(axis=1).sum()),
+            "fallbacks": float((signals["fallback"][:, 0] > 0).sum()),
+        }
 
     def __init__(self, period: float, num_actuators: int = 1):
         """

@@ -1,5 +1,6 @@
 """Tasks by name: the one place where tools ask which there are and what they take."""
 
+import hashlib
 import inspect
 import sys
 import traceback
@@ -72,21 +73,39 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
     return name, (str(Path(typed).resolve()),)
 
 
-def task_content(task: str) -> str:
-    """A digest of the files that a task is made of, as they are now; empty where it is made by code.
+def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[str]) -> str:
+    """A digest of the files that a task is made of, as they are now; empty where there are none but installed ones.
 
     Args:
         task: its name.
+        environment: its options: of those that name a file, such as demonstrations, the file counts.
+        imports: what registers it, as `import_modules` names it: of files, what they say counts.
 
     Raises:
-        InputError: if it is of a folder that is none any more.
+        InputError: if it is of a folder that is none any more, or a file cannot be read.
     """
     folder = getattr(TASKS.get(task), "folder", None) if task in TASKS.names() else None
-    if folder is None:
-        return ""
-    from guiderail.diagrams.tasks.part_file import task_folder_digest  # Drake takes a second
+    told = ""
+    if folder is not None:
+        from guiderail.diagrams.tasks.part_file import task_folder_digest  # Drake takes a second
 
-    return task_folder_digest(folder)
+        told = task_folder_digest(folder)
+    named = [*imports, *(value for _, value in sorted(environment.items()) if isinstance(value, str))]
+    files = [path for path in map(Path, named) if path.is_absolute() and folder not in path.parents and path.is_file()]
+    if not files:
+        return told
+    digest = hashlib.blake2b(told.encode(), digest_size=16)
+    for file in files:
+        digest.update(_read(file))
+    return digest.hexdigest()
+
+
+def _read(file: Path) -> bytes:
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file} cannot be read ({error.strerror}): restore it") from error
+    return len(content).to_bytes(8, "big") + content
 
 
 def _is_module(name: str) -> bool:

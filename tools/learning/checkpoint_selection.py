@@ -55,6 +55,10 @@ class CheckpointSelection:
         while self._open and self._open[0].since >= self.window:
             self._selected = self._better(self._selected, self._open.pop(0))
 
+    def leave_out(self) -> None:
+        """It is over, and says nothing of the actor."""
+        self._open.pop()
+
     def result(self) -> Actor | None:
         """The best actor so far; None where none has successes on both sides."""
         best = self._best()

@@ -52,7 +52,7 @@ def configure(
     resolved = check_environment(task, environment)
     return RunConfig(
         task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger,
-        task_content(task), with_person,
+        task_content(task, resolved, imports), with_person,
     )  # fmt: skip
 
 
@@ -145,8 +145,11 @@ def _continued(
     config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
     stored |= {"ledger": config.ledger, "with_person": config.with_person} | config.environment
-    wanted = {**environment, **given} | ({} if task is None else {"task": task})
+    environment = {key: check_environment(config.task, environment).get(key, environment[key]) for key in environment}
+    wanted = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in wanted.items():
+        if key == "episodes" and value < config.episodes:
+            raise InputError(f"the run in {folder.path} has {config.episodes} episodes: it can only be given more")
         if key != "episodes" and stored.get(key) != value:
             raise InputError(
                 f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train anew"
@@ -155,4 +158,15 @@ def _continued(
     learner = resolve_preset(config.preset, config.learner.algorithm, stored_learner | dict(settings or {}))
     if learner != config.learner:
         raise InputError(f"the run in {folder.path} has other learner settings: leave --set out, or train anew")
-    return replace(config, episodes=max(config.episodes, given.get("episodes", 0)))
+    return replace(config, episodes=given.get("episodes", config.episodes), versions=_versions(folder, config))
+
+
+def _versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:
+    """Of the run so far and from now on; where they differ it is said, as the result may then be another one."""
+    told = {}
+    for name, now in installed_versions().items():
+        before = config.versions.get(name, now)
+        told[name] = before if before.split(", then ")[-1] == now else f"{before}, then {now}"
+    if changed := [f"{name} {words}" for name, words in told.items() if words != config.versions.get(name, words)]:
+        print(f"the run in {folder.path} goes on with other versions: {'; '.join(changed)}", file=sys.stderr)
+    return config.versions | told

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.registry import Registry
 from guiderail.tools.rollouts.rollout import Observer
@@ -50,8 +51,15 @@ register_learner = LEARNERS.register
 learner_names = LEARNERS.names
 
 
+def diverged() -> InputError:
+    """What a person is told of a learner that `has_diverged`."""
+    return InputError("learning diverged: train anew with a smaller --set learning_rate=...")
+
+
 def arguments_of(config: Any, task: Any) -> dict[str, Any]:
     """What a learner is called with by name: `hold`, `seed`, `decisions` (the most that the run can take), `symmetry`.
+
+    What a person pushed, demonstrations no longer have on their other sides: then there is no symmetry to learn from.
 
     Args:
         config: the run's `RunConfig`.
@@ -59,7 +67,13 @@ def arguments_of(config: Any, task: Any) -> dict[str, Any]:
     """
     decisions = config.episodes * -(-task.num_steps // config.hold)
     symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
-    return {"hold": config.hold, "seed": config.seed, "decisions": decisions, "symmetry": symmetry}
+    pushed = config.with_person or bool(config.environment.get("via_points"))
+    return {
+        "hold": config.hold,
+        "seed": config.seed,
+        "decisions": decisions,
+        "symmetry": None if pushed else symmetry,
+    }
 
 
 # These import PyTorch, which takes seconds, when one is made.

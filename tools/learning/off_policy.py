@@ -29,7 +29,7 @@ from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.learning import older
 from guiderail.tools.learning.checkpoint_selection import CheckpointSelection
 from guiderail.tools.learning.ensemble import EnsembleSac, EnsembleTqc
-from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.learner import Learner, diverged
 from guiderail.tools.learning.presets import Preset, decision_discount
 from guiderail.tools.rollouts.rollout import Decision
 
@@ -162,6 +162,7 @@ class OffPolicyLearner(Learner):
         self.selection = CheckpointSelection(preset.selection_window) if preset.selection_window else None
         self.episodes = 0
         self._greedy = False  # whether this episode does not explore
+        self._decided = False  # whether this episode has a decision that is remembered
         self._greedy_successes = 0  # in a row
         self._constant: np.ndarray | None = None  # the action of this episode, where it has only one
         self._repeats = 0  # decisions for which an extended action still goes on
@@ -174,6 +175,7 @@ class OffPolicyLearner(Learner):
     def begin(self) -> None:
         """Begins an episode, and decides how it explores."""
         self.episodes += 1
+        self._decided = False
         share = self.preset.greedy_share
         own = self.episodes - self.preset.demonstration_episodes  # in those before, somebody else acts
         self._constant = self._uniform() if 0 < own <= self.preset.constant_episodes else None
@@ -184,17 +186,35 @@ class OffPolicyLearner(Learner):
             self.selection.begin(self.actor(), self._greedy_successes)
 
     def see(self, decision: Decision) -> None:
-        """Remembers a decision, and learns if it is time to."""
+        """Remembers a decision, and learns if it is time to. Where the simulation failed nothing followed: what came
+        before is then the episode's last, as at a time limit.
+        """
+        if "simulation_failure" in decision.info:
+            self._cut_short()
+            return
         self.remember(decision)
         self.learn()
+        self._decided = True
+
+    def _cut_short(self) -> None:
+        if self._decided:
+            buffer = self.model.replay_buffer
+            buffer.dones[buffer.pos - 1] = buffer.timeouts[buffer.pos - 1] = 1.0
 
     def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Ends an episode."""
-        if self._greedy:
+        """Ends an episode. One in which a person pushed says nothing of the policy."""
+        if row.get("interventions"):
+            self.leave_out()
+        elif self._greedy:
             self._greedy_successes = self._greedy_successes + 1 if row["success"] else 0
             if self.selection is not None:
                 self.selection.finish(bool(row["success"]))
         return {}
+
+    def leave_out(self) -> None:
+        """Ends an episode that does not count for the selection, as if it had not been greedy."""
+        if self._greedy and self.selection is not None:
+            self.selection.leave_out()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """Uniform until learning starts; then sampled from the policy, or in a greedy episode its mean."""
@@ -259,6 +279,8 @@ class OffPolicyLearner(Learner):
         if not self.has_begun() or self.decisions % self.preset.train_every:
             return
         self.model.train(self.preset.gradient_steps, self.preset.batch_size)
+        if self.has_diverged():
+            raise diverged()
         if self.averaged is not None:
             follow = 1.0 - (1.0 - self.preset.averaging) ** self.preset.gradient_steps
             with torch.no_grad():

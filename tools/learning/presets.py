@@ -56,7 +56,7 @@ class Preset:
     train_every: Count = 8  # decisions between two trainings
     gradient_steps: Count = 24  # in one training
     batch_size: Batch = 64  # decisions
-    n_steps: Count = 1  # decisions after which a return is guessed, and until which it is known
+    n_steps: Annotated[Count, Field(le=1000)] = 1  # decisions after which a return is guessed, and until which known
     buffer_size: Count = 1_000_000  # decisions that are remembered
     learning_starts: Count = 100  # decisions, uniformly random, before the first training
     entropy: Entropy = "auto_0.1"  # "auto", "auto_<initial value>", or a number

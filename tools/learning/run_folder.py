@@ -15,7 +15,7 @@ import yaml
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.models.yaml_files import load_yaml
 from guiderail.tools.files import remove_parts, write_atomically
 from guiderail.tools.learning import older
@@ -42,7 +42,7 @@ class RunConfig:
     versions: dict[str, str] = field(default_factory=dict)  # that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
     ledger: bool = True  # whether every control step is written down
-    task_content: str = ""  # of a task folder: the digest of its files; empty where a run is older than that
+    task_content: str = ""  # the digest of the files that the task is made of; empty where there are none
     with_person: bool = False  # whether a person watches; what was corrected is in the environment's via_points
 
     @property
@@ -52,7 +52,8 @@ class RunConfig:
 
     def refuse_changed_task(self, path: Path) -> None:
         """Raises an InputError if the task's files are not those with which the run in that folder began."""
-        if self.task_content and self.task_content != task_content(self.task):
+        now = task_content(self.task, self.environment, self.imports)
+        if self.task_content and self.task_content != now:
             raise InputError(
                 f"the files of {self.task} are not those that the run in {path} began with: restore them, or train "
                 "anew in another folder"
@@ -130,8 +131,14 @@ class RunFolder:
     def refuse_existing(self) -> None:
         """Raises an InputError if the folder holds something already."""
         # What is left of a run that was killed before it had a configuration is nothing that could go on.
-        left = {LOCK, *(part.name for part in self.path.glob(".*.part"))}
-        if self.path.exists() and (not self.path.is_dir() or any(one.name not in left for one in self.path.iterdir())):
+        try:
+            left = {LOCK, *(part.name for part in self.path.glob(".*.part"))}
+            is_taken = self.path.exists() and (
+                not self.path.is_dir() or any(one.name not in left for one in self.path.iterdir())
+            )
+        except OSError as error:
+            raise InputError(f"{brief(self.path)} is no folder for a run: {error.strerror}") from error
+        if is_taken:
             raise InputError(f"{self.path} already exists: name another folder, or go on with that run by --resume")
 
     def refuse_another(self, wanted: RunConfig, also: Sequence[str] = ()) -> None:
@@ -161,7 +168,11 @@ class RunFolder:
             InputError: if this is no run, or its configuration makes no sense.
         """
         file = self.path / "config.yaml"
-        if not file.is_file():
+        try:
+            is_run = file.is_file()
+        except OSError as error:
+            raise InputError(f"{brief(self.path)} cannot be read: {error.strerror}") from error
+        if not is_run:
             raise InputError(
                 f"{self.path} is not a run: it has no config.yaml; give a folder that guiderail train made"
             )

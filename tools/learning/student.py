@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -21,7 +21,7 @@ import torch
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.learning.learner import Learner
+from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 from guiderail.tools.rollouts.rollout import Decision
 
@@ -51,14 +51,16 @@ class Student(Learner):
         waits: bool,
         leaves_out: tuple[str, ...] = (),
         niceness: int = 0,
+        imports: Sequence[str] = (),
     ):
         """
         Args:
             acting: who acts; its networks are replaced as they are learned.
-            arguments: of another one of its kind, positional and by name, that learns.
+            arguments: of another one of its kind, positional and by name, that learns; the first is its preset.
             waits: whether an episode begins only when what it should know was learned.
             leaves_out: terminations of episodes that are not learned from.
             niceness: of the other process.
+            imports: modules or files (.py) that register what is not installed, such as the learner.
 
         Raises:
             InputError: if the learner is of another kind.
@@ -72,7 +74,8 @@ class Student(Learner):
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([__name__])  # a study imports once, not for every run
         self._pipe, other = context.Pipe()
-        self._process = context.Process(target=_learn, args=(other, niceness, type(acting), *arguments), daemon=True)
+        told = (other, niceness, tuple(imports), *arguments)
+        self._process = context.Process(target=_learn, args=told, daemon=True)
         self._process.start()
         other.close()
 
@@ -98,10 +101,17 @@ class Student(Learner):
             self._take(self._receive())
         self.late += self.known < behind
         self._decisions = []
+        self._drawn = self._acting.random.bit_generator.state
         self._acting.begin()
 
     def see(self, decision: Decision) -> None:
-        """Keeps a decision until it is known whether the episode is learned from."""
+        """Keeps a decision until it is known whether the episode is learned from.
+
+        Where the simulation failed nothing followed: what came before is then the episode's last, as at a time limit.
+        """
+        if "simulation_failure" in decision.info:
+            self._decisions[-1:] = [replace(last, truncated=True) for last in self._decisions[-1:]]
+            return
         self._decisions.append(replace(decision, info={}))
         self._acting.decisions += 1
 
@@ -110,6 +120,8 @@ class Student(Learner):
         if row["termination"] in self._leaves_out:
             self._acting.decisions -= len(self._decisions)
             self._acting.episodes -= 1
+            self._acting.leave_out()
+            self._acting.random.bit_generator.state = self._drawn
         else:
             self._acting.end(row)
             self._pending = self._decisions
@@ -184,9 +196,12 @@ class Student(Learner):
 
     def _receive(self) -> Any:
         try:
-            return self._pipe.recv()
+            answer = self._pipe.recv()
         except (EOFError, ConnectionError):
             raise _ended() from None
+        if isinstance(answer, InputError):
+            raise answer
+        return answer
 
     def _take(self, learned: Weights) -> None:
         _load(self._acting, learned)
@@ -230,7 +245,7 @@ def _weights(learner: OffPolicyLearner) -> Weights:
 
 
 def _learn(
-    pipe: Connection, niceness: int, kind: type[OffPolicyLearner], given: tuple[Any, ...], named: dict[str, Any]
+    pipe: Connection, niceness: int, imports: tuple[str, ...], given: tuple[Any, ...], named: dict[str, Any]
 ) -> None:
     """The other process: learns, and writes what takes long, until nobody is at the pipe's other end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: whoever acts decides what comes of it
@@ -239,7 +254,11 @@ def _learn(
     asked: SimpleQueue[tuple[Any, ...]] = SimpleQueue()
     # Always read: two that write into a full pipe wait for each other, and a robot waits for nobody.
     threading.Thread(target=_read, args=(pipe, asked), daemon=True).start()
-    learner = kind(*given, **named)
+    if imports:
+        from guiderail.tools.tasks import import_modules  # Drake takes a second
+
+        import_modules(imports)
+    learner: Any = LEARNERS.get(given[0].algorithm)(*given, **named)
     while (message := asked.get()) != ("end",):
         what, *rest = message
         try:
@@ -260,9 +279,12 @@ def _read(pipe: Connection, asked: SimpleQueue[tuple[Any, ...]]) -> None:
 _NOTHING = object()
 
 
-def _learned(learner: OffPolicyLearner, decisions: list[Decision]) -> Weights:
-    for decision in decisions:
-        learner.see(decision)
+def _learned(learner: OffPolicyLearner, decisions: list[Decision]) -> Weights | InputError:
+    try:
+        for decision in decisions:
+            learner.see(decision)
+    except InputError as error:
+        return error
     return _weights(learner)
 
 

@@ -10,7 +10,7 @@ import torch
 from guiderail.models.errors import InputError
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.learner import LEARNERS, Learner, arguments_of
+from guiderail.tools.learning.learner import LEARNERS, Learner, arguments_of, diverged
 from guiderail.tools.learning.person import Person, Watched
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.student import Spaces, Student
@@ -71,14 +71,21 @@ def train(
     task = cast(Any, env.unwrapped).task
     make_learner = LEARNERS.get(config.learner.algorithm)
     named = arguments_of(config, task)
-    learner: Learner = make_learner(config.learner, env, **named)
+    try:
+        learner: Learner = make_learner(config.learner, env, **named)
+    except MemoryError as error:
+        env.close()
+        raise InputError(
+            f"so many decisions are more than fits into memory ({error}): give a smaller --set buffer_size=..."
+        ) from error
     env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
     if not resume:
         folder.refuse_existing()
     try:
         with folder.locked():
             if config.learner.pipelined:
-                learner = Student(learner, ((config.learner, Spaces(env)), named), waits=True)
+                given = (config.learner, Spaces(env)), named
+                learner = Student(learner, given, waits=True, imports=config.imports)
             return _train(folder, config, env, learner, resume, report, demonstrator, person)
     finally:
         learner.close()
@@ -122,7 +129,9 @@ def _train(
             row = watched.rollout(act, learner, *watching, index=episode)
             env = watched.env
         if learner.has_diverged():
-            raise InputError(f"learning diverged in episode {episode}: train with a smaller --set learning_rate=...")
+            raise diverged()
+        if shown:
+            row["demonstrated"] = int(episode < shown)
         row["wall_time"] = time.perf_counter() - started
         if rows and rows[0].keys() != row.keys():
             raise InputError(
@@ -141,6 +150,8 @@ def _train(
             spent_saving += last_saving
         learner.hand_over()
     learner.finish()
+    if learner.has_diverged():
+        raise diverged()
     policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
     policy.save(folder.path, write=write_atomically)
     return rows

@@ -91,7 +91,12 @@ def _learn(
     named = arguments_of(config, env.task)
     acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **named)
     student = Student(
-        acting, ((config.learner, Spaces(env)), named), waits=waits, leaves_out=UNSOUND, niceness=NICENESS
+        acting,
+        ((config.learner, Spaces(env)), named),
+        waits=waits,
+        leaves_out=UNSOUND,
+        niceness=NICENESS,
+        imports=config.imports,
     )
     rows: list[dict[str, Any]] = []
     due: list[Callable[[], None]] = []  # what the last episode still leaves

@@ -250,7 +250,8 @@ def kept_file(
 ) -> Path:
     """The file that `judged_once` keeps its rows in, named by all that decides them; the arguments are its own."""
     deciding = {key: value for key, value in how.items() if key != "words"}
-    about = [*([] if about is None else [about]), *filter(None, [task_content(config.task)])]
+    content = task_content(config.task, environment, config.imports)
+    about = [*([] if about is None else [about]), *filter(None, [content])]
     told = json.dumps(
         [older.options(environment), deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str
     )

@@ -128,9 +128,17 @@ def first_in_a_row(good: Iterable[bool], number: int) -> int | None:
     return None
 
 
+def own(rows: pd.DataFrame) -> pd.DataFrame:
+    """Those of a run's episodes in which its learner acted, and nobody that it learned from."""
+    return rows[rows["demonstrated"] == 0] if "demonstrated" in rows else rows
+
+
 def converged_after(rows: pd.DataFrame) -> int | None:
-    """Episodes before the first ten in a row that succeed, those ten not counted (the thesis's figure 3.8)."""
-    return first_in_a_row(rows["success"] == 1, 10)
+    """Episodes before the first ten in a row that succeed, those ten not counted (the thesis's figure 3.8).
+
+    What was demonstrated counts as an episode, and as no success.
+    """
+    return first_in_a_row((rows["success"] == 1) & rows.index.isin(own(rows).index), 10)
 
 
 def avoids_obstacle_from(rows: pd.DataFrame, cost: float = 1.0, in_a_row: int = 5) -> int | None:
@@ -144,6 +152,10 @@ def avoids_obstacle_from(rows: pd.DataFrame, cost: float = 1.0, in_a_row: int = 
 
 def _mean(column: str, of: slice = slice(None)) -> Callable[[pd.DataFrame], float]:
     return lambda rows: float(np.mean(rows[column].to_numpy(float)[of]))
+
+
+def _succeeded(of: slice = slice(None)) -> Callable[[pd.DataFrame], float | None]:
+    return lambda rows: float(np.mean(found)) if len(found := own(rows)["success"].to_numpy(float)[of]) else None
 
 
 def _largest(column: str) -> Callable[[pd.DataFrame], float]:
@@ -162,11 +174,14 @@ def _violating(column: str) -> Callable[[pd.DataFrame], int]:
     return lambda rows: int((~(rows[column] <= TOLERANCE)).sum())  # what is no number is no slack
 
 
-def _wilson(end: int) -> Callable[[pd.DataFrame], float]:
-    def bound(rows: pd.DataFrame) -> float:
+def _wilson(end: int) -> Callable[[pd.DataFrame], float | None]:
+    def bound(rows: pd.DataFrame) -> float | None:
         from scipy.stats import binomtest  # half a second to import
 
-        return float(binomtest(int(rows["success"].sum()), len(rows)).proportion_ci(method="wilson")[end])
+        acted = own(rows)["success"]
+        if not len(acted):
+            return None
+        return float(binomtest(int(acted.sum()), len(acted)).proportion_ci(method="wilson")[end])
 
     return bound
 
@@ -182,11 +197,11 @@ JERKS = {"jerk_commanded_linear": "m/s³", "jerk_commanded_angular": "rad/s³", 
 
 _STATISTICS = (
     Metric("episodes", "", "how many episodes the other numbers are of", len),
-    Metric("success_rate", "", "part of the episodes that succeeded", _mean("success")),
+    Metric("success_rate", "", "part of the learner's own episodes that succeeded", _succeeded()),
     Metric("success_low", "", "lower end of the success rate's 95 % interval (Wilson)", _wilson(0)),
     Metric("success_high", "", "upper end of the success rate's 95 % interval (Wilson)", _wilson(1)),
-    Metric("success_rate_last_10", "", "success rate of the last ten episodes", _mean("success", LAST)),
-    Metric("converged_after", "episodes", "those before the first ten in a row that succeed", converged_after),
+    Metric("success_rate_last_10", "", "success rate of the last ten of them", _succeeded(LAST)),
+    Metric("converged_after", "episodes", "those before the first ten own in a row that succeed", converged_after),
     Metric("mean_return", "reward", "return, mean over episodes", _mean("return")),
     Metric("mean_return_last_10", "reward", "return, mean over the last ten episodes", _mean("return", LAST)),
     Metric("mean_steps", STEPS, "length, mean over episodes", _mean("steps")),

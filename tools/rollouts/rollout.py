@@ -7,9 +7,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from guiderail.systems.safety_ledger import SafetyLedger
 from guiderail.tools.rollouts.metrics import Episode, episode_row
 
 Act = Callable[[np.ndarray], np.ndarray]
+COUNTED = {"collision", "saturation", "fallback"}
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,8 @@ class Paths(EnvObserver):
 
 
 class _Tally(EnvObserver):
-    """Adds up what the trace and the ledger don't hold. (Where the simulation failed there is no ledger: then what was
-    seen until there takes its place.)
+    """Adds up what the trace and the ledger don't hold. (Where the simulation failed or a person ended the episode
+    there is no ledger: then what was seen until there takes its place.)
     """
 
     def begin(self) -> None:
@@ -136,6 +138,7 @@ class _Tally(EnvObserver):
         trace = self.base.trace
         force = np.asarray(trace.force)
         seen = {"peak_force": force.max(initial=0.0), "mean_force": force.mean() if len(force) else 0.0, **self._worst}
+        seen |= SafetyLedger.counts(trace.signals) if trace.signals.keys() >= COUNTED else {}
         failed = "simulation_failure" in self._last
         return episode_row(
             Episode(

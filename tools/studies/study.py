@@ -352,7 +352,8 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
     where = job.config(1).environment
     if judged is not None and "difficulty" in judged.env:
         where = changed_environment(job.study.task, where, judged.env)
-    environment = json.dumps(older.options(where), sort_keys=True, default=str) + task_content(job.study.task)
+    content = task_content(job.study.task, where, job.study.imports)
+    environment = json.dumps(older.options(where), sort_keys=True, default=str) + content
     told = said + method + environment + older.task(job.study.task)
     if "{seed}" not in job.study.folder:
         told += f"seed {job.seed}"

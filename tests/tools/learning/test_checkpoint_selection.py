@@ -51,3 +51,12 @@ def test_goes_on_as_it_would_have():
         lived(one, [1, 1, 1, 1, 1], first=5, row=1)
     assert selected(first) == selected(second) == 7
     assert first.state()[1] == second.state()[1]
+
+
+def test_an_episode_that_is_left_out_is_as_if_it_had_not_been():
+    plain, left_out = lived(CheckpointSelection(3), [0, 1, 1]), lived(CheckpointSelection(3), [0, 1])
+    left_out.begin(torch.nn.Linear(1, 1), 1)
+    left_out.leave_out()
+    lived(left_out, [1], first=2, row=1)
+    assert selected(left_out) == selected(plain) == 2
+    assert left_out.state()[1] == plain.state()[1]

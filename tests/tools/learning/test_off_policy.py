@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -9,7 +10,7 @@ from stable_baselines3 import TD3
 
 from guiderail.diagrams.task import Symmetry
 from guiderail.models.errors import InputError
-from guiderail.tools.learning.learner import LEARNERS, register_learner
+from guiderail.tools.learning.learner import LEARNERS, arguments_of, register_learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, policy_of
 from guiderail.tools.learning.presets import PRESETS, resolve_preset
 from guiderail.tools.rollouts.rollout import Decision
@@ -318,3 +319,37 @@ def test_a_network_that_a_policy_cannot_hold_is_refused(preset):
     actor.latent_pi[1] = torch.nn.GELU()
     with pytest.raises(InputError, match="GELU"):
         policy_of(actor, {"observation_shape": [3]})
+
+
+def test_where_the_simulation_failed_nothing_followed(preset):
+    """No decision is remembered of it, and what came before is the episode's last, without being its end."""
+    learner, seen = make(preset), np.zeros(3, np.float32)
+    failed = Decision(seen, np.zeros(2), 0.0, seen, False, True, {"simulation_failure": "it diverged"})
+    for following in ((failed,), (decision(seen, np.zeros(2), 1.0, seen), failed)):
+        learner.begin()
+        for one in following:
+            learner.see(one)
+    buffer = learner.model.replay_buffer
+    assert (buffer.size(), learner.decisions) == (1, 1)
+    assert (buffer.dones[0], buffer.timeouts[0]) == (1, 1)
+
+
+def test_where_a_person_pushed_nothing_is_said_of_the_policy(preset):
+    learner = make(replace(preset, greedy_share=1.0, constant_episodes=0, learning_starts=1))
+    live(learner, 2)
+    for interventions, row in ((0, 1), (2, 1), (0, 2)):
+        learner.begin()
+        assert learner._greedy
+        learner.end({"success": 1, "interventions": interventions})
+        assert learner._greedy_successes == row
+    assert len(learner.selection._open) == 2
+
+
+def test_what_a_person_pushed_has_no_other_sides():
+    task = SimpleNamespace(symmetry="both", near_symmetry="all", num_steps=10)
+    learner = SimpleNamespace(symmetry="near")
+    for pushed, environment, sides in ((False, {}, "all"), (True, {}, None), (False, {"via_points": (1.0, 2.0)}, None)):
+        config = SimpleNamespace(
+            episodes=1, hold=1, seed=0, learner=learner, with_person=pushed, environment=environment
+        )
+        assert arguments_of(config, task)["symmetry"] == sides

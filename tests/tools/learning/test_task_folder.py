@@ -86,4 +86,4 @@ def test_what_was_judged_of_another_task_is_not_taken_for_this_one(folder, tmp_p
 
 
 def test_a_task_that_is_code_has_no_files():
-    assert task_content("NarrowPassage") == task_content("Bead") == ""
+    assert task_content("NarrowPassage", {}, ()) == task_content("Bead", {}, ()) == ""

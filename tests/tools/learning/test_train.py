@@ -5,18 +5,22 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
 import threadpoolctl
 from safetensors.numpy import load_file
 
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.configure import configure, run, with_defaults
+from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import train
+from guiderail.tools.rollouts.evaluate import kept_file
 from guiderail.tools.tasks import make_environment
 
 # Trains like the fixture's run, and says after each episode that it is over; then the parent pulls the plug.
@@ -297,3 +301,86 @@ def test_a_learner_that_was_asked_for_is_taken_whole():
     given = with_defaults("GridClamp", {"algorithm": "tqc"})
     assert given == {"algorithm": "tqc"}
     assert configure("GridClamp", {"guidance": "none"}, **given).preset == "robust"
+
+
+@pytest.mark.parametrize("pipelined", [False, True])
+def test_a_run_that_diverges_says_so_and_what_it_was_is_kept(pipelined, bead_config, tmp_path, forkserver):
+    learner = replace(bead_config.learner, learning_rate=1e30, constant_episodes=0, pipelined=pipelined)
+    folder = RunFolder(tmp_path / "run")
+    with pytest.raises(InputError, match="diverged"):
+        train(folder, replace(bead_config, learner=learner))
+    assert (folder.path / "config.yaml").exists()
+    assert not (folder.path / "policy.json").exists()
+
+
+def test_more_than_fits_into_memory_is_refused_before_a_run_begins(bead_config, tmp_path, monkeypatch):
+    def vast(*given, **named):
+        raise MemoryError("no 44 GiB")
+
+    monkeypatch.setitem(LEARNERS._entries, "vast", vast)
+    with pytest.raises(InputError, match="buffer_size"):
+        train(RunFolder(tmp_path / "run"), replace(bead_config, learner=replace(bead_config.learner, algorithm="vast")))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_goes_on_by_the_words_that_began_it_and_says_of_other_versions(tmp_path, capsys):
+    words = {"environment": {"guidance": "kgrl", "explored": "0,1"}, "settings": {"units": "8"}}
+    out = tmp_path / "run"
+    run("NarrowPassage", out, episodes=1, **words)
+    folder = RunFolder(out)
+    folder.write_config(replace(folder.config(), versions={**folder.config().versions, "drake": "1.0.0"}))
+    for _ in range(2):
+        run("NarrowPassage", out, episodes=2, resume=True, **words)
+    said = capsys.readouterr().err
+    assert said.count("goes on with other versions: drake 1.0.0, then ") == 1
+    assert folder.config().versions["drake"].startswith("1.0.0, then ")
+    with pytest.raises(InputError, match="has 2 episodes"):
+        run("NarrowPassage", out, episodes=1, resume=True, **words)
+
+
+def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monkeypatch):
+    monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # no other test has this one
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "from guiderail.diagrams.tasks.narrow_passage import NarrowPassage\n"
+        "from guiderail.diagrams.tasks.registry import register_task\n"
+        "@register_task('changes/Passage')\nclass Mine(NarrowPassage):\n    pass\n"
+    )
+    out = tmp_path / "run"
+    run("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
+    config = RunFolder(out).config()
+    before = kept_file(out, "white", config, config.environment, episodes=2)
+    file.write_text(file.read_text() + "# now it is another one\n")
+    with pytest.raises(InputError, match="are not those that the run"):
+        run(None, out, environment={}, episodes=2, resume=True)
+    assert kept_file(out, "white", config, config.environment, episodes=2) != before
+    gymnasium.registry.pop(environment_id("changes/Passage"), None)
+
+
+def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, forkserver, monkeypatch):
+    monkeypatch.setitem(LEARNERS._entries, "sac_of_mine", None)  # no other test has this one
+    file = tmp_path / "own_learner.py"
+    file.write_text(
+        "from guiderail.tools.learning.learner import register_learner\n"
+        "from guiderail.tools.learning.off_policy import SacLearner\n"
+        "@register_learner('sac_of_mine')\nclass Mine(SacLearner):\n    pass\n"
+    )
+    settings = {"units": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
+    done = run(
+        "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "hold": 20}, algorithm="sac_of_mine",
+        settings=settings, episodes=2, imports=[str(file)],
+    )  # fmt: skip
+    assert done["episodes"] == 2
+
+
+def test_a_demonstrated_episode_is_marked(bead_config, tmp_path):
+    rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=always_left)
+    assert [row["demonstrated"] for row in rows[:3]] == [1, 1, 0]
+
+
+def test_a_folder_that_cannot_be_one_is_refused(tmp_path):
+    folder = RunFolder(tmp_path / ("n" * 300))
+    with pytest.raises(InputError, match="folder"):
+        folder.refuse_existing()
+    with pytest.raises(InputError, match="cannot be read"):
+        folder.config()

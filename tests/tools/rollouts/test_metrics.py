@@ -1,3 +1,4 @@
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
@@ -73,3 +74,33 @@ def test_the_ledger_says_what_the_trace_says():
     assert row["collisions"] == (np.diff(trace.force > 0, prepend=False) & (trace.force > 0)).sum()
     jerk = np.linalg.norm(np.diff(trace.commanded, 3, axis=0), axis=1).mean() / trace.period**3
     assert row["jerk_commanded_linear"] == pytest.approx(jerk, rel=1e-12)
+
+
+@pytest.mark.parametrize("gone", ["ledger", "nothing"])
+def test_without_a_ledger_what_the_trace_saw_is_counted(gone):
+    """Where a simulation failed or a person ended the episode, what had happened is no zero."""
+
+    class WithoutIt(gymnasium.Wrapper):
+        def step(self, action):
+            *what, info = super().step(action)
+            return *what, {key: value for key, value in info.items() if key != gone}
+
+    env = WithoutIt(make_environment("NarrowPassage", {"guidance": "residual"}))
+    random = np.random.default_rng(0)
+    row = rollout(env, lambda observation: random.uniform(-1, 1, 2), seed=0)
+    touches = env.unwrapped.trace.force > 0
+    assert row["collision_steps"] == touches.sum() > 0
+    assert row["collisions"] == (np.diff(touches, prepend=False) & touches).sum()
+    assert row["saturations"] == env.unwrapped.trace.signals["saturation"].any(axis=1).sum()
+
+
+def test_what_was_demonstrated_is_no_success_of_the_learner():
+    rows = episodes("1" * 12 + "00" + "1" * 10, demonstrated=[1] * 12 + [0] * 12)
+    assert converged_after(rows) == 14
+    assert converged_after(episodes("1" * 12, demonstrated=[1] * 12)) is None
+    found = summary(rows, ("success_rate", "success_low", "success_rate_last_10"))
+    assert found["success_rate"] == pytest.approx(10 / 12)
+    assert found["success_low"] == pytest.approx(0.5520, abs=1e-3)
+    assert summary(episodes("1", demonstrated=[1]), ("success_rate", "success_low")) == dict.fromkeys(
+        ("success_rate", "success_low")
+    )
