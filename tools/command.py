@@ -548,7 +548,7 @@ def study(
     running = make_engine(engine, processes, address)
     from guiderail.tools.studies.study import study_command
 
-    found = study_command(chosen, out, running)
+    found = study_command(chosen, out, running, declared.part_name(chosen))
     differs = {} if as_json else found.pop("differs_from_thesis", {})
     _print(found, as_json)
     for methods, words in differs.items():
@@ -632,8 +632,9 @@ def bench(
     """
     from guiderail.tools.benchmarks import run_benchmark
 
-    task = None if task is None else _named(task, imports)[0]
-    result, show = run_benchmark(what, picture=picture, task=task, environment=_environment(env))
+    name, folder = (None, ()) if task is None else _named(task, imports)
+    told = (*folder, *map(str, imports or ()))
+    result, show = run_benchmark(what, picture=picture, task=name, environment=_environment(env), imports=told)
     typer.echo(json.dumps(result)) if as_json else show(result)
 
 

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
+from guiderail.tools.files import check_picture
 
 Item = TypeVar("Item")
 BENCHMARKS = (
@@ -24,6 +25,7 @@ BENCHMARKS = (
     "many_envs",
 )
 OF_A_TASK = ("training", "cold_start")  # those that are told which task, and how it is set up
+OF_OTHER_PROCESSES = ("cold_start",)  # those that have to tell them what registers the task
 DRAWN = ("time_step", "engines")  # those that can be drawn
 
 
@@ -35,7 +37,7 @@ def run_benchmark(
     Args:
         what: its name.
         picture: where a picture of it is written, if it can be drawn.
-        told_of: `task` and `environment`, where it takes them.
+        told_of: `task`, `environment` and `imports`, where it takes them.
 
     Raises:
         InputError: if there is no such benchmark, it takes no task, or it can't be drawn.
@@ -47,6 +49,10 @@ def run_benchmark(
         raise InputError(f"the benchmark {what} is of no task: leave {' and '.join(given)} out")
     if picture is not None and what not in DRAWN:
         raise InputError(f"the benchmark {what} is printed and not drawn: leave --picture out")
+    if picture is not None:
+        check_picture(picture)
+    if what not in OF_OTHER_PROCESSES:
+        given.pop("imports", None)
     module = import_module(f"guiderail.tools.benchmarks.{what}")
     results = module.measure(**given)
     if picture is not None:

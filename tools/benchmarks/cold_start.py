@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ REQUIRED_MEDIAN, REQUIRED_WORST = 60.0, 120.0  # [s]
 def measure(
     task: str | None = None,
     environment: Mapping[str, Any] | None = None,
+    imports: Sequence[str] = (),
     *,
     episodes: int = EPISODES,
     seeds: range = SEEDS,
@@ -46,6 +47,7 @@ def measure(
     Args:
         task: what is learned.
         environment: its options; the connector's with a hidden offset per run unless any is given.
+        imports: modules or files that register the task, where nothing installed does.
         episodes: how many are learned from.
         seeds: of the runs.
         held_out: how many episodes judge a policy.
@@ -59,18 +61,22 @@ def measure(
     with tempfile.TemporaryDirectory() as folder:
         for seed, kind in told([(seed, kind) for seed in seeds for kind in KINDS], "run"):
             out = Path(folder) / f"{seed}-{KINDS[kind]}"
-            seconds = _train(task, options, episodes, seed, KINDS[kind], out)
+            seconds = _train(task, options, episodes, seed, KINDS[kind], out, imports)
             judged = evaluate_run(RunFolder(out).config(), partial(as_learned, Policy.load(out)), episodes=held_out)
             success = float((judged["termination"] == "success").mean())
             runs.append({"kind": kind, "seed": seed, "seconds": seconds, "success_rate": success})
     return {"task": task, "environment": dict(options), "episodes": episodes, "held_out": held_out, "runs": runs}
 
 
-def _train(task: str, options: Mapping[str, Any], episodes: int, seed: int, pipelined: str, out: Path) -> float:
+def _train(
+    task: str, options: Mapping[str, Any], episodes: int, seed: int, pipelined: str, out: Path, imports: Sequence[str]
+) -> float:
     words = [sys.executable, "-c", "from guiderail.tools.command import main; main()", "train", task, "--json"]
     words += ["--episodes", str(episodes), "--seed", str(seed), "--set", f"pipelined={pipelined}", "--out", str(out)]
     for name, value in options.items():
         words += ["--env", f"{name}={value}"]
+    for module in imports:
+        words += ["--import", module]
     start = time.perf_counter()
     ended = subprocess.run(words, capture_output=True, text=True)
     seconds = time.perf_counter() - start

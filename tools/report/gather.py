@@ -131,16 +131,20 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
     Raises:
         InputError: if a folder holds no run, or a file of it is damaged.
     """
-    folders, held_out, tables = [], [], False
+    folders: list[Path] = []
+    alone: list[Path] = []  # runs that are no part of a study
+    held_out, tables = [], False
     for path in paths:
         if (path / "config.yaml").is_file():
             folders.append(path)
+            alone.append(path.resolve())
             continue
         inside = sorted(file.parent for file in path.rglob("config.yaml")) if path.is_dir() else []
         studied = _study_tables(path) if path.is_dir() else []
         if not inside and not studied:
             raise InputError(f"{path} holds no run: give folders that guiderail train or guiderail study made")
         folders += inside
+        alone += [] if studied else [folder.resolve() for folder in inside]
         held_out += studied
         tables = tables or bool(studied)
     read = {folder.resolve(): RunFolder(folder) for folder in folders}
@@ -149,8 +153,7 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
     if not runs and not held_out:
         raise InputError(f"{paths[0]} has no finished episode yet: let it train, then report on it")
     _name_methods(runs)
-    if not held_out:
-        held_out = [_judged(run, episodes) for run in runs]
+    held_out += [_judged(run, episodes) for run in runs if run.path.resolve() in alone]
     name = paths[0].resolve().name if len(paths) == 1 else ", ".join(dict.fromkeys(run.config.task for run in runs))
     tables_of_rows = [table for table in held_out if len(table)]
     judged = pd.concat(tables_of_rows, ignore_index=True) if tables_of_rows else pd.DataFrame()

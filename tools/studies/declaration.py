@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
@@ -132,6 +132,23 @@ class Study(_Strict):
     def judgements(self) -> tuple[JudgedOn, ...]:
         """All that is judged on, sweeps included."""
         return (*self.judged_on, *(sweep.judged_on(value) for sweep in self.sweeps for value in sweep.at))
+
+    @model_validator(mode="after")
+    def _is_told_apart(self) -> Study:
+        names = [judged.name for judged in self.judgements]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"two things that are judged on are called {twice!r}: give each a name of its own")
+        for ratio in self.ratios:
+            for method in (ratio.method, ratio.against):
+                if method not in self.methods:
+                    raise ValueError(f"a ratio is of no method {method!r}: {did_you_mean(method, self.methods)}")
+        return self
+
+    def part_name(self, chosen: Study) -> str | None:
+        """What the table of a part of this study is called; None for all of it, which has the study's own name."""
+        methods = [] if chosen.methods.keys() == self.methods.keys() else list(chosen.methods)
+        seeds = [] if chosen.seeds == self.seeds else [str(seed) for seed in chosen.seeds]
+        return "-".join([self.name, *methods, *seeds]) if methods or seeds else None
 
     def only(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
         """The same study with some of its methods, or with other seeds.

@@ -124,6 +124,8 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
         told = [method, mark or "–", judged or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
+    if missing := [method for method in study.methods if method not in set(rows["method"])]:
+        lines += ["", f"Declared by the study, and not in this table: {', '.join(missing)}."]
     import_modules(study.imports)
     differing: dict[str, list[str]] = {}
     for method in (m for m, one in study.methods.items() if one.policy == LEARNED and m in set(rows["method"])):

@@ -22,6 +22,7 @@ from rich.console import Console
 
 from guiderail.models.errors import InputError, RunsFailedError
 from guiderail.models.policy import Policy
+from guiderail.models.registry import did_you_mean
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning import older
 from guiderail.tools.learning.configure import configure, with_defaults
@@ -134,6 +135,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
     jobs = [
         Job(study, name, seed, out) for name, method in study.methods.items() for seed in method.seeds or study.seeds
     ]
+    _check_ratios(study)
     for job in jobs:
         _check(job)
     _refuse_shared_folders(jobs)
@@ -149,8 +151,10 @@ def run_study(study: Study, out: Path, engine: Engine | None = None, console: Co
     return rows
 
 
-def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict[str, Any]:
-    """Runs a study, writes `<name>.csv` and `.md`, and says what the rows come to, each seed by itself.
+def study_command(study: Study, out: Path, engine: Engine | None = None, table: str | None = None) -> dict[str, Any]:
+    """Runs a study, writes a table, `.csv` and `.md`, and says what the rows come to, each seed by itself.
+
+    The table has the study's name unless another is given, as to a part of a study.
 
     `differs_from_thesis` says in what, by the methods that do.
 
@@ -163,9 +167,9 @@ def study_command(study: Study, out: Path, engine: Engine | None = None) -> dict
         rows, result["failed"] = error.rows, error.sentences
         if not len(rows):
             return result
-    result["table"] = str(write_table(out / study.name, rows.drop(columns="folder")))
+    result["table"] = str(write_table(out / (table or study.name), rows.drop(columns="folder")))
     if study.sweeps:
-        result["picture"] = str(draw_sweeps(study, rows, out / f"{study.name}.png"))
+        result["picture"] = str(draw_sweeps(study, rows, out / f"{table or study.name}.png"))
         result |= broken(study, rows)
     for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
         after = f" after {mark} episodes" if mark else ""
@@ -218,6 +222,13 @@ def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
     }
 
 
+def _check_ratios(study: Study) -> None:
+    known = {*JUDGED, *(f"training_{name}" for name in (*TRAINING, *study.statistics))}
+    for one in study.ratios:
+        if one.of not in known:
+            raise InputError(f"the study {study.name} has no column {one.of!r}: {did_you_mean(one.of, known)}")
+
+
 def _outcomes(jobs: list[Job], engine: Engine, console: Console | None) -> dict[int, Outcome]:
     """What became of each job; those that only have to be read are read here."""
     done = {index: job for index, job in enumerate(jobs) if _is_done(job)}
@@ -256,7 +267,7 @@ def _check(job: Job) -> None:
         where = changed_environment(config.task, config.environment, judged.env)
         configure(job.study.task, where | sampled, episodes=1)
     for mark, judged in itertools.product(job.marks, job.study.judgements):
-        _refuse_other_rows(job, _evaluated_file(job, mark, judged), judged)
+        _refuse_other_rows(job, _evaluated_file(job, mark, judged), judged, mark)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
         for mark in job.marks:
@@ -344,8 +355,10 @@ def _policy_folder(job: Job, mark: int) -> Path:
     return job.folder.path / "marks" / str(mark)
 
 
-def _digest(job: Job, judged: JudgedOn | None = None) -> str:
-    """What a file was evaluated with: other episodes of the same name, or another method's, are not taken for these."""
+def _digest(job: Job, judged: JudgedOn | None = None, mark: int = 0) -> str:
+    """What a file was evaluated with: other episodes of the same name, another method's, or those of a policy that
+    learned longer, are not taken for these.
+    """
     method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
     said = "" if judged is None else judged.model_dump_json(exclude={"name", "file"})
     # As resolved: what a difficulty stands for may change, and what was evaluated before is then another task.
@@ -355,6 +368,8 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
     content = task_content(job.study.task, where, job.study.imports)
     environment = json.dumps(older.options(where), sort_keys=True, default=str) + content
     told = said + method + environment + older.task(job.study.task)
+    if judged is not None and mark and "{mark}" not in judged.file:
+        told += f"mark {mark}"
     if "{seed}" not in job.study.folder:
         told += f"seed {job.seed}"
     return hashlib.blake2b(told.encode(), digest_size=4).hexdigest()
@@ -363,12 +378,12 @@ def _digest(job: Job, judged: JudgedOn | None = None) -> str:
 def _evaluated(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
     """Rows of held-out episodes, from the file where they are known already."""
     file = _evaluated_file(job, mark, judged)
-    _refuse_other_rows(job, file, judged)
+    _refuse_other_rows(job, file, judged, mark)
 
     def evaluated() -> pd.DataFrame:
         rows = _evaluate(job, mark, judged)
         if "{digest}" not in judged.file:
-            write_atomically(_says_of_what(file), _digest(job, judged).encode())
+            write_atomically(_says_of_what(file), _digest(job, judged, mark).encode())
         return rows
 
     return cached(file, evaluated)
@@ -379,19 +394,19 @@ def _says_of_what(file: Path) -> Path:
     return file.with_name(f".{file.name}.digest")
 
 
-def _refuse_other_rows(job: Job, file: Path, judged: JudgedOn) -> None:
+def _refuse_other_rows(job: Job, file: Path, judged: JudgedOn, mark: int) -> None:
     """Another study's rows of the same name are not taken for these."""
     says = _says_of_what(file)
-    if "{digest}" not in judged.file and says.exists() and says.read_text() != _digest(job, judged):
+    if "{digest}" not in judged.file and says.exists() and says.read_text() != _digest(job, judged, mark):
         raise InputError(
-            f"{file} holds episodes of another study, or of other settings: name another folder with --out, or write "
-            "{digest} into the file's name"
+            f"{file} holds episodes of another study, of other settings or after other training: name another folder "
+            "with --out, or write {mark} and {digest} into the file's name"
         )
 
 
 def _evaluated_file(job: Job, mark: int, judged: JudgedOn) -> Path:
     words = {"name": judged.name.replace(" ", "_"), "mark": mark, "episodes": judged.episodes}
-    return job.folder.path / judged.file.format(**words, digest=_digest(job, judged))
+    return job.folder.path / judged.file.format(**words, digest=_digest(job, judged, mark))
 
 
 def _evaluate(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:

@@ -48,8 +48,8 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
                 axis.plot(at, BREAKS, "x", color=line.get_color(), markersize=9, markeredgewidth=2)
         axis.axhline(BREAKS, color="0.7", linewidth=0.7, linestyle=":")
         axis.set(xlabel=sweep.quantity, ylabel="success", ylim=(-0.03, 1.03))
-        easiest, *_, hardest = sweep.at
-        if easiest > hardest:
+        values = list(sweep.at)
+        if values[0] > values[-1]:
             axis.invert_xaxis()
     legend(figure, axes.flat[0])
     return save_figure(figure, path)

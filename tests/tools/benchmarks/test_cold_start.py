@@ -14,11 +14,12 @@ def test_both_kinds_of_each_seed_are_timed_and_judged(monkeypatch, bead_config, 
 
     def run(words, **_):
         asked.append(words[words.index("--set") + 1])
+        assert words[words.index("--import") + 1] == "bead"
         train(RunFolder(Path(words[words.index("--out") + 1])), bead_config)
         return subprocess.CompletedProcess(words, 0)
 
     monkeypatch.setattr(cold_start.subprocess, "run", run)
-    found = cold_start.measure("Bead", episodes=1, seeds=range(2, 4), held_out=3)
+    found = cold_start.measure("Bead", None, ("bead",), episodes=1, seeds=range(2, 4), held_out=3)
     kinds = list(cold_start.KINDS)
     assert [(run["seed"], run["kind"]) for run in found["runs"]] == [(s, k) for s in (2, 3) for k in kinds]
     assert asked == ["pipelined=false", "pipelined=true"] * 2

@@ -32,3 +32,9 @@ def test_it_is_shown_and_drawn(results, tmp_path, capsys, monkeypatch):
 def test_what_is_printed_is_not_drawn(tmp_path):
     with pytest.raises(InputError, match="leave --picture out"):
         run_benchmark("learner", picture=tmp_path / "learner.png")
+
+
+def test_a_picture_that_cannot_be_drawn_is_refused_before_anything_is_measured(monkeypatch, tmp_path):
+    monkeypatch.setattr(time_step, "measure", lambda: pytest.fail("it was measured"))
+    with pytest.raises(InputError, match=r"\.txt"):
+        run_benchmark("time_step", picture=tmp_path / "errors.txt")

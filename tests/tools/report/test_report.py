@@ -135,3 +135,11 @@ def test_what_is_no_page_is_refused_before_anything_is_read(name, tmp_path):
 def test_a_folder_without_runs_is_refused(tmp_path):
     with pytest.raises(InputError, match="holds no run"):
         write_report([tmp_path], tmp_path / "report.html")
+
+
+def test_a_run_that_lies_beside_a_study_is_judged_too(studied, tmp_path):
+    run = tmp_path / "alone"
+    train(RunFolder(run), configure("Bead", {}, settings=SETTINGS, episodes=2, seed=9))
+    judged = gather([run, studied], episodes=2).held_out
+    assert set(judged["seed"]) == {1, 2, 9}
+    assert judged[(judged["seed"] == 9) & (judged["policy"] == "learned")]["episodes"].tolist() == [2]

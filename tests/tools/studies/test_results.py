@@ -32,6 +32,7 @@ def test_every_seed_stands_beside_the_thesis_with_what_differs(finished, tmp_pat
     assert "guiderail study connector --out studies" in page
     (differs,) = (line for line in page.splitlines() if line.startswith("Differs from the thesis in (skgrl)"))
     assert "reward shaped (thesis: sparse)" in differs
+    assert "Declared by the study, and not in this table: kgrl" in page
 
 
 def test_a_study_that_judges_nothing_has_its_rows_too(finished, tmp_path):

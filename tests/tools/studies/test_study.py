@@ -13,7 +13,7 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import evaluate_policy
 from guiderail.tools.rollouts.metrics import STATISTICS
 from guiderail.tools.rollouts.null_policies import always
-from guiderail.tools.studies.declaration import JudgedOn, Study, load_study, shipped_studies
+from guiderail.tools.studies.declaration import JudgedOn, Ratio, Study, load_study, shipped_studies
 from guiderail.tools.studies.engines.engine import make_engine
 from guiderail.tools.studies.study import Job, _check, differences_of, differing, each, ratio, run_study, study_command
 from guiderail.tools.studies.sweep import AT_ONCE, NEVER, breaking_point
@@ -261,7 +261,7 @@ def test_a_ratio_is_of_sums_and_a_number_that_never_was_says_so():
     rows = pd.DataFrame(
         {"method": ["a", "a", "b", "b"], "seed": [0, 1, 0, 1], "force": [1.0, 2.0, 4.0, 2.0], "after": [3, None, 1, 2]}
     )
-    wanted = study(ratios=[{"of": "force", "method": "a", "against": "b"}]).ratios[0]
+    wanted = Ratio(of="force", method="a", against="b")
     assert list(ratio(rows, wanted).values()) == ["0.25, 1.00", "0.50"]
     assert ratio(rows[:2], wanted) == ratio(rows[:3], wanted) == {}
     assert ratio(rows.assign(seed=[0, 1, 1, 2]), wanted) == {}
@@ -290,6 +290,9 @@ WRONG = [
     ({"folder": "{method}-{seed"}, "has braces that nothing fills"),
     ({"judged on": [{"file": "{mark}-{seed}.csv"}]}, "it may have {name}, {mark}, {episodes}, {digest}"),
     ({"statistics": ["sucess_rate"]}, "did you mean success_rate"),
+    ({"judged on": [{"episodes": 2}, {"episodes": 3}]}, "called 'held out'"),
+    ({"ratios": [{"of": "mean_force", "method": "learnt", "against": "learner"}]}, "did you mean learner"),
+    ({"ratios": [{"of": "mean_fource", "method": "learner", "against": "learner"}]}, "did you mean mean_force"),
 ]
 
 
@@ -374,3 +377,26 @@ def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
     assert found["nothing, below 90% at wall [m]"] == "from the easiest on"
     assert (tmp_path / "beads.png").stat().st_size > 10_000
     assert run_study(one, tmp_path, make_engine(processes=1))["judged_on"].tolist() == rows["judged_on"].tolist()
+
+
+def test_a_policy_that_learned_longer_is_judged_by_itself_whatever_the_file_is_called(tmp_path):
+    judged = [{"episodes": 2, "file": "held_out-{episodes}-{digest}.csv"}]
+    run(study(marks=[2], seeds=[5], **{"judged on": judged}), tmp_path)
+    run(study(marks=[4], seeds=[5], **{"judged on": judged}), tmp_path)
+    assert len(list((tmp_path / "learner-5").glob("held_out-2-*.csv"))) == 2
+    same = [{"episodes": 2, "file": "held_out.csv"}]
+    run(study(marks=[4], seeds=[5], **{"judged on": same}), tmp_path)
+    with pytest.raises(InputError, match="after other training"):
+        run(study(marks=[6], seeds=[5], **{"judged on": same}), tmp_path)
+
+
+def test_a_part_of_a_study_does_not_take_the_place_of_its_table(tmp_path):
+    methods = {"learner": {}, "nothing": {"policy": "zero"}}
+    (tmp_path / "beads.yaml").write_text(yaml.safe_dump(BEAD | {"methods": methods, "marks": [2]}))
+    for words, rows in (([], 4), (["--methods", "nothing"], 2), (["--seeds", "5"], 2)):
+        with pytest.raises(SystemExit) as end:
+            main(["study", str(tmp_path / "beads.yaml"), "--out", str(tmp_path / "out"), "--processes", "1", *words])
+        assert end.value.code == 0
+        name = "-".join(["beads", *words[1:]])
+        assert len(read_table(tmp_path / "out" / f"{name}.csv")) == rows
+    assert len(read_table(tmp_path / "out" / "beads.csv")) == 4

@@ -2,7 +2,8 @@ import pandas as pd
 import pytest
 
 from guiderail.tools.report.statistics import wilson
-from guiderail.tools.studies.sweep import _success
+from guiderail.tools.studies.declaration import Study
+from guiderail.tools.studies.sweep import _success, draw_sweeps
 
 
 def rows(*rates):
@@ -15,3 +16,12 @@ def test_a_band_is_as_wide_as_the_seeds_differ():
     assert _success(rows(1.0, 0.0), "one", "x") == pytest.approx((0.5, wilson(0, 50)[0], wilson(50, 50)[1]))
     assert _success(rows(1.0, 1.0), "one", "x") == pytest.approx((1.0, *wilson(50, 50)))
     assert _success(rows(1.0), "another", "x") is None
+
+
+def test_a_sweep_of_one_value_is_drawn(tmp_path):
+    study = Study.model_validate(
+        {"name": "one", "task": "Bead", "methods": {"one": {"policy": "zero"}}, "seeds": [0], "judged on": [],
+         "sweeps": [{"quantity": "x", "at": {1.0: {}}}]}
+    )  # fmt: skip
+    found = rows(0.5).assign(judged_on="x 1")
+    assert draw_sweeps(study, found, tmp_path / "one.png").is_file()
