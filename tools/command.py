@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -928,8 +929,7 @@ def main(arguments: list[str] | None = None) -> None:
             _say(sentence)
         code = 1
     except (KeyboardInterrupt, typer.Abort):
-        go_on = {"train": "; go on with --resume", "study": "; the same command goes on where it was"}
-        _say(f"stopped{go_on.get(arguments[0] if arguments else '', '')}")
+        _say(f"stopped{_how_to_go_on(arguments)}")
         code = 130
     except BrokenPipeError:
         code = 1
@@ -938,6 +938,17 @@ def main(arguments: list[str] | None = None) -> None:
             raise
         code = _refuse(_usage_sentence(error))
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _how_to_go_on(arguments: list[str]) -> str:
+    """Of a command that was stopped; a run without a checkpoint, as on a robot, does not go on."""
+    what, *words = map(str, [*arguments, ""])
+    if what == "study":
+        return "; the same command goes on where it was"
+    values = [word.partition("=")[2] or following for word, following in pairwise(words) if word.startswith("--out")]
+    if what == "train" and values and (Path(values[-1]) / "checkpoint").is_dir():
+        return "; go on with --resume"
+    return ""
 
 
 def _usage_sentence(error: Any) -> str:

@@ -319,3 +319,26 @@ def test_a_robot_and_what_is_imported_reach_whoever_learns_on_it(typed, robot, c
     assert call(capsys, *typed)[0] == 0
     assert (asked["other"].robot, asked["other"].rate) == (robot, 0.5)
     assert asked["given"]["imports"] == (str(file),)
+
+
+@pytest.mark.parametrize(
+    ("typed", "checkpoint", "words"),
+    [
+        (["train", "BncConnector", "--out"], True, "stopped; go on with --resume"),
+        (["train", "BncConnector", "--out"], False, "stopped"),  # as of a robot, which goes on with nothing
+        (["study", "connector", "--out"], False, "stopped; the same command goes on where it was"),
+        (["evaluate"], False, "stopped"),
+    ],
+)
+def test_whoever_stops_a_command_is_told_how_it_goes_on(typed, checkpoint, words, capsys, tmp_path, monkeypatch):
+    def stop(**given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("guiderail.tools.command.app", stop)
+    if checkpoint:
+        (tmp_path / "checkpoint").mkdir()
+    for last in ([*typed, str(tmp_path)], [*typed[:-1], f"{typed[-1]}={tmp_path}"]):
+        with pytest.raises(SystemExit) as end:
+            main(last)
+        assert end.value.code == 130
+        assert capsys.readouterr().err.strip().removeprefix("guiderail: ") == words
