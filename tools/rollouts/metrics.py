@@ -201,9 +201,7 @@ _STATISTICS = (
     Metric("success_low", "", "lower end of the success rate's 95 % interval (Wilson)", _wilson(0)),
     Metric("success_high", "", "upper end of the success rate's 95 % interval (Wilson)", _wilson(1)),
     Metric("success_rate_last_10", "", "success rate of the last ten of them", _succeeded(LAST)),
-    Metric(
-        "converged_after", "episodes", "those before the first ten in a row that succeed, of its own", converged_after
-    ),
+    Metric("converged_after", "episodes", "before the first ten in a row that succeed, its own", converged_after),
     Metric("mean_return", "reward", "return, mean over episodes", _mean("return")),
     Metric("mean_return_last_10", "reward", "return, mean over the last ten episodes", _mean("return", LAST)),
     Metric("mean_steps", STEPS, "length, mean over episodes", _mean("steps")),

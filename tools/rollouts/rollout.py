@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.systems.safety_ledger import SafetyLedger
 from guiderail.tools.rollouts.metrics import Episode, episode_row
 
 Act = Callable[[np.ndarray], np.ndarray]
@@ -138,7 +137,10 @@ class _Tally(EnvObserver):
         trace = self.base.trace
         force = np.asarray(trace.force)
         seen = {"peak_force": force.max(initial=0.0), "mean_force": force.mean() if len(force) else 0.0, **self._worst}
-        seen |= SafetyLedger.counts(trace.signals) if trace.signals.keys() >= COUNTED else {}
+        if "ledger" not in self._last and trace.signals.keys() >= COUNTED:
+            from guiderail.systems.safety_ledger import SafetyLedger  # Drake takes a second
+
+            seen |= SafetyLedger.counts(trace.signals)
         failed = "simulation_failure" in self._last
         return episode_row(
             Episode(
