@@ -54,6 +54,11 @@ TASKS: dict[str, list[Row]] = {
         Row("residual RL", "connector_guidance", "residual"),
         *_nulls("connector_nulls", ("demonstrations", "white", "best_constant", "rule"), "calibration"),
     ],
+    "**connector**, another offset in every episode": [
+        Row("KGRL", "connector_disc", "kgrl"),
+        Row("sKGRL", "connector_disc", "skgrl"),
+        *_nulls("connector_nulls", ("demonstrations", "white", "best_constant", "rule"), "disc"),
+    ],
     "**connector, hard**": [
         Row("KGRL", "connector_hard", "kgrl"),
         Row("sKGRL, adaptive history", "connector_hard", "skgrl_adaptive"),
@@ -61,6 +66,13 @@ TASKS: dict[str, list[Row]] = {
         Row("residual RL", "connector_hard", "residual"),
         Row("safe residual RL", "connector_hard", "safe_residual"),
         *_nulls("connector_hard_nulls", ("demonstrations", "white", "best_constant", "rule")),
+    ],
+    "**connector, hard**, commands within 2.8 mm": [
+        Row("KGRL", "connector_hard_safety", "kgrl"),
+        Row("sKGRL, adaptive history", "connector_hard_safety", "skgrl_adaptive"),
+        Row("residual RL", "connector_hard_safety", "residual"),
+        Row("safe residual RL", "connector_hard_safety", "safe_residual"),
+        *_nulls("connector_hard_safety", ("demonstrations", "white", "rule"), names=(*NULLS[:2], NULLS[3])),
     ],
     "**grid clamp**": [
         Row("RL-SCT", "grid_clamp", "sct"),

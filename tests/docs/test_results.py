@@ -27,7 +27,8 @@ def test_standard_tasks_hardly_ask_for_anything():
 
 
 @pytest.mark.parametrize(
-    ("study", "nothing"), [("connector_hard_nulls", "demonstrations"), ("grid_clamp_hard_nulls", "zero")]
+    ("study", "nothing"),
+    [("connector_hard_nulls", "demonstrations"), ("grid_clamp_hard_nulls", "zero"), ("pouring_hard_nulls", "zero")],
 )
 def test_at_hard_policies_that_learned_nothing_fail_and_a_rule_does_not(study, nothing):
     for method, most in ((nothing, 0.05), ("white", 0.10), ("best_constant", 0.15)):
@@ -92,3 +93,19 @@ def test_certificates_hold_and_the_loosest_bound_is_the_connectors_turn_under_sk
     loosest = table.loc[table["worst_ratio_active"].idxmax()]
     assert (loosest["skill"], loosest["worst_active"]) == ("connector_skgrl", "pose of Rz")
     assert loosest["worst_ratio_active"] == pytest.approx(2.5, abs=0.1)
+
+
+def test_where_the_reach_leads_beyond_the_bound_only_residual_learning_follows_it():
+    for method in ("kgrl", "skgrl_adaptive", "safe_residual", "residual"):
+        rows = of("connector_hard_safety", method)
+        assert len(rows) == 3
+        assert (rows["success_rate"] >= 0.9).all()
+        worst = rows[["worst_violation", "training_worst_violation"]].max(axis=1)
+        assert worst.between(2.0e-3, 2.1e-3).all() if method == "residual" else (worst <= TOLERANCE).all()
+    assert (of("connector_hard_safety", "residual")["success_rate"] == 1.0).all()
+    assert of("connector_hard_safety", "safe_residual")["success_rate"].min() == 0.99
+
+
+def test_a_mug_that_is_elsewhere_is_learned_with_a_template():
+    assert of("pouring_hard", "rl_sct")["success_rate"].tolist() == [0.93, 0.87, 0.98]
+    assert of("pouring_hard_nulls", "blind_rule")["success_rate"].max() < 1 / 5
