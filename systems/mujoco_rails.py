@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     import mujoco
 
 
+class DivergedError(RuntimeError):
+    """An engine's state is no number that the physics could have led to."""
+
+
 class MovedBodies(NamedTuple):
     """Bodies of a plant that the engine moves, or places anew: the fixture, the tool, and what is fixed to the tool."""
 
@@ -74,8 +78,8 @@ class MujocoRails(LeafSystem):
     motors push with, in the order of the pose. All that changes is declared state: the engine's positions, velocities
     and warm start, and the filter.
 
-    Where the engine diverges an update raises a RuntimeError; the engine's own way, to go on from its zero, would put
-    the tool at the target.
+    Where the engine diverges an update raises a `DivergedError`; the engine's own way, to go on from its zero, would
+    put the tool at the target.
     """
 
     def __init__(
@@ -230,7 +234,7 @@ class MujocoRails(LeafSystem):
             filtered = newest + decay * (filtered - newest)
         following = np.concatenate([self._engine_state(), filtered])
         if not np.isfinite(following).all():
-            raise RuntimeError("MuJoCo diverged: its state is not finite")
+            raise DivergedError("MuJoCo diverged: its state is not finite")
         discrete_state.set_value(self._state, following)
         return EventStatus.Succeeded()
 
@@ -239,7 +243,7 @@ class MujocoRails(LeafSystem):
         if numbers.max() > 1:
             warning = self._bad[int(numbers.argmax())]
             about = int(self._data.warning[warning].lastinfo)
-            raise RuntimeError(f"MuJoCo diverged: {self._mujoco.mju_warningText(warning, about)}")
+            raise DivergedError(f"MuJoCo diverged: {self._mujoco.mju_warningText(warning, about)}")
 
     def _place(self, poses: list[RigidTransform]) -> None:
         X_TFixture = self._X_TW @ poses[self._moved.fixture]
