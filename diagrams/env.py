@@ -33,7 +33,8 @@ RECORDED = (
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
-# What Drake says when the physics, and not the wiring, went wrong. Its own assertions arrive in Python as SystemExit.
+# What Drake, or a system with another engine, says when the physics, and not the wiring, went wrong. Drake's own
+# assertions arrive in Python as SystemExit.
 _SIMULATION_FAILURE = re.compile(r"failed to converge|\bnan\b|not finite|diverg|AllFinite|isfinite", re.IGNORECASE)
 
 

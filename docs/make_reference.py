@@ -641,7 +641,7 @@ def errors() -> str:
     """What is raised, and what the command ends with."""
     from guiderail.models.errors import InputError, RunsFailedError
     from guiderail.models.primitives import UnsolvableError
-    from guiderail.systems import PolicyError
+    from guiderail.systems import DivergedError, PolicyError
 
     page = (
         "# Errors\n\n| the command ends with | when |\n|---|---|\n"
@@ -651,7 +651,7 @@ def errors() -> str:
         "| 130 | it was stopped by Ctrl-C; what can go on says how |\n\n"
         "In Python these are raised, and nothing else is meant to be caught:\n\n"
     )
-    for error in (InputError, UnsolvableError, PolicyError, RunsFailedError):
+    for error in (InputError, UnsolvableError, PolicyError, DivergedError, RunsFailedError):
         bases = ", ".join(base.__name__ for base in error.__bases__)
         page += f"## {error.__name__}\n\nA `{bases}`, from `{error.__module__}`. {documented(error)}"
     return page

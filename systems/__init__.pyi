@@ -23,6 +23,7 @@ from .lc_ns_kmp_system import LcNsKmpSystem as LcNsKmpSystem
 from .mean_force import MeanForce as MeanForce
 from .measured_pose import MeasuredPose as MeasuredPose
 from .meshcat_device import MeshcatDevice as MeshcatDevice
+from .mujoco_rails import DivergedError as DivergedError
 from .mujoco_rails import MovedBodies as MovedBodies
 from .mujoco_rails import MujocoRails as MujocoRails
 from .policy_system import PolicyError as PolicyError

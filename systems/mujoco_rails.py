@@ -1,5 +1,6 @@
 """A workcell on six rails, stepped by MuJoCo."""
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,12 +28,26 @@ if TYPE_CHECKING:
     import mujoco
 
 
+class DivergedError(RuntimeError):
+    """An engine's state is no number that the physics could have led to."""
+
+
 class MovedBodies(NamedTuple):
     """Bodies of a plant that the engine moves, or places anew: the fixture, the tool, and what is fixed to the tool."""
 
     fixture: RigidBody
     tool: RigidBody
     workpiece: RigidBody
+
+
+class _Nominal(NamedTuple):
+    """What `set_contact` multiplies, as the model was given; the names are MuJoCo's."""
+
+    timestep: float
+    geom_friction: np.ndarray
+    jnt_stiffness: np.ndarray
+    dof_damping: np.ndarray
+    geom_solref: np.ndarray
 
 
 class MujocoRails(LeafSystem):
@@ -62,6 +77,9 @@ class MujocoRails(LeafSystem):
     geometry. ``wrench`` is the filtered y, (6,), force first, in N and Nm; ``impedance_wrench`` is (6,), what the six
     motors push with, in the order of the pose. All that changes is declared state: the engine's positions, velocities
     and warm start, and the filter.
+
+    Where the engine diverges an update raises a `DivergedError`; the engine's own way, to go on from its zero, would
+    put the tool at the target.
     """
 
     def __init__(
@@ -94,11 +112,14 @@ class MujocoRails(LeafSystem):
         if abs(self._num_steps * step - period) > 1e-9:
             raise InputError(f"MuJoCo's step of {step} s does not divide the period of {period} s")
         self._mujoco = mujoco_engine()
+        model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # Scratch: every update writes all that it depends on, so that nothing in it outlives one.
         self.model, self._data = model, self._mujoco.MjData(model)
+        bad = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
+        self._bad = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in bad]
         # With the solver's warm start, so that a state that is restored goes on identically.
         self._parts = self._mujoco.mjtState.mjSTATE_INTEGRATION
-        self._decay = float(np.exp(-step / time_constant)) if time_constant > 0.0 else 0.0
+        self._time_constant = time_constant
         self._X_WT, self._X_TW = X_WT, X_WT.inverse()
         self._fixture, self._workpiece = (model.body(name).id for name in ("fixture", "workpiece"))
         self._moved = MovedBodies(*(int(body.index()) for body in moved))
@@ -112,7 +133,7 @@ class MujocoRails(LeafSystem):
         poses = plant.get_body_poses_output_port()
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._nominal_body_poses_port = self.DeclareAbstractInputPort("nominal_body_poses", poses.Allocate())
-        self._nominal = (model.geom_friction.copy(), model.jnt_stiffness.copy(), model.geom_solref.copy())
+        self._nominal = _Nominal(step, *(getattr(model, name).copy() for name in _Nominal._fields[1:]))
         self._factors = self.DeclareNumericParameter(BasicVector(np.ones(2)))
         self._state = self.DeclareDiscreteState(self._at_rest(np.zeros(POSE_SIZE)))
         state = {self.discrete_state_ticket(self._state)}
@@ -178,7 +199,7 @@ class MujocoRails(LeafSystem):
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
         """Multiplies all friction, and the stiffness of contacts and springs; `context` is this system's own.
 
-        A contact is never made stiffer than two of the engine's steps allow.
+        What is stiffer is stepped more finely: √modulus times, or the next whole number of times.
         """
         context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
 
@@ -199,16 +220,30 @@ class MujocoRails(LeafSystem):
         model, data = self.model, self._data
         state = self._values(context)
         self._place(self._nominal_body_poses_port.Eval(context))
-        self._soften(*context.get_numeric_parameter(self._factors).value())
+        finer = self._soften(*context.get_numeric_parameter(self._factors).value())
         self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
         data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
+        for warning in self._bad:
+            data.warning[warning].number = 1  # of the first one the engine would write a file in the working directory
         filtered = state[self._filtered]
-        for _ in range(self._num_steps):
+        decay = np.exp(-model.opt.timestep / self._time_constant) if self._time_constant > 0.0 else 0.0
+        for _ in range(finer * self._num_steps):
             self._mujoco.mj_step(model, data)
+            self._check_warnings()
             newest = self._contact_wrench()
-            filtered = newest + self._decay * (filtered - newest)
-        discrete_state.set_value(self._state, np.concatenate([self._engine_state(), filtered]))
+            filtered = newest + decay * (filtered - newest)
+        following = np.concatenate([self._engine_state(), filtered])
+        if not np.isfinite(following).all():
+            raise DivergedError("MuJoCo diverged: its state is not finite")
+        discrete_state.set_value(self._state, following)
         return EventStatus.Succeeded()
+
+    def _check_warnings(self) -> None:
+        numbers = self._data.warning.number[self._bad]
+        if numbers.max() > 1:
+            warning = self._bad[int(numbers.argmax())]
+            about = int(self._data.warning[warning].lastinfo)
+            raise DivergedError(f"MuJoCo diverged: {self._mujoco.mju_warningText(warning, about)}")
 
     def _place(self, poses: list[RigidTransform]) -> None:
         X_TFixture = self._X_TW @ poses[self._moved.fixture]
@@ -217,11 +252,21 @@ class MujocoRails(LeafSystem):
             self.model.body_pos[body] = X.translation()
             self.model.body_quat[body] = X.rotation().ToQuaternion().wxyz()
 
-    def _soften(self, friction: float, modulus: float) -> None:
-        frictions, stiffnesses, references = self._nominal
-        self.model.geom_friction[:] = frictions * friction
-        self.model.jnt_stiffness[:] = stiffnesses * modulus
-        self.model.geom_solref[:, 0] = np.maximum(references[:, 0] / np.sqrt(modulus), 2.0 * self.model.opt.timestep)
+    def _soften(self, friction: float, modulus: float) -> int:
+        """Sets the model's contact; returns how many steps take the place of one.
+
+        A spring's natural frequency times the step, and a contact's time constant in steps, stay what the engine
+        integrates; a spring that is stiffer keeps its damping ratio.
+        """
+        model, nominal = self.model, self._nominal
+        finer = max(math.ceil(math.sqrt(modulus) - 1e-9), 1)
+        model.opt.timestep = nominal.timestep / finer
+        model.geom_friction[:] = nominal.geom_friction * friction
+        model.jnt_stiffness[:] = nominal.jnt_stiffness * modulus
+        model.dof_damping[:] = nominal.dof_damping * math.sqrt(max(modulus, 1.0))
+        constants = nominal.geom_solref[:, 0] / math.sqrt(modulus)
+        model.geom_solref[:, 0] = np.maximum(constants, 2.0 * model.opt.timestep)
+        return finer
 
     def _contact_wrench(self) -> np.ndarray:
         """What the contacts do to the joints, turned back: slides are T's axes, about hinges a torque t does a · t."""

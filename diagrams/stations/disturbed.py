@@ -86,7 +86,8 @@ class DisturbedStation(Station):
         own = {name: system.GetMyMutableContextFromRoot(context) for name, system in self._systems().items()}
         self._wrench.set_error(own["wrench"], np.full(6, scale), bias, seed)
         self._pose.set_error(own["pose"], np.ones(POSE_SIZE), beside, 0)
-        self._commands.set_seed(own["commands"], seed)
+        # Of its own: both count their steps, and two that share seed and count draw from one stream.
+        self._commands.set_seed(own["commands"], int(np.random.SeedSequence(seed).generate_state(1)[0]))
         return {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
 
     def _systems(self) -> dict[str, Any]:

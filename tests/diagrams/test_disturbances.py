@@ -90,6 +90,24 @@ def test_lost_and_late_commands_leave_the_tool_behind(plain):
     assert late.trace.measured[-1, 2] > plain[0].trace.measured[24, 2] + 1.0 * MM
 
 
+def test_which_commands_are_lost_is_not_read_off_the_stream_of_the_noise():
+    env = make_env("GridClamp", wrench_noise=(0.2, 0.01), lost_commands=0.3, hold=1)
+    station = env.task.diagram.GetSubsystemByName("station")
+    commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))
+    env.reset(seed=1)
+    root = env.simulator.get_context()
+    lost, of_one_stream = [], []
+    for _ in range(60):
+        env.step(np.zeros(env.action_space.shape))
+        count, is_lost = (commands.GetMyContextFromRoot(root).get_discrete_state(i).value()[0] for i in (0, 1))
+        seed = wrench.GetMyContextFromRoot(root).get_numeric_parameter(2).value()[0]
+        stream = np.random.default_rng([int(seed), int(count)])
+        lost.append(is_lost)
+        of_one_stream.append(stream.uniform() < 0.3)
+    assert 0.1 < np.mean(lost) < 0.5
+    assert np.mean(np.equal(lost, of_one_stream)) < 0.8  # of independent ones 0.58
+
+
 def test_a_payload_hangs_from_the_arms_tool_and_its_controller_knows_nothing_of_it():
     env = make_env("GridClamp", station="arm", payload=0.3)
     env.reset(seed=0)

@@ -213,4 +213,5 @@ def test_prerequisites_are_given_by_keyword_and_users_get_an_input_error(path):
             if name in ("DeclareVectorOutputPort", "DeclareAbstractOutputPort", "DeclareCacheEntry"):
                 assert "prerequisites_of_calc" in {keyword.arg for keyword in node.keywords}, f"line {node.lineno}"
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            assert node.exc.func.id in ("InputError", "PolicyError", "AttributeError"), f"line {node.lineno}"
+            known = ("InputError", "PolicyError", "DivergedError", "AttributeError")
+            assert node.exc.func.id in known, f"line {node.lineno}"

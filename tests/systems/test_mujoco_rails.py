@@ -7,9 +7,11 @@ from pydrake.systems.analysis import Simulator
 pytest.importorskip("mujoco")
 
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
 from guiderail.diagrams.stations.mujoco_rails import MujocoStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
 from guiderail.models.errors import InputError
+from guiderail.models.units import MM
 from guiderail.systems import MovedBodies, MujocoRails
 
 FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # high above the jack
@@ -58,6 +60,47 @@ def test_the_state_is_all_there_is(station):
         simulator.AdvanceTo(one.get_time() + 10 * PLANT_PERIOD)
         poses.append(station.get_pose_output_port().Eval(one))
     np.testing.assert_array_equal(*poses)
+
+
+def pressed(workcell, modulus):
+    """How deep a clamp beside its holes sinks into the table [m] under 19.5 N."""
+    station = MujocoStation(workcell)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    top = np.array([2.0 * MM, 1.5 * MM, 12.0 * MM, 0.0, 0.0, 0.0])
+    below = top - [0.0, 0.0, 19.5 / Impedance().stiffness[2], 0.0, 0.0, 0.0]
+    station.set_pose(context, top)
+    station.set_contact(context, 1.0, modulus)
+    station.get_desired_pose_input_port().FixValue(context, below)
+    simulator.Initialize()
+    simulator.AdvanceTo(1.0)
+    assert station.get_wrench_output_port().Eval(context)[2] == pytest.approx(19.5, abs=0.01)
+    return top[2] - station.get_pose_output_port().Eval(context)[2]
+
+
+def test_the_contact_itself_is_as_many_times_stiffer_as_it_is_told():
+    workcell = GridClampWorkcell()
+    nominal = pressed(workcell, 1.0)
+    for modulus in (0.1, 3.0, 10.0, 30.0):
+        assert pressed(workcell, modulus) * modulus == pytest.approx(nominal, rel=1e-2)
+
+
+def test_what_is_no_stiffer_is_stepped_as_the_model_says(station):
+    """And what is stiffer leaves nothing behind in the model."""
+    model = station.rails.model
+    names = ("jnt_stiffness", "dof_damping", "geom_solref", "geom_friction")
+    before = {name: getattr(model, name).copy() for name in names} | {"timestep": model.opt.timestep}
+    for factors in ((0.5, 7.0), (1.0, 1.0)):
+        simulator = Simulator(station)
+        context = simulator.get_mutable_context()
+        station.set_pose(context, FREE)
+        station.set_contact(context, *factors)
+        station.get_desired_pose_input_port().FixValue(context, FREE)
+        simulator.Initialize()
+        simulator.AdvanceTo(PLANT_PERIOD)
+    after = {name: getattr(model, name) for name in names} | {"timestep": model.opt.timestep}
+    for name, value in before.items():
+        np.testing.assert_array_equal(after[name], value)
 
 
 @pytest.mark.parametrize(("period", "constant"), [(PLANT_PERIOD * 1.0001, 0.0), (PLANT_PERIOD, -1.0), (0.0, 0.0)])

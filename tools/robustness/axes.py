@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.errors import InputError
 from guiderail.models.registry import did_you_mean
 from guiderail.models.units import MM
+from guiderail.tools.rollouts.evaluate import hides
 from guiderail.tools.tasks import check_environment
 
 Environment = Mapping[str, Any]
@@ -27,6 +28,7 @@ class Axis:
         values: in steps, the trained one among them where it has a number.
         trained: what it is where a policy learned without asking for anything else.
         changed: from an environment's arguments and a value to the arguments that differ.
+        anew: whether what is hidden in a run is drawn anew in every episode, as it is what is changed.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Axis:
     values: tuple[float, ...]
     trained: float
     changed: Callable[[Environment, float], dict[str, Any]]
+    anew: bool = False
 
 
 def _factor(option: str) -> Callable[[Environment, float], dict[str, Any]]:
@@ -76,7 +79,7 @@ AXES = (
     Axis("modulus", "contact's stiffness, times", (0.1, 0.3, 1.0, 3.0, 10.0), 1.0, _factor("modulus_factor")),
     Axis("stiffness", "impedance's stiffness, times", (1 / 3, 0.6, 1.0, 1.7, 3.0), 1.0, _plain("stiffness_factor")),
     Axis("clearance", "clearance, times", (0.5, 0.75, 1.0, 1.5, 2.0), 1.0, _clearance),
-    Axis("offsets", "offsets, times", (0.5, 1.0, 1.25, 1.5, 2.0), 1.0, _offsets),
+    Axis("offsets", "offsets, new every episode, times", (0.5, 1.0, 1.25, 1.5, 2.0), 1.0, _offsets, anew=True),
     Axis("wrench_scale", "measured wrench, times", FACTORS, 1.0, _factor("wrench_scale")),
     Axis("wrench_bias", "wrench bias up to [N]", (0.0, 0.5, 1.0, 2.0, 4.0), 0.0, _force_and_torque("wrench_bias")),
     Axis("wrench_noise", "wrench noise, σ [N]", (0.0, 0.25, 0.5, 1.0, 2.0), 0.0, _force_and_torque("wrench_noise")),
@@ -113,12 +116,14 @@ class Point:
         axis, value: where.
         environment: all arguments there.
         trained: the axis's value where the policy learned; None if that is none of them, such as a whole range.
+        options: of every reset.
     """
 
     axis: Axis
     value: float
     environment: Environment
     trained: float | None
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
@@ -137,7 +142,8 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
                 if axis.name == "payload" and resolved.get("station") != "arm":
                     raise InputError("a payload hangs from an arm's tool")
                 there = {**environment, **_checked(task, resolved, changed)}
-                found.append(Point(axis, value, there, trained))
+                options = {"new_run": True} if axis.anew and hides(task, {**resolved, **there}) else {}
+                found.append(Point(axis, value, there, trained, options))
             except InputError as error:
                 left_out.append(f"{axis.name} {value:g} is left out: {error}")
     return found, left_out

@@ -101,9 +101,10 @@ def robustness(
     rows: list[dict[str, Any]] = []
     for number, (one, place) in enumerate(places, start=1):
         words = f"{number}/{len(places)} {place.axis.name} {place.value:.3g} {one.name}"
+        options = {"options": dict(place.options)} if place.options else {}
         judged = judged_once(
             out / "episodes", one.name, one.config, one.acts, place.environment,
-            about=one.about, episodes=episodes, seed=seed, words=words,
+            about=one.about, episodes=episodes, seed=seed, words=words, **options,
         )  # fmt: skip
         if judged is not None:
             rows.append(_row(place, one.name, judged))

@@ -190,16 +190,24 @@ def claim(task: str, environment: Mapping[str, Any], fresh: bool) -> str:
     Raises:
         InputError: if a run hides nothing that could be drawn anew.
     """
-    hides = task in TASKS.names() and "new_run" in TASKS.get(task).Reset.model_fields
-    if fresh and not hides:
+    if fresh and not _can_hide(task):
         raise InputError(f"a run of {task} hides nothing that could be drawn anew: leave --fresh out")
     if not draws_held_out(task):
         return f"a policy for conditions as in training: {task} declares none that training never draws"
-    if not hides:
+    if not _can_hide(task):
         return "a policy for starts that training never drew"
-    if fresh or environment.get("uncertainty", CALIBRATION) != CALIBRATION:
+    if fresh or not hides(task, environment):
         return "a policy for any offset: a new one in every episode"
     return "a policy for the one offset that is hidden in this run, and for no other (--fresh: for any)"
+
+
+def hides(task: str, environment: Mapping[str, Any]) -> bool:
+    """Whether something is hidden that is the same in all episodes of a run, unless `new_run` draws it anew."""
+    return _can_hide(task) and environment.get("uncertainty", CALIBRATION) == CALIBRATION
+
+
+def _can_hide(task: str) -> bool:
+    return task in TASKS.names() and "new_run" in TASKS.get(task).Reset.model_fields
 
 
 def _counts_collisions(task: str) -> bool:

@@ -165,6 +165,55 @@ def test_the_same_seed_is_the_same_episode_bit_for_bit(task, options):
     assert not np.array_equal(episode(env, 4), first)
 
 
+@pytest.mark.parametrize(
+    ("task", "options", "modulus", "most"),
+    [
+        ("BncConnector", {"uncertainty": "known", "guidance": "kmp"}, 10.0, 400),
+        ("GridClamp", {}, 10.0, 100),
+        ("GridClamp", {}, 30.0, 100),
+    ],
+    ids=lambda value: None if isinstance(value, dict) else str(value),
+)
+def test_a_stiff_contact_does_not_blow_up(task, options, modulus, most):
+    """Gasket and bead are on springs, which an explicit step as long as the nominal ones' would excite."""
+    env = make_env(task, station="mujoco", modulus_factor=(modulus, modulus), **options)
+    env.reset(seed=2)
+    rng, over = np.random.default_rng(2), False
+    while not over and len(env.trace) < most:
+        _, _, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+        over = terminated or truncated
+    moved = np.abs(np.diff(env.trace.measured, axis=0))
+    assert info["termination"] != "collision"
+    assert "simulation_failure" not in info
+    assert np.rad2deg(moved[:, 3:]).max() < 3.0
+    assert moved[:, :3].max() < 3.0 * MM
+    assert max(env.trace.force) < 20.0
+
+
+def test_an_engine_that_diverges_ends_the_episode_and_leaves_nothing_for_the_next(tmp_path, monkeypatch):
+    """MuJoCo by itself goes on from its zero, where the connector is locked, and writes a file about it."""
+    monkeypatch.chdir(tmp_path)
+
+    def made():
+        return make_env("BncConnector", station="mujoco", uncertainty="disc", hold=25)
+
+    env = made()
+    episode(env, 4)
+    env.reset(seed=3)
+    sound, *_ = env.step(np.zeros(2))
+    for displacement in (1e11, 1e300):
+        env.reset(seed=3)
+        env.step(np.zeros(2))
+        env.push(np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
+        observation, _, terminated, truncated, info = env.step(np.zeros(2))
+        assert (terminated, truncated) == (False, True)
+        assert "MuJoCo diverged" in info["simulation_failure"]
+        assert not info["is_success"]
+        np.testing.assert_array_equal(observation, sound)
+    assert not list(tmp_path.iterdir())
+    np.testing.assert_array_equal(episode(env, 5), episode(made(), 5))
+
+
 def test_what_a_task_draws_is_where_the_engine_has_it():
     env = make_env("BncConnector", station="mujoco", uncertainty="disc", grasp_angle=1.0)
     _, info = env.reset(seed=2)

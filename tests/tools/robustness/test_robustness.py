@@ -2,16 +2,19 @@ import shutil
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.models.units import MM
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import train
 from guiderail.tools.robustness import axes
 from guiderail.tools.robustness.axes import AXES, Axis, chosen_axes, points
-from guiderail.tools.robustness.robustness import breaks, robustness
+from guiderail.tools.robustness.robustness import _Who, breaks, robustness
+from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, kept_file
 from guiderail.tools.rollouts.null_policies import NullPolicy, white
 from guiderail.tools.tasks import check_environment
 
@@ -125,6 +128,51 @@ def test_a_policy_that_learned_with_a_whole_range_is_judged_at_each_value_of_it(
     assert at["stiffness", 1.0].environment["stiffness_factor"] == 1.0
     assert at["lost", 0.0].environment == arguments
     assert {point.axis.name: point.trained for point in found} == {"friction": None, "stiffness": None, "lost": 0.0}
+
+
+@pytest.mark.parametrize(("uncertainty", "anew"), [("calibration", True), ("disc", False)])
+def test_offsets_that_a_run_hides_are_drawn_anew_in_every_episode_of_their_axis_alone(uncertainty, anew):
+    """What is drawn in every episode anyway is asked for as before, and found where it was kept."""
+    found, _ = points("BncConnector", {"uncertainty": uncertainty}, AXES)
+    for point in found:
+        assert point.options == ({"new_run": True} if anew and point.axis.name == "offsets" else {})
+
+
+def test_everybody_meets_a_new_offset_in_every_episode_and_what_was_kept_of_one_offset_is_not_taken(
+    bead_config, tmp_path, monkeypatch
+):
+    """Of a learned policy, here one that stands still, and of who acts beside it."""
+    environment = check_environment("BncConnector", {"uncertainty": "calibration", "guidance": "kgrl", "hold": 25})
+    config = replace(bead_config, task="BncConnector", environment=environment)
+    met = {"policy": [], "white": []}
+
+    def watching(name):
+        def acts(env):
+            def act(_):
+                met[name].append(tuple(env.unwrapped.drawn["jack_offset"]))
+                return np.zeros(env.action_space.shape)
+
+            return act
+
+        return acts
+
+    def one(*_):
+        return [_Who("policy", watching("policy"), config, environment)]
+
+    (offsets,) = chosen_axes("offsets")
+    monkeypatch.setattr("guiderail.tools.robustness.robustness._policies", one)
+    monkeypatch.setattr(axes, "AXES", (replace(offsets, values=(2.0,)),))
+    robustness([tmp_path], episodes=2, beside={"white": watching("white")}, out=tmp_path)
+    # In the run's own place, the first, it is only asked whether it suits the environment.
+    places = {name: set(seen) - {seen[0]} for name, seen in met.items()}
+    assert len(places["policy"]) == 2
+    assert places["policy"] == places["white"]
+    assert all(2.0 * MM <= np.hypot(*place) <= 3.0 * MM for place in places["policy"])
+    (point,), _ = points("BncConnector", environment, axes.AXES)
+    before = kept_file(tmp_path / "episodes", "policy", config, point.environment, episodes=2, seed=HELD_OUT_SEED)
+    kept = list((tmp_path / "episodes").glob("policy-*.csv"))
+    assert len(kept) == 1
+    assert before not in kept
 
 
 def test_offsets_go_up_to_twice_the_trained_ones():
