@@ -109,3 +109,30 @@ def test_where_the_reach_leads_beyond_the_bound_only_residual_learning_follows_i
 def test_a_mug_that_is_elsewhere_is_learned_with_a_template():
     assert of("pouring_hard", "rl_sct")["success_rate"].tolist() == [0.93, 0.87, 0.98]
     assert of("pouring_hard_nulls", "blind_rule")["success_rate"].max() < 1 / 5
+
+
+def test_what_was_learned_for_any_offset_succeeds_in_the_other_engine():
+    """Success, and the forces of those that succeed."""
+    ours = [of("connector_disc", method)["success_rate"] for method in ("kgrl", "skgrl")]
+    assert {rate for rates in ours for rate in rates} == {0.99, 1.0}
+    ranges = {
+        (method, friction): [
+            end(of("connector_disc_transfer", method, f"MuJoCo{friction}")["success_rate"]) for end in (min, max)
+        ]
+        for method in ("kgrl", "skgrl")
+        for friction in ("", ", friction × 0.5", ", friction × 1.5")
+    }
+    assert ranges == {
+        ("kgrl", ""): [0.98, 1.0],
+        ("skgrl", ""): [0.99, 1.0],
+        ("kgrl", ", friction × 0.5"): [0.97, 1.0],
+        ("skgrl", ", friction × 0.5"): [0.96, 1.0],
+        ("kgrl", ", friction × 1.5"): [0.98, 1.0],
+        ("skgrl", ", friction × 1.5"): [0.86, 0.99],
+    }
+    without_failures = [
+        rows[rows["success_rate"] == 1.0]["peak_force"].max()
+        for rows in (of("connector_disc", "kgrl"), of("connector_disc_transfer", "kgrl", "MuJoCo"))
+    ]
+    assert without_failures[1] < 1.2 * without_failures[0]
+    assert (of("connector_disc_transfer", "white", "MuJoCo")["success_rate"] > 0.5).all()
