@@ -95,7 +95,7 @@ def certificate_files(
         assumed = {"excess": budget.excess.tolist(), "residue": budget.residue.tolist()}
         claims["budgeted"] = _bounds(certified.budgeted.bounds) | assumed
         claims["assumes"].append(BUDGET)
-    clock = np.diff(numbers["inputs"]).mean()
+    clock = np.diff(reference.inputs(np.array([0, primitive.num_steps - 1])))[0] / (primitive.num_steps - 1)
     if abs(skill.period - clock) > CLOCK_AGREES * clock:
         claims["assumes"].append(OTHER_CLOCK)
     if stiffness is not None and limits is not None:
