@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.diagrams.make import known
+from guiderail.diagrams.make import known, resolve
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import QUANTITIES, Adversary
@@ -21,7 +21,7 @@ from guiderail.models.certificate.bounds import Certified, certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files
 from guiderail.models.certificate.loop import Bounds, Skill
 from guiderail.models.certificate.prices import Budget
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
@@ -49,7 +49,7 @@ def certify_skill(
         environment: arguments of the environment that are other ones than the run's or the task's.
         out: the folder that is written; `certificate` in the run unless given.
         start_within: how far beside its start, in any output, the robot may begin, in the outputs' units; what the
-            environment draws unless given.
+            task declares unless given, and the error of a measured pose, with which a history begins.
         attack: how many steps an adversary tries to leave the bounds; none for 0. What it found is written beside
             them, in `attack.csv`.
 
@@ -78,16 +78,17 @@ def certify_skill(
     assert demonstrated is not None  # both kinds of guidance need them
     acted = guidance != "kmp"
     primitive = demonstrated.primitive(history=guidance == "skgrl", constrained=acted)
-    start = primitive.constraints.nearest(primitive.reference.means[0])
-    within = float(options.get("start_beside", 0.0)) if start_within is None else start_within
-    if not (np.isfinite(within) and within >= 0.0):
-        raise InputError(f"the robot begins within a distance that is not negative, not {within}")
+    # A reset goes by what was demonstrated, whatever via-points the primitive passes through.
+    start = primitive.constraints.nearest(resolve(task, options).task.reference().means[0])
+    within = _declared_start(task, options, len(start)) if start_within is None else np.full(len(start), start_within)
+    if not (np.isfinite(within).all() and (within >= 0.0).all()):
+        raise InputError(f"the robot begins within a distance that is not negative, not {within.min()}")
     skill = Skill(
         primitive,
         demonstrated.null_space_gains(primitive) if acted else np.zeros(primitive.num_outputs),
         demonstrated.control_period,
         start,
-        np.full(primitive.num_outputs, within),
+        within,
     )
     budget = None
     if primitive.history:
@@ -106,6 +107,7 @@ def certify_skill(
         "certificate": str(out / CERTIFICATE),
         "checker": (word.stdout or word.stderr).strip(),
         "checker_seconds": round(seconds, 1),
+        "start_within": within.tolist(),
         "steps": primitive.num_steps,
         "steps_that_constraints_can_touch": int(certified.touched.sum()),
     }
@@ -162,6 +164,17 @@ def corrected_steps(skill: Skill, certified: Certified) -> np.ndarray:
     if skill.primitive.history:
         return np.logical_or.accumulate(touched)
     return touched | np.append(False, touched[:-1]) | np.append([False, False], touched[:-2])
+
+
+def _declared_start(task: str, options: Mapping[str, Any], size: int) -> np.ndarray:
+    """(O,), how far beside its start the environment's history may begin: a reset's draw, and a pose's error."""
+    declared = resolve(task, options).task.start_within()
+    try:
+        within = np.array(np.broadcast_to(declared, size), dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"start_within of {task} is a number, or {size} of them, not {brief(declared)}") from None
+    within[:3] += float(options.get("pose_bias", 0.0))
+    return within
 
 
 def _part(found: np.ndarray, budget: np.ndarray) -> float:

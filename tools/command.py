@@ -327,7 +327,8 @@ def certify(
     env: Env = None,
     out: Annotated[Path | None, _opt("The folder to write.  [default: certificate in the run]")] = None,
     start_within: Annotated[
-        float | None, _opt("How far beside its start the robot may begin, in the outputs' units.")
+        float | None,
+        _opt("How far beside its start the robot may begin, in the outputs' units.  [default: as a reset draws it]"),
     ] = None,
     attack: Annotated[int, _opt("How many steps an adversary tries to leave the bounds.")] = 0,
     imports: OwnTask = None,
@@ -521,7 +522,7 @@ def study(
     out: Annotated[Path, _opt("The folder of the study; what is finished in it is used again.")],
     methods: Annotated[str | None, _opt("Some of its methods, separated by commas.")] = None,
     seeds: Annotated[str | None, _opt("Other seeds, separated by commas.")] = None,
-    engine: Annotated[str, _opt("What runs them: {engines}.", of="engines")] = "process",
+    engine: Annotated[str | None, _opt("What runs them: {engines}.  [default: process]", of="engines")] = None,
     address: Annotated[str | None, _opt("Of a Ray cluster.  [default: RAY_ADDRESS, or a Ray of this machine]")] = None,
     processes: Annotated[int | None, _opt("How many runs go side by side.  [default: 2, or a cluster's cores]")] = None,
     as_json: Json = False,
@@ -536,8 +537,14 @@ def study(
 
     declared = declaration.load_study(file)
     if not isinstance(declared, declaration.Study):
+        given = {"methods": methods, "seeds": seeds, "engine": engine, "address": address, "processes": processes}
+        if refused := [f"--{name}" for name, value in given.items() if value is not None]:
+            raise InputError(f"the study {declared.name} trains nothing: leave out {', '.join(refused)}")
         program = import_module(f"guiderail.tools.studies.{declared.program}")
-        _print(getattr(program, declared.program)(out, **declared.model_dump(exclude={"program", "name"})), as_json)
+        found = getattr(program, declared.program)(out, **declared.model_dump(exclude={"program", "name"}))
+        _print(found, as_json)
+        if "failed" in found:
+            raise RunsFailedError(found["failed"], None)
         return
     try:
         numbers = None if seeds is None else [int(number) for number in seeds.split(",")]
@@ -546,7 +553,7 @@ def study(
     chosen = declared.only(None if methods is None else methods.split(","), numbers)
     from guiderail.tools.studies.engines.engine import make_engine
 
-    running = make_engine(engine, processes, address)
+    running = make_engine(engine or "process", processes, address)
     from guiderail.tools.studies.study import study_command
 
     found = study_command(chosen, out, running, declared.part_name(chosen))

@@ -35,6 +35,7 @@ IMAGE_SIZE = (144, 110)  # width and height of the policy's image (4.4.1, end)
 COMPONENTS = 20  # of the mixture: with 8 to 16 of them the passage is blurred
 FLOOR = 0.002  # [m], how well a hand repeats itself: added to the demonstrations' covariance as a standard deviation
 HELD_OUT_DEVIATION = 0.01  # [m] of a held-out start from the usual one
+FARTHEST_DRAW = 4.0  # deviations of a start along x and along y: one in 8000 draws would be farther, and is put there
 FARTHEST_START = 2.0  # [m] along x and y
 
 
@@ -111,13 +112,13 @@ class NarrowPassage(Task):
     ) -> dict[str, Any]:
         """Starts where the demonstrations do, or as far beside it as it is asked for; held out, a little beside it."""
         start, obstacles = reference_trajectory().means[0].copy(), self._world.obstacles
-        deviation = self.options.start_deviation or (HELD_OUT_DEVIATION if options.held_out else 0.0)
+        deviation = self._start_deviation(options.held_out)
         if self.options.drawn:
             rng = episode_stream(rng, options.held_out)
             sides = (-1.0) ** (rng.integers(2) + np.arange(len(obstacles)))
             obstacles[:, 0] += self.options.obstacle_beside * sides
         if deviation:
-            start = start + deviation * rng.standard_normal(2)
+            start = start + deviation * np.clip(rng.standard_normal(2), -FARTHEST_DRAW, FARTHEST_DRAW)
         if options.start is not None:
             start = np.array(options.start)
         if np.abs(start).max() > FARTHEST_START:
@@ -131,6 +132,13 @@ class NarrowPassage(Task):
         self.drawn["obstacles"].set(context, obstacles.ravel())
         station.set_obstacles(context, obstacles)
         return {"start": start, "obstacles": obstacles}
+
+    def start_within(self) -> float:
+        """As far as a start is drawn, held out or not."""
+        return FARTHEST_DRAW * max(self._start_deviation(held_out) for held_out in (False, True))
+
+    def _start_deviation(self, held_out: bool) -> float:
+        return self.options.start_deviation or (HELD_OUT_DEVIATION if held_out else 0.0)
 
     def camera(self) -> Camera:
         """The plane from above."""

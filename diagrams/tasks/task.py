@@ -198,6 +198,15 @@ class Task(ABC):
         earlier environment with the same options. What is remembered in the task is for its next reset.
         """
 
+    def start_within(self) -> np.ndarray | float:
+        """How far beside the demonstrations' first pose a reset may put the robot at most: certificates assume it.
+
+        Of each output, (O,), in its unit, or one number for all of them. It covers all that a reset draws, held out or
+        not, and no place that somebody names in a reset's options. The option `start_beside` unless overridden, 0 for a
+        task that has none.
+        """
+        return float(getattr(self.options, "start_beside", 0.0))
+
     # How it is drawn.
 
     def camera(self) -> Camera | None:

@@ -136,8 +136,12 @@ class Adversary:
         }
 
     def _start(self) -> np.ndarray:
-        skill = self._skill
-        return skill.start + self._rng.choice([-1.0, 1.0], len(skill.start)) * skill.start_within
+        """In a corner of all starts, or, every other time, anywhere among them where they make a difference."""
+        skill, rng = self._skill, self._rng
+        place = rng.choice([-1.0, 1.0], len(skill.start))
+        if self._past and skill.start_within.any() and rng.uniform() < 0.5:
+            place = rng.uniform(-1.0, 1.0, len(skill.start))
+        return skill.start + place * skill.start_within
 
     def _deflections(self) -> tuple[np.ndarray, np.ndarray]:
         """Full deflections that turn; the outputs together, apart, or each when it likes."""

@@ -31,6 +31,11 @@ BUDGET = (
     "thirds of them: that they are kept is not proved"
 )
 
+OTHER_CLOCK = (
+    "the period is not the one between two inputs of the primitive: it is executed slower or faster than it was shown"
+)
+CLOCK_AGREES = 1e-6  # of that: how well the two are the same
+
 
 def certificate_files(
     skill: Skill,
@@ -90,6 +95,9 @@ def certificate_files(
         assumed = {"excess": budget.excess.tolist(), "residue": budget.residue.tolist()}
         claims["budgeted"] = _bounds(certified.budgeted.bounds) | assumed
         claims["assumes"].append(BUDGET)
+    clock = np.diff(reference.inputs(np.array([0, primitive.num_steps - 1])))[0] / (primitive.num_steps - 1)
+    if abs(skill.period - clock) > CLOCK_AGREES * clock:
+        claims["assumes"].append(OTHER_CLOCK)
     if stiffness is not None and limits is not None:
         claims |= {"stiffness": list(map(float, stiffness)), "limits": list(map(float, limits))}
         claims["force"] = float(np.linalg.norm(limits[:3]))

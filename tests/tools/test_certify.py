@@ -1,9 +1,13 @@
 import json
 
+import numpy as np
 import pytest
 
+from guiderail.diagrams.make import make_env, resolve
+from guiderail.diagrams.tasks.narrow_passage import NarrowPassage, reference_trajectory
 from guiderail.models.errors import InputError
-from guiderail.tools.certify import certify_skill
+from guiderail.tools.certify import _declared_start, certify_skill
+from guiderail.tools.tasks import check_environment
 
 
 def test_a_tasks_certificate_is_written_and_accepted_and_an_attack_says_how_tight_it_is(tmp_path):
@@ -53,3 +57,77 @@ def test_an_attack_of_a_negative_number_of_steps_is_refused(tmp_path):
 def test_a_task_needs_a_folder_to_write_to():
     with pytest.raises(InputError, match="--out"):
         certify_skill("NarrowPassage", {"guidance": "kgrl"})
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "far"),
+    [("standard", (755, 1950)), ("hard", (1352, 8387))],  # seeds of starts that would be farther than there are any
+)
+def test_without_actions_held_out_episodes_stay_in_the_bounds(tmp_path, difficulty, far):
+    """They begin beside the demonstrations, and sKGRL's history with them."""
+    environment = {"guidance": "skgrl", "difficulty": difficulty}
+    found = certify_skill("NarrowPassage", environment, out=tmp_path)
+    assert found["checker"] == "yes"
+    assert found["start_within"] == pytest.approx([0.04, 0.04] if difficulty == "standard" else [0.12, 0.12])
+    claims = json.loads((tmp_path / "certificate.json").read_text())
+    env = make_env("NarrowPassage", **environment)
+    for seed in (*far, *range(1_000_000, 1_000_004)):
+        env.reset(seed=seed, options={"held_out": True})
+        while not any(env.step(np.zeros(2))[2:4]):
+            pass
+        y, period = env.trace.commanded, env.task.control_period
+        for regime in ("free", "budgeted"):
+            bounds = {name: np.array(claims[regime][name])[: len(y)] for name in ("lower", "upper", "speed")}
+            assert (y >= bounds["lower"] - 1e-7).all()
+            assert (y <= bounds["upper"] + 1e-7).all()
+            assert (np.abs(np.diff(y, axis=0)) / period <= bounds["speed"][1:] + 1e-6).all()
+    env.close()
+
+
+def declared_start(task, **environment):
+    """How far beside its start a certificate lets a task's robot begin."""
+    options = check_environment(task, environment)
+    return _declared_start(task, options, resolve(task, options).task.reference().num_outputs)
+
+
+def test_a_start_is_within_what_the_task_declares_and_the_error_of_its_measurement():
+    assert not declared_start("BncConnector").any()
+    np.testing.assert_allclose(declared_start("BncConnector", start_beside=0.002), np.full(6, 0.002))
+    np.testing.assert_allclose(declared_start("BncConnector", pose_bias=0.001), [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0])
+    both = declared_start("BncConnector", pose_bias=0.001, start_beside=0.002)
+    np.testing.assert_allclose(both, [3e-3, 3e-3, 3e-3, 2e-3, 2e-3, 2e-3])
+
+
+@pytest.mark.parametrize(
+    "far", [{"pose_bias": 1e-3}, {"start_beside": 1e-3}, {"pose_bias": 5e-4, "start_beside": 1e-3}]
+)
+def test_a_history_begins_within_what_is_declared(far):
+    env = make_env("BncConnector", guidance="skgrl", **far)
+    within = declared_start("BncConnector", **far)
+    declared = env.task.declaration
+    start = declared.constraints().nearest(declared.reference().means[0])
+    farthest = np.zeros(6)
+    for seed in range(20):
+        env.reset(seed=seed, options={"held_out": True})
+        history = env.task.diagram.GetSubsystemByName("guidance").GetSubsystemByName("history")
+        context = history.GetMyContextFromRoot(env.simulator.get_context())
+        beside = history.get_history_output_port().Eval(context).reshape(-1, 6) - start
+        farthest = np.maximum(farthest, np.abs(beside).max(axis=0))
+    env.close()
+    assert (farthest <= within + 1e-9).all()
+    assert (farthest[:2] > 0.5 * within[:2]).all()
+
+
+def test_a_start_that_fits_no_output_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setattr(NarrowPassage, "start_within", lambda self: [0.1, 0.1, 0.1])
+    with pytest.raises(InputError, match="start_within of NarrowPassage is a number, or 2 of them"):
+        certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path)
+
+
+def test_via_points_move_the_motion_and_not_its_start(tmp_path):
+    """A reset goes by the demonstrations."""
+    via = [0.0, 0.36, 0.1]
+    certify_skill("NarrowPassage", {"guidance": "kgrl", "via_points": via}, out=tmp_path)
+    with np.load(tmp_path / "primitive.npz") as primitive:
+        assert np.abs(primitive["means"][0] - via[1:]).max() < 0.01
+        np.testing.assert_array_equal(primitive["start"], reference_trajectory().means[0])

@@ -30,6 +30,9 @@ def certificates(out: Path, *, skills: Mapping[str, Mapping[str, Any]], attack: 
         skills: by name, the `task` and the arguments of its environment, `env`.
         attack: steps of the adversary, on each.
 
+    Returns:
+        Where the table is, and how many skills are in it; `failed` says which of them left a bound, or were rejected.
+
     Raises:
         InputError: if a skill can't be certified.
     """
@@ -40,7 +43,19 @@ def certificates(out: Path, *, skills: Mapping[str, Mapping[str, Any]], attack: 
         rows.append(cached(folder / f"told-{digest}.csv", partial(_told, skill, folder, attack)))
         rows[-1].insert(0, "skill", name)
     table = pd.concat(rows, ignore_index=True)
-    return {"table": str(write_table(out / "certificates", table.to_dict("records"))), "skills": len(table)}
+    found: dict[str, Any] = {
+        "table": str(write_table(out / "certificates", table.to_dict("records"))),
+        "skills": len(table),
+    }
+    failed = [words for row in table.to_dict("records") if (words := _failure(row))]
+    return found | ({"failed": failed} if failed else {})
+
+
+def _failure(row: Mapping[Any, Any]) -> str:
+    """What does not hold of a skill's certificate; empty where all does."""
+    if row["checker"] != "yes":
+        return f"{row['skill']}: the checker says {row['checker']}"
+    return f"{row['skill']}: an adversary left {row['bounds_left']} bounds" if row["bounds_left"] else ""
 
 
 def _told(skill: Mapping[str, Any], folder: Path, attack: int) -> pd.DataFrame:

@@ -4,6 +4,7 @@ import ast
 import hashlib
 import io
 import json
+import runpy
 import sys
 from dataclasses import replace
 from functools import cache
@@ -15,7 +16,7 @@ import pytest
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.certificate.bounds import certify
-from guiderail.models.certificate.files import CERTIFICATE, certificate_files, digest
+from guiderail.models.certificate.files import BUDGET, CERTIFICATE, OTHER_CLOCK, certificate_files, digest
 from guiderail.models.certificate.loop import Skill, reach
 from guiderail.models.certificate.prices import Budget, _Market, _of_residue
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
@@ -151,6 +152,23 @@ def test_nothing_is_spent_where_there_is_no_constraint():
     assert not seen.residue.any()
 
 
+def test_an_attack_begins_in_the_corners_of_all_starts_and_between_them():
+    made = skill(4)
+    adversary = Adversary(made, np.zeros(STEPS, bool))
+    places = (np.array([adversary._start() for _ in range(200)]) - made.start)[:, 0] / made.start_within[0]
+    assert np.abs(places).max() == pytest.approx(1.0)
+    assert {-1.0, 1.0} <= set(np.round(places, 9))
+    assert 50 < (np.abs(places) < 0.999).sum() < 150
+
+
+def test_an_attack_notices_a_start_that_was_not_certified():
+    made = skill(4)
+    kept = certify(replace(made, start_within=np.zeros(2))).free
+    seen = Adversary(made, np.zeros(STEPS, bool)).attack(20 * STEPS)
+    assert (seen.upper[:2, 0] > kept.upper[:2, 0] + 1e-3).all()
+    assert (seen.upper <= certify(made).free.upper + 1e-9).all()
+
+
 @pytest.mark.parametrize("price", [0.0, 0.3, -2.0])
 def test_any_price_proves_a_bound(price):
     """Prices are multipliers of a linear program: bad ones only make a bound wider."""
@@ -220,6 +238,30 @@ def at(index, factor=1.0, plus=0.0):
     return change
 
 
+def faster(contents, factor, *left_out):
+    """Everything as if a step took `factor` times as long; sentences may be left out of what it assumes."""
+    claims = json.loads(contents[CERTIFICATE])
+    claims["period"] *= factor
+    for regime in ("free", "always"):
+        for order, name in ((1, "speed"), (2, "acceleration")):
+            rows = claims[regime][name]
+            claims[regime][name] = [[None if x is None else x / factor**order for x in row] for row in rows]
+    claims["assumes"] = [sentence for sentence in claims["assumes"] if sentence not in left_out]
+    claims["digest"] = digest(claims)
+    return {**contents, CERTIFICATE: json.dumps(claims).encode()}
+
+
+def constrained_by_nothing(contents):
+    """A constraint that is no number, and claims as if there were none."""
+    none = altered(contents, "constraints.npz", c=lambda c: np.nan * c)
+    none = altered(none, "witness.npz", touched=np.zeros_like, multipliers=lambda alphas: alphas[:0])
+    claims = json.loads(contents[CERTIFICATE])
+    free, stiffness, limits = (claims[name] for name in ("free", "stiffness", "limits"))
+    ranges = np.max(free["upper"], axis=0) - np.min(free["lower"], axis=0)
+    at_rest = float(np.linalg.norm(np.minimum(limits, np.array(stiffness) * ranges)))
+    return signed(none, always=lambda _: free | {"rest_force": at_rest})
+
+
 TAMPERED = {
     "an upper bound": lambda c: signed(c, always__upper=at((30, 0), plus=-0.01)),
     "a lower bound": lambda c: signed(c, always__lower=at((30, 0), plus=0.01)),
@@ -242,6 +284,15 @@ TAMPERED = {
     "which steps are touched": lambda c: signed(altered(c, "witness.npz", touched=lambda t: np.zeros_like(t))),
     "a multiplier": lambda c: signed(altered(c, "witness.npz", multipliers=lambda a: 0.5 * a)),
     "a digest": lambda c: {**c, CERTIFICATE: c[CERTIFICATE].replace(b'"digest": "', b'"digest": "0')},
+    "a constraint that is no number": constrained_by_nothing,
+    "a mean that is no number": lambda c: signed(altered(c, "primitive.npz", means=at((30, 0), factor=np.nan))),
+    "a start below zero": lambda c: signed(altered(c, "primitive.npz", start_within=lambda within: -within)),
+    "the period, and the speeds with it": lambda c: faster(c, 2.0),
+    "a period without end": lambda c: faster(c, np.inf),
+    "that anything is assumed": lambda c: signed(c, assumes=lambda sentences: []),
+    "a sentence that is assumed": lambda c: signed(c, assumes=lambda sentences: sentences[:-1]),
+    "the words of a sentence": lambda c: signed(c, assumes=lambda them: [them[0].replace("-1", "-2"), *them[1:]]),
+    "a sentence too many": lambda c: signed(c, assumes=lambda sentences: [*sentences, OTHER_CLOCK]),
     "a file, unsigned": lambda c: altered(c, "primitive.npz", gains=lambda gains: 1.0 * gains + 1e-9),
 }
 
@@ -271,6 +322,7 @@ BUDGETED = {
     "the residue": lambda c: signed(c, budgeted__residue=lambda rows: [[0.5 * x for x in row] for row in rows]),
     "a budget below zero": lambda c: signed(c, budgeted__residue=lambda rows: [[-x for x in row] for row in rows]),
     "a price": lambda c: signed(altered(c, "witness.npz", prices=lambda p: 1.1 * p)),
+    "what it assumes": lambda c: signed(c, assumes=lambda them: [one for one in them if one != BUDGET]),
     "the regime": lambda c: signed(
         c, budgeted=lambda claims: c and json.loads(c[CERTIFICATE])["always"] | claims_of(c)
     ),
@@ -287,6 +339,53 @@ def claims_of(contents):
 def test_what_was_tampered_with_in_the_third_regime_is_rejected(budgeted, tmp_path, what):
     with pytest.raises((checker.Rejected, ValueError)):
         checker.check(write(tmp_path, BUDGETED[what](budgeted)))
+
+
+def test_another_period_than_the_clocks_is_said_in_words(tmp_path):
+    made = replace(skill(4, 0.25), period=1.5 * PERIOD)
+    contents = files(made, certify(made))
+    assert OTHER_CLOCK in json.loads(contents[CERTIFICATE])["assumes"]
+    checker.check(write(tmp_path, contents))
+    with pytest.raises(checker.Rejected, match="does not assume"):
+        checker.check(write(tmp_path, faster(contents, 1.0, OTHER_CLOCK)))
+
+
+def told(folder, capsys, monkeypatch):
+    """Exit code and output of the checker as a program."""
+    monkeypatch.setattr(sys, "argv", ["checker.py", str(folder)])
+    try:
+        runpy.run_path(checker.__file__, run_name="__main__")
+    except SystemExit as ended:
+        return ended.code, capsys.readouterr().out
+    return 0, capsys.readouterr().out
+
+
+NONE = {
+    "a list": lambda c: {**c, CERTIFICATE: b"[]"},
+    "a number": lambda c: {**c, CERTIFICATE: b"3"},
+    "half of it": lambda c: {**c, CERTIFICATE: c[CERTIFICATE][:100]},
+    "no text": lambda c: {**c, CERTIFICATE: bytes(range(256))},
+    "digests as a list": lambda c: signed(c, digests=lambda digests: []),
+    "no arrays": lambda c: signed({**c, "witness.npz": b"none"}),
+    "half of an archive": lambda c: signed({**c, "witness.npz": c["witness.npz"][:-50]}),
+    "a word for a number": lambda c: signed(altered(c, "primitive.npz", horizon=lambda _: "long")),
+    "nothing": lambda c: {},
+}
+
+
+@pytest.mark.parametrize("what", NONE)
+def test_what_is_no_certificate_is_one_sentence_and_the_exit_code_says_so(honest, what, tmp_path, capsys, monkeypatch):
+    code, out = told(write(tmp_path, NONE[what](honest)), capsys, monkeypatch)
+    assert code == 2
+    assert out.startswith("no: the files make no sense")
+    assert out.count("\n") == 1
+
+
+def test_yes_and_no_are_exit_codes(honest, tmp_path, capsys, monkeypatch):
+    assert told(write(tmp_path, honest), capsys, monkeypatch) == (0, "yes\n")
+    code, out = told(write(tmp_path, TAMPERED["a speed"](honest)), capsys, monkeypatch)
+    assert code == 1
+    assert out.startswith("no: step 20: always speed of output 0 is ")
 
 
 def test_the_checker_is_short_and_knows_numpy_alone():

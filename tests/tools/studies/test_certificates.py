@@ -2,6 +2,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.errors import InputError
+from guiderail.tools.command import main
 from guiderail.tools.studies.certificates import certificates
 from guiderail.tools.studies.declaration import load_study
 
@@ -29,3 +30,33 @@ def test_the_program_is_named(tmp_path):
         (tmp_path / "study.yaml").write_text(f"name: a\nprogram: {program}\nskills: {{a: {{task: NarrowPassage}}}}\n")
         with pytest.raises(InputError, match=words):
             load_study(tmp_path / "study.yaml")
+
+
+def found(checker="yes", left=0):
+    """What certifying a skill comes to."""
+    row = {"quantity": "pose", "output": 0, "constraint": "never active", "ratio": 1.0, "left": left}
+    numbers = dict.fromkeys(("checker_seconds", "steps", "steps_that_constraints_can_touch"), 1)
+    return {"checker": checker, "attack": [row], "attack_steps": 1, "attack_corrected": 0, **numbers}
+
+
+@pytest.mark.parametrize(
+    ("came", "words"),
+    [
+        (found(), None),
+        (found(checker="no: step 3: too tight"), "a_skill: the checker says no: step 3: too tight"),
+        (found(left=2), "a_skill: an adversary left 2 bounds"),
+    ],
+)
+def test_what_does_not_hold_ends_the_command_as_it_ends_certify(tmp_path, monkeypatch, capsys, came, words):
+    (tmp_path / "study.yaml").write_text(
+        "name: a\nprogram: certificates\nskills: {other: {task: NarrowPassage}, a_skill: {task: NarrowPassage}}\n"
+    )
+    monkeypatch.setattr(
+        "guiderail.tools.studies.certificates.certify_skill",
+        lambda *_, out, **__: came if out.name == "a_skill" else found(),
+    )
+    with pytest.raises(SystemExit) as ended:
+        main(["study", str(tmp_path / "study.yaml"), "--out", str(tmp_path / "out")])
+    assert (tmp_path / "out" / "certificates.csv").is_file()
+    assert ended.value.code == (0 if words is None else 1)
+    assert capsys.readouterr().err == ("" if words is None else f"guiderail: {words}\n")
