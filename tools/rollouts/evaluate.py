@@ -30,7 +30,7 @@ from guiderail.tools.tasks import changed_environment, make_environment, task_co
 from guiderail.tools.thesis import differences
 
 CALIBRATION = "calibration"  # the uncertainty under which a run hides an offset of its own
-HELD_OUT_SEED = 1_000_000  # of the first held-out episode; training seeds are smaller
+HELD_OUT_SEED = 1_000_000  # of the first held-out episode
 COMPARED = (
     "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "worst_violation",
     "worst_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
@@ -138,8 +138,8 @@ def evaluate(
         environment do, in words.
 
     Raises:
-        InputError: if there is no trained run, a number is out of range, its policy sees or moves other things, or
-            nothing is hidden that could be drawn anew.
+        InputError: if there is no trained run, a number is out of range, its policy sees or moves other things,
+            nothing is hidden that could be drawn anew, or an episode would hide what the run did.
     """
     folder = RunFolder(run)
     config, policy, trained = folder.config(), Policy.load(folder.path), folder.episodes()
@@ -148,6 +148,11 @@ def evaluate(
     claimed = claim(config.task, where, fresh)
     if fresh:
         how["options"] = {"new_run": True}
+        if seed <= config.seed < seed + episodes:  # what a run hides is drawn from its own seed
+            raise InputError(
+                f"episode {config.seed - seed} of these hides what the run itself hid: give another --seed, such as "
+                f"{config.seed + 1}"
+            )
     alone = {"demonstration": still} if is_demonstrated(where.get("guidance")) else {}
     them: dict[str, Callable[[gymnasium.Env], Act]] = {**alone, **(beside or {})}
     series = {

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from guiderail.models.errors import InputError
+from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import COMPARED, cached, claim, evaluate, evaluate_policy
 from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
 from guiderail.tools.tasks import make_environment
@@ -77,6 +78,14 @@ def test_a_policy_for_one_offset_and_one_for_any_are_two_claims(bead_run):
     assert evaluate(bead_run, episodes=1)["claim"] == "a policy for starts that training never drew"
     with pytest.raises(InputError, match="hides nothing that could be drawn anew: leave --fresh out"):
         evaluate(bead_run, episodes=1, fresh=True)
+
+
+def test_what_a_run_hid_is_not_among_what_is_drawn_anew(bead_run, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.rollouts.evaluate.claim", lambda *given: "for any")
+    own = RunFolder(bead_run).config().seed
+    for seed, episodes in ((own, 1), (own - 2, 3)):
+        with pytest.raises(InputError, match="hides what the run itself hid"):
+            evaluate(bead_run, episodes=episodes, seed=seed, fresh=True)
 
 
 def test_what_is_hidden_in_a_run_is_drawn_anew_only_where_that_is_asked_for():
