@@ -521,7 +521,9 @@ def study(
     file: Annotated[str, _arg("A YAML file, or one of {studies}.", "FILE", "studies")],
     out: Annotated[Path, _opt("The folder of the study; what is finished in it is used again.")],
     methods: Annotated[str | None, _opt("Some of its methods, separated by commas.")] = None,
-    seeds: Annotated[str | None, _opt("Other seeds, separated by commas.")] = None,
+    seeds: Annotated[
+        str | None, _opt("Other seeds, separated by commas; a method with seeds of its own keeps them.")
+    ] = None,
     engine: Annotated[str | None, _opt("What runs them: {engines}.  [default: process]", of="engines")] = None,
     address: Annotated[str | None, _opt("Of a Ray cluster.  [default: RAY_ADDRESS, or a Ray of this machine]")] = None,
     processes: Annotated[int | None, _opt("How many runs go side by side.  [default: 2, or a cluster's cores]")] = None,
@@ -529,9 +531,9 @@ def study(
 ) -> None:
     """Train and judge methods over seeds, as a YAML file says.
 
-    It leaves a table with a row for each method, seed, mark and what was judged on. A study that was stopped goes on
-    where it was with the same command. A run that fails stops none of the others; it is named at the end, and the
-    command ends with 1.
+    It leaves a table with a row for each method, seed, mark and what was judged on; that of some methods or other seeds
+    is named by them. A study that was stopped goes on where it was with the same command. A run that fails stops none
+    of the others; it is named at the end, and the command ends with 1.
     """
     from guiderail.tools.studies import declaration
 
