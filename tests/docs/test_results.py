@@ -136,3 +136,27 @@ def test_what_was_learned_for_any_offset_succeeds_in_the_other_engine():
     ]
     assert without_failures[1] < 1.2 * without_failures[0]
     assert (of("connector_disc_transfer", "white", "MuJoCo")["success_rate"] > 0.5).all()
+
+
+def test_at_a_finer_contact_what_was_learned_at_hard_is_hardly_harder_in_the_other_engine():
+    found = {
+        (method, where): (100 * of("connector_hard_fine", method, where)["success_rate"]).round().tolist()
+        for method in ("kgrl", "kgrl_randomized", "skgrl_adaptive", "residual", "rule", "white")
+        for where in ("fresh", "MuJoCo")
+    }
+    assert found == {
+        ("kgrl", "fresh"): [82, 100, 100],
+        ("kgrl", "MuJoCo"): [74, 96, 97],
+        ("kgrl_randomized", "fresh"): [98, 99, 97],
+        ("kgrl_randomized", "MuJoCo"): [91, 95, 94],
+        ("skgrl_adaptive", "fresh"): [87],
+        ("skgrl_adaptive", "MuJoCo"): [84],
+        ("residual", "fresh"): [100],
+        ("residual", "MuJoCo"): [92],
+        ("rule", "fresh"): [100],
+        ("rule", "MuJoCo"): [88],
+        ("white", "fresh"): [5],
+        ("white", "MuJoCo"): [7],
+    }
+    assert of("connector_hard_fine", "residual")["worst_violation"].min() > TOLERANCE
+    assert of("connector_hard_fine", "kgrl")["worst_violation"].max() <= TOLERANCE
