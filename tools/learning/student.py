@@ -110,7 +110,8 @@ class Student(Learner):
         Where the simulation failed nothing followed: what came before is then the episode's last, as at a time limit.
         """
         if "simulation_failure" in decision.info:
-            self._decisions[-1:] = [replace(last, truncated=True) for last in self._decisions[-1:]]
+            if self._decisions:
+                self._decisions[-1] = replace(self._decisions[-1], truncated=True)
             return
         self._decisions.append(replace(decision, info={}))
         self._acting.decisions += 1

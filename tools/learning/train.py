@@ -150,8 +150,6 @@ def _train(
             spent_saving += last_saving
         learner.hand_over()
     learner.finish()
-    if learner.has_diverged():
-        raise diverged()
     policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
     policy.save(folder.path, write=write_atomically)
     return rows

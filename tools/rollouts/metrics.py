@@ -138,7 +138,7 @@ def converged_after(rows: pd.DataFrame) -> int | None:
 
     What was demonstrated counts as an episode, and as no success.
     """
-    return first_in_a_row((rows["success"] == 1) & rows.index.isin(own(rows).index), 10)
+    return first_in_a_row((rows["success"] == 1) & (rows.get("demonstrated", 0) == 0), 10)
 
 
 def avoids_obstacle_from(rows: pd.DataFrame, cost: float = 1.0, in_a_row: int = 5) -> int | None:

@@ -338,14 +338,21 @@ def test_a_run_goes_on_by_the_words_that_began_it_and_says_of_other_versions(tmp
         run("NarrowPassage", out, episodes=1, resume=True, **words)
 
 
+def one_more(folder, package, kind, register, name):
+    """A file that registers a class like one of a package's under a name of its own."""
+    (module, _, like), (registry, _, decorator) = kind.partition("."), register.partition(".")
+    file = folder / "mine.py"
+    file.write_text(
+        f"from {package}.{module} import {like}\nfrom {package}.{registry} import {decorator}\n"
+        f"@{decorator}({name!r})\nclass Mine({like}):\n    pass\n"
+    )
+    return file
+
+
 def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monkeypatch):
     monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # no other test has this one
-    file = tmp_path / "mine.py"
-    file.write_text(
-        "from guiderail.diagrams.tasks.narrow_passage import NarrowPassage\n"
-        "from guiderail.diagrams.tasks.registry import register_task\n"
-        "@register_task('changes/Passage')\nclass Mine(NarrowPassage):\n    pass\n"
-    )
+    kinds = "narrow_passage.NarrowPassage", "registry.register_task"
+    file = one_more(tmp_path, "guiderail.diagrams.tasks", *kinds, "changes/Passage")
     out = tmp_path / "run"
     run("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
     config = RunFolder(out).config()
@@ -359,12 +366,8 @@ def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monke
 
 def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, forkserver, monkeypatch):
     monkeypatch.setitem(LEARNERS._entries, "sac_of_mine", None)  # no other test has this one
-    file = tmp_path / "own_learner.py"
-    file.write_text(
-        "from guiderail.tools.learning.learner import register_learner\n"
-        "from guiderail.tools.learning.off_policy import SacLearner\n"
-        "@register_learner('sac_of_mine')\nclass Mine(SacLearner):\n    pass\n"
-    )
+    kinds = "off_policy.SacLearner", "learner.register_learner"
+    file = one_more(tmp_path, "guiderail.tools.learning", *kinds, "sac_of_mine")
     settings = {"units": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
     done = run(
         "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "hold": 20}, algorithm="sac_of_mine",
