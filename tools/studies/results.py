@@ -17,7 +17,8 @@ from guiderail.tools.figures.thesis import THESIS
 from guiderail.tools.files import write_atomically
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.studies.declaration import LEARNED, Study, load_study, shipped_studies
-from guiderail.tools.studies.study import differences_of
+from guiderail.tools.studies.study import differences_of, each
+from guiderail.tools.studies.sweep import BREAKS, break_words, curve, draw_sweeps
 from guiderail.tools.tables import cell, read_table, table_text
 from guiderail.tools.tasks import import_modules
 
@@ -47,6 +48,8 @@ OF_SMOOTHNESS = (
 def write_results(folders: Sequence[Path], out: Path) -> Path:
     """Takes what studies and figures left into a folder, and writes its README.md anew from all that is there.
 
+    Beside it is a picture of each study that has sweeps.
+
     Args:
         folders: of studies that come along, or of what `guiderail reproduce` left; none to write the page anew only.
         out: the folder with a table for each study and a JSON file for each figure.
@@ -74,6 +77,9 @@ def write_results(folders: Sequence[Path], out: Path) -> Path:
         "# What was reproduced\n\nWritten by `guiderail results`, from the tables and the figures' numbers beside it. "
         "In simulation;\nevery seed by itself; held-out episodes are ones that training never drew.\n"
     )
+    for name, rows in tables.items():
+        if isinstance(study := load_study(name), Study) and study.sweeps:
+            draw_sweeps(study, rows, out / f"{name}.svg")
     parts = [head, _figures(made, [*tables]), *(_study(name, rows) for name, rows in tables.items())]
     write_atomically(out / "README.md", "\n".join(parts).encode())
     return out / "README.md"
@@ -119,10 +125,12 @@ def _study(name: str, rows: pd.DataFrame) -> str:
         lines += [f"| {' | '.join(map(cell, row))} |" for row in told.itertuples(index=False)]
         return "\n".join([*lines, ""])
     lines += [f"- Figure {number}: {THESIS[number]}." for number in FIGURES.get(name, ())]
-    lines += ["", f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
+    lines += _swept(study, rows)
+    if len(judged := _judged(study, rows)):
+        lines += ["", f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
     # A study that judges nothing has an empty column, whose cells are read as NaN.
-    for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
-        told = [method, mark or "–", judged or "–", *_numbers(group)]
+    for (method, mark, on), group in judged.groupby(["method", "mark", "judged_on"], sort=False, dropna=False):
+        told = [method, mark or "–", on or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, told))} |")
     if missing := [method for method in study.methods if method not in set(rows["method"])]:
         lines += ["", f"Declared by the study, and not in this table: {', '.join(missing)}."]
@@ -133,6 +141,36 @@ def _study(name: str, rows: pd.DataFrame) -> str:
     for words, methods in differing.items():
         lines += ["", f"Differs from the thesis in ({', '.join(methods)}): {words}."]
     return "\n".join([*lines, ""])
+
+
+def _swept(study: Study, rows: pd.DataFrame) -> list[str]:
+    """A study's sweeps: their picture, and for each a table of every method's success, each seed by itself."""
+    if not study.sweeps:
+        return []
+    lines = ["", f"![Success against difficulty, every method]({study.name}.svg)"]
+    for sweep in study.sweeps:
+        columns = [sweep.quantity, *(f"{value:g}" for value in sweep.at), f"below {BREAKS:.0%} at"]
+        lines += ["", f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+        for method in study.methods:
+            of_method = rows[rows["method"] == method]
+            values, points = curve(sweep, rows, method)
+            if not values:
+                continue
+            seeds = (
+                each(of_method[of_method["judged_on"] == sweep.judged_on(value).name], "success_rate", "{:.0%}")
+                for value in sweep.at
+            )
+            told = [method, *seeds, break_words(values, points)]
+            lines.append(f"| {' | '.join(one or '–' for one in told)} |")
+    return lines
+
+
+def _judged(study: Study, rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows of what is judged besides sweeps; of what is judged in sweeps alone one a run, about its training."""
+    if study.judged_on or not study.sweeps:
+        return rows[~rows["judged_on"].isin([s.judged_on(value).name for s in study.sweeps for value in s.at])]
+    once = rows.drop_duplicates(["method", "mark", "seed"])
+    return once[once["training_episodes"].notna()].assign(judged_on="", success_rate=np.nan)
 
 
 def _numbers(group: pd.DataFrame) -> list[str]:

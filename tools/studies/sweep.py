@@ -62,10 +62,14 @@ def broken(study: Study, rows: pd.DataFrame) -> dict[str, str]:
         for name in study.methods:
             values, points = curve(sweep, rows, name)
             if values:
-                at = breaking_point(values, [rate for rate, _, _ in points])
-                words = at if isinstance(at, str) else f"{at:.3g}"
-                found[f"{name}, below {BREAKS:.0%} at {sweep.quantity}"] = words
+                found[f"{name}, below {BREAKS:.0%} at {sweep.quantity}"] = break_words(values, points)
     return found
+
+
+def break_words(values: Sequence[float], points: Sequence[tuple[float, float, float]]) -> str:
+    """Where a curve breaks, as a number or in words."""
+    at = breaking_point(values, [rate for rate, _, _ in points])
+    return at if isinstance(at, str) else f"{at:.3g}"
 
 
 def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], list[tuple[float, float, float]]]:

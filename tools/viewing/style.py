@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -27,10 +28,11 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figu
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 130) -> Path:
-    """Writes a picture, whole, in the format that its ending says."""
+    """Writes a picture, whole, in the format that its ending says; the same figure is the same SVG."""
     check_picture(path)
-    content = io.BytesIO()
-    figure.savefig(content, format=path.suffix[1:].lower(), dpi=dpi)
+    content, kind = io.BytesIO(), path.suffix[1:].lower()
+    with matplotlib.rc_context({"svg.hashsalt": "guiderail", "svg.fonttype": "none"}):
+        figure.savefig(content, format=kind, dpi=dpi, metadata={"Date": None} if kind == "svg" else None)
     write_atomically(path, content.getvalue())
     return path
 

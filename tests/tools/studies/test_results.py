@@ -4,7 +4,7 @@ import pytest
 from guiderail.models.errors import InputError
 from guiderail.tools.figures import reproduce
 from guiderail.tools.figures.thesis import THESIS
-from guiderail.tools.studies.declaration import shipped_studies
+from guiderail.tools.studies.declaration import load_study, shipped_studies
 from guiderail.tools.studies.results import FIGURES, OF_SMOOTHNESS, write_results
 from guiderail.tools.tables import read_table, write_table
 
@@ -40,6 +40,28 @@ def test_a_study_that_judges_nothing_has_its_rows_too(finished, tmp_path):
     write_table(tmp_path / "unjudged" / "connector", table.assign(judged_on=""))
     page = write_results([tmp_path / "unjudged"], tmp_path / "results").read_text()
     assert "| skgrl | 40 | – | – | 12, never | within | 2 | 1.00 |" in page
+
+
+def test_a_sweep_has_a_picture_and_says_where_each_method_breaks(tmp_path):
+    rates = {"rl_sct": (1.0, 1.0, 0.95, 0.85, 0.6, 0.0), "white": (0.05,) * 6}
+    rows = [
+        {"method": method, "mark": 100 * learned, "judged_on": one.name, "seed": 110, "episodes": 40,
+         "success_rate": rate, "training_episodes": 100 if learned else None, "training_converged_after": None,
+         "training_worst_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0}
+        for method, learned in (("rl_sct", True), ("white", False))
+        for one, rate in zip(load_study("pouring_sweep").judgements, rates[method], strict=True)
+    ]  # fmt: skip
+    write_table(tmp_path / "study" / "pouring_sweep", pd.DataFrame(rows))
+    page, picture = write_results([tmp_path / "study"], tmp_path / "results"), tmp_path / "results/pouring_sweep.svg"
+    text, drawn = page.read_text(), picture.read_bytes()
+    assert "](pouring_sweep.svg)" in text
+    assert "| rl_sct | 100% | 100% | 95% | 85% | 60% | 0% | 30 |" in text
+    assert "| white | 5% | 5% | 5% | 5% | 5% | 5% | from the easiest on |" in text
+    assert "| rl_sct | 100 | – | – | never | within | 0 | 0.17 |" in text
+    assert "| white | – |" not in text
+    assert "Declared by the study, and not in this table: rule," in text
+    write_results([], tmp_path / "results")
+    assert picture.read_bytes() == drawn
 
 
 def test_the_benchmark_of_smoothness_has_a_line_for_every_way_to_explore(tmp_path):
