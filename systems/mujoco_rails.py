@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class DivergedError(RuntimeError):
-    """An engine's state is no number that the physics could have led to."""
+    """An engine's state is nothing that the physics could have led to."""
 
 
 class MovedBodies(NamedTuple):
@@ -115,8 +115,9 @@ class MujocoRails(LeafSystem):
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # Scratch: every update writes all that it depends on, so that nothing in it outlives one.
         self.model, self._data = model, self._mujoco.MjData(model)
-        bad = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL")
-        self._bad = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in bad]
+        # Diverged; or out of memory, where the engine goes on without the contacts that it has no room for.
+        failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
+        self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
         # With the solver's warm start, so that a state that is restored goes on identically.
         self._parts = self._mujoco.mjtState.mjSTATE_INTEGRATION
         self._time_constant = time_constant
@@ -223,7 +224,7 @@ class MujocoRails(LeafSystem):
         finer = self._soften(*context.get_numeric_parameter(self._factors).value())
         self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
         data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
-        for warning in self._bad:
+        for warning in self._failures:
             data.warning[warning].number = 1  # of the first one the engine would write a file in the working directory
         filtered = state[self._filtered]
         decay = np.exp(-model.opt.timestep / self._time_constant) if self._time_constant > 0.0 else 0.0
@@ -234,16 +235,16 @@ class MujocoRails(LeafSystem):
             filtered = newest + decay * (filtered - newest)
         following = np.concatenate([self._engine_state(), filtered])
         if not np.isfinite(following).all():
-            raise DivergedError("MuJoCo diverged: its state is not finite")
+            raise DivergedError("the simulation failed in MuJoCo: its state is not finite")
         discrete_state.set_value(self._state, following)
         return EventStatus.Succeeded()
 
     def _check_warnings(self) -> None:
-        numbers = self._data.warning.number[self._bad]
+        numbers = self._data.warning.number[self._failures]
         if numbers.max() > 1:
-            warning = self._bad[int(numbers.argmax())]
+            warning = self._failures[int(numbers.argmax())]
             about = int(self._data.warning[warning].lastinfo)
-            raise DivergedError(f"MuJoCo diverged: {self._mujoco.mju_warningText(warning, about)}")
+            raise DivergedError(f"the simulation failed in MuJoCo: {self._mujoco.mju_warningText(warning, about)}")
 
     def _place(self, poses: list[RigidTransform]) -> None:
         X_TFixture = self._X_TW @ poses[self._moved.fixture]

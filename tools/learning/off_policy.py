@@ -253,7 +253,12 @@ class OffPolicyLearner(Learner):
         return self.random.uniform(space.low, space.high).astype(space.dtype)
 
     def remember(self, one: Decision) -> None:
-        """Takes a decision into the replay buffer. A time limit is not an end of the task."""
+        """Takes a decision into the replay buffer.
+
+        A time limit is not an end of the task: its last decision is bootstrapped (partial-episode bootstrapping, Pardo
+        et al., 2018), as whoever is near the goal then is worth what one is worth who is there earlier. The clock that
+        is observed is for telling the phases of a skill apart, and not for what is left of the time.
+        """
         infos = [{"TimeLimit.truncated": one.truncated and not one.terminated}]
         observation, following = one.observation, one.following
         action = self.model.policy.scale_action(np.asarray(one.action)[None])

@@ -14,7 +14,7 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.objects.bnc_motion import CLEAR, insert_and_lock, poses
 from guiderail.models.units import MM
 
-pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco")
 from guiderail.diagrams.stations.mujoco_rails import MujocoStation
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
@@ -207,11 +207,28 @@ def test_an_engine_that_diverges_ends_the_episode_and_leaves_nothing_for_the_nex
         env.push(np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
         observation, _, terminated, truncated, info = env.step(np.zeros(2))
         assert (terminated, truncated) == (False, True)
-        assert "MuJoCo diverged" in info["simulation_failure"]
+        assert "the simulation failed in MuJoCo" in info["simulation_failure"]
         assert not info["is_success"]
         np.testing.assert_array_equal(observation, sound)
     assert not list(tmp_path.iterdir())
     np.testing.assert_array_equal(episode(env, 5), episode(made(), 5))
+
+
+@pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
+def test_an_engine_without_room_for_its_contacts_ends_the_episode(warning, monkeypatch):
+    """MuJoCo by itself goes on without the contacts that are too many: a plug would go through a socket."""
+    step = mujoco.mj_step
+
+    def step_and_warn(model, data):
+        step(model, data)
+        data.warning[mujoco.mjtWarning.__members__[f"mjWARN_{warning}"].value].number += 1
+
+    env = make_env("BncConnector", station="mujoco", hold=25)
+    env.reset(seed=3)
+    monkeypatch.setattr(mujoco, "mj_step", step_and_warn)
+    *_, terminated, truncated, info = env.step(np.zeros(2))
+    assert (terminated, truncated) == (False, True)
+    assert "the simulation failed in MuJoCo" in info["simulation_failure"]
 
 
 def test_what_a_task_draws_is_where_the_engine_has_it():
