@@ -35,7 +35,9 @@ _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
 # What Drake, or a system with another engine, says when the physics, and not the wiring, went wrong. Drake's own
 # assertions arrive in Python as SystemExit.
-_SIMULATION_FAILURE = re.compile(r"failed to converge|\bnan\b|not finite|diverg|simulation failed|AllFinite|isfinite", re.IGNORECASE)
+_SIMULATION_FAILURE = re.compile(
+    r"failed to converge|\bnan\b|not finite|diverg|simulation failed|AllFinite|isfinite", re.IGNORECASE
+)
 
 
 class GuidedEnv(DrakeGymEnv):

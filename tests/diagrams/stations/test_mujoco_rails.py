@@ -14,7 +14,8 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.objects.bnc_motion import CLEAR, insert_and_lock, poses
 from guiderail.models.units import MM
 
-mujoco = pytest.importorskip("mujoco")
+pytest.importorskip("mujoco")
+import mujoco
 from guiderail.diagrams.stations.mujoco_rails import MujocoStation
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
