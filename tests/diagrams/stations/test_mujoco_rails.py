@@ -16,6 +16,7 @@ from guiderail.models.units import MM
 
 pytest.importorskip("mujoco")
 import mujoco
+
 from guiderail.diagrams.stations.mujoco_rails import MujocoStation
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
