@@ -384,8 +384,9 @@ def replay(
     page = default_page(Path(shown), environment) if html is None else html
     if picture is not None:
         check_picture(picture)
-        write_film(picture, episode)
     write_page(page, episode, episodes=episodes)
+    if picture is not None:
+        write_film(picture, episode)
     typer.echo(page)
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
-from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.files import write_atomically
 from guiderail.tools.guidance import colour
 from guiderail.tools.learning.configure import run
 from guiderail.tools.learning.run_folder import RunFolder
@@ -24,6 +24,7 @@ from guiderail.tools.viewing.style import new_figure, save_figure
 HELD_OUT = 10  # episodes that the result is judged on
 SEED = 1_000_000
 PRESET = "steady"
+MARK = ".demo"  # a file in the folder of a demo: nothing without it is removed
 
 
 def run_demo(out: Path, *, episodes: int, seed: int) -> None:
@@ -44,6 +45,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         "and a zone was forbidden. It now learns by trial and error to go around the one, and never enters the other."
     )
     _clear(out)
+    write_atomically(out / MARK, b"")
     summary = run(
         "NarrowPassage",
         out,
@@ -89,17 +91,9 @@ def _called() -> str:
 
 def _clear(out: Path) -> None:
     """Removes an earlier demo, and nothing else."""
-    if not out.exists():
-        return
-    folder = RunFolder(out)
-    try:
-        config = folder.config()
-    except InputError:
-        config = None
-    if config is None or config.task != "NarrowPassage" or config.preset != PRESET:
-        folder.refuse_existing()
-        return
-    shutil.rmtree(out)
+    if (out / MARK).is_file():
+        shutil.rmtree(out)
+    RunFolder(out).refuse_existing()
 
 
 def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:

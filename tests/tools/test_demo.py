@@ -1,4 +1,8 @@
+import pytest
+
+from guiderail.models.errors import InputError
 from guiderail.tools import demo
+from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.viewing import replay, style
 
 
@@ -17,3 +21,20 @@ def test_the_demo_says_what_it_left_and_replaces_itself(tmp_path, monkeypatch, c
     (out / "left_over.txt").write_text("of the last demo")
     demo._clear(out)
     assert not out.exists()
+
+
+def test_a_run_like_a_demo_that_is_none_is_left_alone(tmp_path):
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "config.yaml").write_text("task: NarrowPassage\npreset: steady\n")
+    with pytest.raises(InputError, match="already exists"):
+        demo.run_demo(out, episodes=2, seed=0)
+    assert (out / "config.yaml").exists()
+
+
+def test_a_demo_that_was_killed_at_its_start_is_replaced(tmp_path):
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / demo.MARK).touch()
+    RunFolder(tmp_path / "demo").refuse_existing()
+    demo._clear(tmp_path / "demo")
+    assert not (tmp_path / "demo").exists()

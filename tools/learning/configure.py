@@ -16,7 +16,7 @@ from guiderail.tools.learning.presets import resolve_preset
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.rollouts.metrics import summary
 from guiderail.tools.rollouts.progress import EpisodeProgress
-from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.rollouts.rollout import Act, check_seed
 from guiderail.tools.tasks import check_environment, import_modules, task_content
 
 # What a finished run says about itself.
@@ -46,8 +46,7 @@ def configure(
     """
     if episodes < 1:
         raise InputError(f"a run needs at least one episode, not {episodes}")
-    if not 0 <= seed < 2**31:
-        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
+    check_seed(seed)
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)
     return RunConfig(

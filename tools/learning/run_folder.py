@@ -129,12 +129,11 @@ class RunFolder:
         self.write_config(config)
 
     def refuse_existing(self) -> None:
-        """Raises an InputError if the folder holds something already."""
-        # What is left of a run that was killed before it had a configuration is nothing that could go on.
+        """Raises an InputError if the folder holds something already, but for hidden files."""
+        # Such as what is left of a run that was killed before it had a configuration: nothing that could go on.
         try:
-            left = {LOCK, *(part.name for part in self.path.glob(".*.part"))}
             is_taken = self.path.exists() and (
-                not self.path.is_dir() or any(one.name not in left for one in self.path.iterdir())
+                not self.path.is_dir() or any(not one.name.startswith(".") for one in self.path.iterdir())
             )
         except OSError as error:
             raise InputError(f"{brief(self.path)} is no folder for a run: {error.strerror}") from error

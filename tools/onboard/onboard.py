@@ -29,6 +29,7 @@ from guiderail.models.parts.model_files import obj_text
 from guiderail.models.parts.pieces import as_arrays, convex_pieces
 from guiderail.models.parts.sides import sides
 from guiderail.models.units import DEGREE, MM
+from guiderail.tools.files import check_writable
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 MODULI = (2e9, 1e10, 3e10)  # [Pa] of what is compliant, tried in this order until it is stiff enough
@@ -151,6 +152,7 @@ def onboard(
     """
     if out.exists():
         raise InputError(f"{out} already exists: name another folder with --out, or remove it")
+    check_writable(out)
     _check_given(friction, scenario)
     parts = read_parts(plug, socket, unit, place, axis, centre)
     check_target(*parts)
@@ -161,7 +163,10 @@ def onboard(
     say(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
     made = out.with_name(f".{out.name}.part")
     shutil.rmtree(made, ignore_errors=True)
-    made.mkdir(parents=True)
+    try:
+        made.mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{out} cannot be made ({error.strerror}): choose a folder with room to write") from error
     try:
         measured = _make(made, out.name, parts, path, clearance, snapping, force_limit, friction, scenario, say)
         made.rename(out)
@@ -173,12 +178,17 @@ def onboard(
 def _check_given(friction: float, scenario: Sequence[Path]) -> None:
     """Raises an InputError for what would be found out only after minutes."""
     from guiderail.diagrams.options import validated
-    from guiderail.diagrams.tasks.part_file import Piece
+    from guiderail.diagrams.tasks.part_file import FILE_NAME, Piece
 
     validated(Piece, {"file": "plug.obj", "friction": friction}, "a part")
+    names = [file.name for file in scenario]
     for file in scenario:
         if not file.is_file():
             raise InputError(f"there is no scenario {file}")
+        if file.suffix.lower() not in (".yaml", ".yml") or file.name == FILE_NAME:
+            raise InputError(f"{file} is no scenario: that is a .yaml file of Drake model directives, not {FILE_NAME}")
+        if names.count(file.name) > 1:
+            raise InputError(f"two scenarios are called {file.name}, and both go into one folder: rename one")
 
 
 def _snapping(plug: Part, socket: Part, path: Motion) -> frozenset[int]:
@@ -398,7 +408,11 @@ def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
     """The unit, asked for at a terminal where neither an argument nor the format says it."""
     if given is not None or all(unit_of(path, None) for path in paths) or not sys.stdin.isatty():
         return given
+    if any(not path.is_file() for path in paths):
+        return given  # which is said better where the files are read
     try:
-        return input(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ").strip() or "mm"
+        # Not by input(), whose question may go where a program reads the result.
+        print(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ", end="", file=sys.stderr, flush=True)
+        return input().strip() or "mm"
     except EOFError:
         return None  # as where nobody can be asked

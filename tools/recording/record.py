@@ -8,8 +8,9 @@ import numpy as np
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
+from guiderail.tools.files import check_writable
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.rollouts.rollout import rollout
+from guiderail.tools.rollouts.rollout import check_seed, rollout
 from guiderail.tools.tasks import make_environment
 
 SIGNALS = ("commanded", "measured")
@@ -35,8 +36,10 @@ def record(run: Path, out: Path, *, episodes: int = 5, signal: str = "commanded"
         raise InputError(f"there is no signal {signal!r} to record: choose one of {', '.join(SIGNALS)}")
     if episodes < 1:
         raise InputError(f"a recording needs at least one episode, not {episodes}")
+    check_seed(seed)
     if out.exists():
         raise InputError(f"{out} already exists: name another file")
+    check_writable(out)
     if out.suffix not in (".npz", ".csv"):
         raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
     config, policy = RunFolder(run).config(), Policy.load(run)

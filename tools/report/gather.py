@@ -17,7 +17,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.guidance import colour, is_demonstrated, label
 from guiderail.tools.learning.presets import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, cached, evaluate_run, kept_file
+from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, cached, evaluate_run, kept_file, learned_file
 from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
@@ -27,6 +27,10 @@ from guiderail.tools.tasks import beyond_defaults, known_tasks
 LEARNED = "learned"
 BESIDE = ("zero", "white", "constant")  # null policies that an evaluation for a report has beside the learned one
 STUDY_COLUMNS = {"method", "policy", "seed", "mark", "judged_on", "episodes", "success_rate"}
+NEEDED = (
+    "success", "return", "steps", "worst_violation", "worst_measured_violation", "peak_force", "collisions",
+    "fallbacks",
+)  # fmt: skip
 PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
 LEDGER_COLUMNS = (
     "commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "holding", "fallback",
@@ -92,12 +96,14 @@ class Gathered:
         runs: those with at least an episode, by task and method.
         held_out: a row for every policy, seed, mark and what it was judged on, with the counts.
         study: whether it is a study's folder, and not runs by themselves.
+        called: a name for each run's folder, no two alike.
     """
 
     name: str
     runs: list[Run] = field(default_factory=list)
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
     study: bool = False
+    called: list[str] = field(default_factory=list)
 
     @property
     def tasks(self) -> list[str]:
@@ -157,22 +163,39 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
     name = paths[0].resolve().name if len(paths) == 1 else ", ".join(dict.fromkeys(run.config.task for run in runs))
     tables_of_rows = [table for table in held_out if len(table)]
     judged = pd.concat(tables_of_rows, ignore_index=True) if tables_of_rows else pd.DataFrame()
-    return Gathered(name, runs, judged, study=tables)
+    return Gathered(name, runs, judged, study=tables, called=_names(runs))
+
+
+def _names(runs: Sequence[Run]) -> list[str]:
+    """The runs' folders' names, numbered where several have the same."""
+    names = [run.path.resolve().name for run in runs]
+    return [name if names.count(name) == 1 else f"{name}-{1 + names[:i].count(name)}" for i, name in enumerate(names)]
 
 
 def _episodes(folder: RunFolder) -> pd.DataFrame:
-    return folder.episodes() if (folder.path / "episodes.csv").is_file() else pd.DataFrame()
+    rows = folder.episodes() if (folder.path / "episodes.csv").is_file() else pd.DataFrame()
+    if len(rows) and (missing := [name for name in NEEDED if name not in rows]):
+        raise InputError(f"{folder.path} is of another version: its episodes have no {missing[0]}; train anew")
+    return rows
 
 
 def _study_tables(folder: Path) -> list[pd.DataFrame]:
-    """What a study left: tables with a row for each method, seed, mark and what is judged on."""
-    found = []
-    for file in sorted(folder.glob("*.csv")):
+    """What a study left: tables with a row for each method, seed, mark and what is judged on.
+
+    Rows of a study's part that are in its whole table too are left out.
+    """
+    found: dict[str, pd.DataFrame] = {}
+    for file in sorted(folder.glob("*.csv"), key=lambda one: (len(one.stem), one.stem)):
         table = read_table(file)
-        if set(table.columns) >= STUDY_COLUMNS:
-            rows = table[(table["judged_on"] != "") & table["success_rate"].notna()]
-            found.append(_counted(rows.assign(study=file.stem)))
-    return found
+        if not set(table.columns) >= STUDY_COLUMNS:
+            continue
+        rows = _counted(table[(table["judged_on"] != "") & table["success_rate"].notna()].assign(study=file.stem))
+        for name, whole in found.items():
+            if file.stem.startswith(f"{name}-"):
+                same = list(whole.columns.drop("study"))
+                rows = rows[~rows[same].apply(tuple, axis=1).isin(set(whole[same].apply(tuple, axis=1)))]
+        found[file.stem] = rows
+    return [rows for rows in found.values() if len(rows)]
 
 
 def _counted(rows: pd.DataFrame) -> pd.DataFrame:
@@ -190,7 +213,7 @@ def _judged(run: Run, episodes: int) -> pd.DataFrame:
     for file in sorted(file for folder in ("held_out", "beside") for file in (run.path / folder).glob("*.csv")):
         table, policy = read_table(file), file.stem.split("-")[0]
         if "success" not in table or (
-            policy == LEARNED and not file.stem.startswith(f"{LEARNED}-{len(run.episodes)}-")
+            policy == LEARNED and not file.stem.startswith(f"{LEARNED}-{len(run.episodes)}-{HELD_OUT_SEED}-")
         ):
             continue
         # An evaluation may have been asked for another environment or other episodes.
@@ -208,7 +231,9 @@ def _judged(run: Run, episodes: int) -> pd.DataFrame:
 
 def _judge(run: Run, episodes: int) -> None:
     policy = Policy.load(run.path)
-    acts: dict[str, Any] = {f"{LEARNED}-{len(run.episodes)}": lambda env: policy}
+    known = learned_file(run.path, len(run.episodes), HELD_OUT_SEED, episodes)
+    cached(known, partial(evaluate_run, run.config, lambda env: policy, episodes=episodes, words=LEARNED))
+    acts: dict[str, Any] = {}
     demonstrated = is_demonstrated(run.config.environment.get("guidance"))
     for name in BESIDE:
         called = "demonstration" if name == "zero" and demonstrated else name

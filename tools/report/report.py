@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import pandas as pd
 
 from guiderail.models.errors import InputError
-from guiderail.tools.files import write_atomically
+from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.report import figures
 from guiderail.tools.report.gather import LEARNED, Gathered, Run, command, finite, flat, gather
 from guiderail.tools.report.statistics import interquartile_mean, median_survival, survival, wilson_of_each
 from guiderail.tools.rollouts.metrics import TOLERANCE, converged_after
+from guiderail.tools.studies.declaration import shipped_studies
 from guiderail.tools.tables import cell
 from guiderail.tools.thesis import differences
 
@@ -63,6 +65,7 @@ def write_report(paths: Sequence[Path], out: Path, *, episodes: int = 0) -> Path
         raise InputError(f"{out} has the ending {out.suffix!r}: a report is a page, .html")
     if episodes < 0:
         raise InputError(f"runs are judged on a number of episodes from 0, not {episodes}")
+    check_writable(out)
     gathered = gather(paths, episodes)
     write_atomically(out, page(gathered, paths).encode())
     return out
@@ -77,7 +80,7 @@ def page(gathered: Gathered, paths: Sequence[Path]) -> str:
     commands, every = _commands(gathered, paths)
     return PAGE.render(
         title=gathered.name,
-        lead=f"{', '.join(tasks)}: {lead}." if runs else "Policies that learned nothing.",
+        lead=f"{', '.join(tasks)}: {lead}." if runs else _lead(gathered),
         held_out={"table": _held_out(gathered), "figure": figures.held_out(gathered)}
         if len(gathered.held_out)
         else None,
@@ -95,8 +98,8 @@ def _task(gathered: Gathered, task: str) -> dict[str, Any]:
         ("success", "success rate"), ("return", "return"), ("mean_squared_force", "mean squared force [N²]"),
     ]  # fmt: skip
     known = [(name, words) for name, words in terms if all(name in run.episodes for run in gathered.runs)]
-    if all(run.episodes["mean_squared_force"].max() == 0 for runs in methods.values() for run in runs):
-        known = [one for one in known if one[0] != "mean_squared_force"]
+    touched = any((run.episodes["peak_force"] > 0).any() for runs in methods.values() for run in runs)
+    known = [one for one in known if touched or one[0] != "mean_squared_force"]
     drawn = [figures.curve(gathered, task, name, words) for name, words in known]
     drawn.insert(2, figures.survival_curve(gathered, task))
     safety = {name: [run.safety for run in runs] for name, runs in methods.items()}
@@ -116,7 +119,8 @@ def _task(gathered: Gathered, task: str) -> dict[str, Any]:
 
 def _held_out(gathered: Gathered) -> Table:
     rows, judged = [], gathered.held_out
-    for (_, method, policy, mark, where), group in judged.groupby(
+    several = judged["study"].nunique() > 1
+    for (study, method, policy, mark, where), group in judged.groupby(
         ["study", "method", "policy", "mark", "judged_on"], sort=False
     ):
         successes, episodes = int(group["successes"].sum()), int(group["episodes"].sum())
@@ -126,6 +130,7 @@ def _held_out(gathered: Gathered) -> Table:
         each = ", ".join(f"{count} ({interval})" for count, interval in zip(counts, told, strict=True))
         learned = policy == LEARNED
         name = str(method) if learned or str(method) == str(policy) else f"{method}: {policy}"
+        name = f"{study}: {name}" if several else name
         cells = [name, str(mark) if learned and mark else "–", str(where), f"{successes}/{episodes}"]
         cells += [f"{successes / episodes:.1%}", each]
         rows.append(Row([*map(Cell, cells[:-1]), Cell(cells[-1], "long")], null=not learned))
@@ -249,12 +254,28 @@ def _versions(runs: Sequence[Run]) -> Table | None:
 
 def _commands(gathered: Gathered, paths: Sequence[Path]) -> tuple[list[str], list[str]]:
     """What repeats it all, and each run."""
-    out = {id(run): f"runs/{run.path.name}" for run in gathered.runs}
-    every = [command(run.config, out[id(run)]) for run in gathered.runs]
+    every = [command(run.config, f"runs/{name}") for run, name in zip(gathered.runs, gathered.called, strict=True)]
     if gathered.study:
-        studies = dict.fromkeys(gathered.held_out["study"]) if len(gathered.held_out) else ()
-        return [f"guiderail study {name} --out studies" for name in studies], every
+        return _studies(gathered.held_out), every
     return every, []
+
+
+def _studies(judged: pd.DataFrame) -> list[str]:
+    """What repeats the studies of a table; a part of one, whose table's name goes on after a dash, with its methods."""
+    found = []
+    known = {*(judged["study"] if len(judged) else ()), *shipped_studies()}
+    for name, rows in judged.groupby("study", sort=False) if len(judged) else ():
+        whole = next((one for one in sorted(known) if str(name).startswith(f"{one}-")), name)
+        methods, seeds = (",".join(map(str, dict.fromkeys(rows[column]))) for column in ("method", "seed"))
+        part = f" --methods {methods} --seeds {seeds}" if whole != name else ""
+        found.append(f"guiderail study {whole}{part} --out studies")
+    return found
+
+
+def _lead(gathered: Gathered) -> str:
+    """What tables without their runs are of."""
+    learned = (gathered.held_out["policy"] == LEARNED).any() if len(gathered.held_out) else False
+    return "Tables of studies, without their runs." if learned else "Policies that learned nothing."
 
 
 def _count(number: int, what: str) -> str:

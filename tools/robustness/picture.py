@@ -39,7 +39,9 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
             x = [places[value] + APART * (order[who] - (len(order) - 1) / 2) for value in points["value"]]
             rate, colour = points["success_rate"], colours[who]
             bars = [rate - points["success_low"], points["success_high"] - rate]
-            success.errorbar(x, rate, yerr=bars, color=colour, marker="o", markersize=3, capsize=2, label=who)
+            success.errorbar(
+                x, rate, yerr=bars, color=colour, marker="o", markersize=3, capsize=2, label=who.replace("$", r"\$")
+            )
             force.plot(x, points["peak_force_mean"], color=colour)
             force.plot(x, points["peak_force"], ".", color=colour)
         for panel in (success, force):

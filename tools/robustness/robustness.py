@@ -28,6 +28,7 @@ from guiderail.tools.tables import write_table
 from guiderail.tools.tasks import changed_environment
 
 EPISODES = 30  # of each who at each place
+LONGEST = 120  # characters of a table's name
 POLICY, DEMONSTRATION = "policy", "demonstration"  # names in the table
 
 Acts = Callable[[gymnasium.Env], Act]
@@ -110,7 +111,11 @@ def robustness(
             rows.append(_row(place, one.name, judged))
     if not rows:
         raise InputError("none of these axes can be changed here: choose others with --axes")
-    table = write_table(out / f"{_called(axes, environment or {})}.csv", rows).with_suffix(".csv")
+    asked = dict(environment or {})
+    asked |= {"episodes": episodes} if episodes != EPISODES else {}
+    asked |= {"seed": seed} if seed != HELD_OUT_SEED else {}
+    others = [*([one.name for one in policies] if len(policies) > 1 else []), *sorted(beside or {})]
+    table = write_table(out / f"{_called(axes, asked, others)}.csv", rows).with_suffix(".csv")
     picture = draw(table.with_suffix(".png"), rows)
     return {"table": table, "picture": picture, "rows": rows, "policies": [one.name for one in policies]}
 
@@ -141,7 +146,11 @@ def _policies(runs: Sequence[Path], environment: Mapping[str, Any], tell: Callab
 
 
 def _digest(folder: RunFolder) -> str:
-    return hashlib.blake2b((folder.path / "policy.safetensors").read_bytes(), digest_size=8).hexdigest()
+    return _short_digest((folder.path / "policy.safetensors").read_bytes())
+
+
+def _short_digest(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
 def _places(who: Sequence[_Who], axes: Sequence[Axis], tell: Callable[[str], None]) -> list[tuple[_Who, Point]]:
@@ -159,11 +168,13 @@ def _places(who: Sequence[_Who], axes: Sequence[Axis], tell: Callable[[str], Non
     return sorted((pair for pairs in found for pair in pairs), key=lambda pair: order[pair[1].axis.name, pair[1].value])
 
 
-def _called(axes: str | None, environment: Mapping[str, Any]) -> str:
-    """The name of a table, by what was asked for: another question does not replace its answer."""
-    asked = [] if axes is None else [axis.name for axis in chosen_axes(axes)]
-    asked += [f"{key}={value}" for key, value in sorted(environment.items())]
-    return re.sub(r"[^\w.=-]+", "_", "-".join(["robustness", *asked]))
+def _called(axes: str | None, asked: Mapping[str, Any], who: Sequence[str]) -> str:
+    """The name of a table, by what was asked for, and of whom: another question does not replace its answer."""
+    words = [] if axes is None else [axis.name for axis in chosen_axes(axes)]
+    words += [f"{key}={value}" for key, value in sorted(asked.items())]
+    name = re.sub(r"[^\w.=-]+", "_", "-".join(["robustness", *words, *who]))
+    # A file's name has at most 255 bytes.
+    return name if len(name) <= LONGEST else f"{name[:LONGEST]}-{_short_digest(name.encode())}"
 
 
 def _row(place: Point, name: str, judged: pd.DataFrame) -> dict[str, Any]:

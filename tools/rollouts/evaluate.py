@@ -23,7 +23,7 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_
 from guiderail.tools.rollouts.metrics import converged_after, summary
 from guiderail.tools.rollouts.null_policies import still
 from guiderail.tools.rollouts.progress import EpisodeProgress
-from guiderail.tools.rollouts.rollout import Act, rollout
+from guiderail.tools.rollouts.rollout import Act, check_seed, rollout
 from guiderail.tools.rollouts.suited import as_learned, suits
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import changed_environment, make_environment, task_content
@@ -69,8 +69,7 @@ def evaluate_policy(
     """
     if episodes < 1:
         raise InputError(f"an evaluation needs at least one episode, not {episodes}")
-    if not 0 <= seed < 2**31:
-        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
+    check_seed(seed)
     rows = []
     with EpisodeProgress(episodes, name=words, window=None) if words else nullcontext() as progress:
         for i in range(episodes):
@@ -126,7 +125,7 @@ def evaluate(
         seed: of the first; the policy and the demonstration meet the same ones.
         environment: arguments of the environment that are other ones than where it learned, such as the station.
         beside: what else acts in the same episodes, by a name: null policies and rules by hand. Their rows and the
-            demonstration's are kept in the run's folder and used again.
+            demonstration's are kept in the run's folder and used again; the policy's, where it learned, for a report.
         fresh: what is hidden and constant in the run is drawn anew in every episode.
 
     Returns:
@@ -160,6 +159,8 @@ def evaluate(
         for number, name in enumerate(("policy", *them), start=1)
     }
     rows = evaluate_run(config, partial(as_learned, policy), where, words=series["policy"], **how)
+    if where == config.environment and not fresh:
+        write_atomically(learned_file(folder.path, len(trained), seed, episodes), table_text(rows).encode())
     kept, judged = folder.path / "beside", {}
     for name, acts in them.items():
         if kept_file(kept, name, config, where, **how).exists():
@@ -182,6 +183,11 @@ def evaluate(
         "trained_episodes": len(trained),
         "differs_from_thesis": differences(replace(config, environment=where)),
     }
+
+
+def learned_file(run: Path, trained: int, seed: int, episodes: int) -> Path:
+    """Where a report finds the held-out episodes of what a run learned in so many episodes."""
+    return run / "held_out" / f"learned-{trained}-{seed}-{episodes}.csv"
 
 
 def claim(task: str, environment: Mapping[str, Any], fresh: bool) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from guiderail.models.errors import InputError
 from guiderail.tools.rollouts.metrics import Episode, episode_row
 
 Act = Callable[[np.ndarray], np.ndarray]
@@ -60,6 +61,16 @@ class EnvObserver(Observer):
         """
         self.env: Any = env
         self.base: Any = env.unwrapped
+
+
+def check_seed(seed: int) -> None:
+    """Refuses a seed that no environment takes.
+
+    Raises:
+        InputError: if it is negative, or does not fit into 31 bits.
+    """
+    if not 0 <= seed < 2**31:
+        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
 
 
 def rollout(

@@ -7,8 +7,13 @@ import numpy as np
 from guiderail.models.errors import InputError
 from guiderail.tools.guidance import colour
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.rollouts.metrics import converged_after
+from guiderail.tools.rollouts.metrics import WORDS, converged_after
 from guiderail.tools.viewing.style import new_figure, rolling, save_figure
+
+DRAWN = {
+    "success", "return", "worst_violation", "worst_measured_violation", "peak_force", "mean_force",
+    "jerk_commanded_linear", "jerk_measured_linear",
+}  # fmt: skip
 
 
 def plot_run(run: Path) -> Path:
@@ -21,7 +26,9 @@ def plot_run(run: Path) -> Path:
     config, rows = folder.config(), folder.episodes()
     if not len(rows):
         raise InputError(f"{run} has no finished episode yet: let it train, then plot it")
-    column = {key: rows[key].to_numpy(float) for key in rows.columns.drop("termination")}
+    column = {key: rows[key].to_numpy(float) for key in rows.columns.drop(list(WORDS), errors="ignore")}
+    if missing := sorted(DRAWN - column.keys()):
+        raise InputError(f"{folder.path} is of another version: its episodes have no {missing[0]}; train anew")
     episodes = np.arange(1, len(rows) + 1)
     guidance = config.environment.get("guidance", "")
     line = colour(guidance)

@@ -18,7 +18,7 @@ from pydrake.geometry import Rgba
 
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.models.errors import InputError
-from guiderail.tools.files import write_atomically
+from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.guidance import is_demonstrated
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
@@ -75,6 +75,7 @@ def write_page(html: Path, episode: Shown, *, episodes: int | None = None) -> di
     episodes = EPISODES if episodes is None else episodes
     if episodes < 1:
         raise InputError(f"a page shows at least one episode, not {episodes}")
+    check_writable(html)
     logging.getLogger("drake").setLevel(logging.WARNING)  # where Meshcat listens is of no interest to a page
     env = make_environment(episode.task, episode.environment, render_mode="human")
     base = cast(Any, env.unwrapped)

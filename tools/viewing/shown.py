@@ -13,7 +13,7 @@ import gymnasium
 from guiderail.models.policy import Policy
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
-from guiderail.tools.rollouts.rollout import Act
+from guiderail.tools.rollouts.rollout import Act, check_seed
 from guiderail.tools.rollouts.suited import as_learned
 from guiderail.tools.tasks import changed_environment
 
@@ -50,6 +50,9 @@ class Shown:
             seed=seed,
             run=folder.path,
         )
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)
 
     @property
     def heading(self) -> str:

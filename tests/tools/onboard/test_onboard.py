@@ -1,6 +1,7 @@
 """Two meshes become a task by the command alone: it is checked, inserted, trained, evaluated and replayed."""
 
 import json
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -13,7 +14,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models import writing
 from guiderail.models.errors import InputError
 from guiderail.tools.command import main
-from guiderail.tools.onboard.onboard import rank
+from guiderail.tools.onboard.onboard import ask_unit, onboard, rank
 from guiderail.tools.viewing import replay
 
 pytest.importorskip("trimesh")
@@ -51,6 +52,38 @@ def test_what_was_measured_is_what_was_drawn(folder):
     page = (folder / "preview.html").read_text()
     assert "plug" in page
     assert len(page) > 100_000
+
+
+def test_scenarios_that_would_lie_on_each_other_or_on_the_tasks_own_files_are_refused(tmp_path):
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    for name in ("a/table.yaml", "b/table.yaml", "a/task.yaml", "a/plug.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("directives: []\n")
+    for names, words in (
+        (("a/table.yaml", "b/table.yaml"), "two scenarios are called table.yaml"),
+        (("a/task.yaml",), "not task.yaml"),
+        (("a/plug.obj",), "is no scenario"),
+    ):
+        with pytest.raises(InputError, match=words):
+            onboard(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
+    assert not (tmp_path / "peg").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_refused_in_a_sentence(tmp_path):
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="is a file"):
+        onboard(plug, socket, tmp_path / "file" / "peg", unit="mm")
+
+
+def test_a_question_is_no_part_of_the_result(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True, readline=lambda: "cm\n"))
+    files = [tmp_path / "plug.stl", tmp_path / "socket.stl"]
+    assert ask_unit(files, None) is None, "of files that are missing nothing is asked"
+    for file in files:
+        file.touch()
+    assert ask_unit(files, None) == "cm"
+    assert capsys.readouterr().out == ""
 
 
 def test_of_contacts_the_fastest_is_chosen_that_is_nowhere_too_deep_or_else_the_least_deep():

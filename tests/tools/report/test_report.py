@@ -19,8 +19,9 @@ from guiderail.tools.rollouts.evaluate import evaluate
 from guiderail.tools.rollouts.ledger import Ledger, read_ledger
 from guiderail.tools.rollouts.null_policies import NullPolicy, white
 from guiderail.tools.rollouts.rollout import rollout
-from guiderail.tools.tables import write_table
+from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.tasks import make_environment
+from guiderail.tools.viewing.plot import plot_run
 
 SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
 
@@ -90,7 +91,53 @@ def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_
     assert len(gather([run]).held_out) == 0
     evaluate(run, episodes=2, beside=others)
     judged = gather([run]).held_out
-    assert judged[["policy", "episodes"]].to_numpy().tolist() == [["demonstration", 2], ["white", 2]]
+    assert judged[["policy", "episodes"]].to_numpy().tolist() == [["demonstration", 2], ["white", 2], ["learned", 2]]
+
+
+def test_rows_of_a_part_of_a_study_are_counted_once_and_its_command_says_so(studied, tmp_path):
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    shutil.copy(studied / "beads.csv", folder)
+    rows = read_table(studied / "beads.csv")
+    part = rows.iloc[[0]]
+    more = part.assign(seed=5, success_rate=0.2)
+    write_table(folder / "beads-learner-1-5", pd.concat([part, more]))
+    page = write_report([folder], tmp_path / "page.html").read_text()
+    text = text_of(page)
+    assert "beads: learner 3 held out 16/20" in text
+    assert "beads-learner-1-5: learner 3 held out 2/10" in text
+    assert "guiderail study beads --methods learner --seeds 5 --out studies" in text
+    assert "Policies that learned nothing" not in text
+
+
+def test_runs_in_folders_of_one_name_go_into_different_ones(studied, tmp_path):
+    for name in ("a", "b"):
+        shutil.copytree(studied / "skgrl-1", tmp_path / name / "same")
+    text = text_of(write_report([tmp_path / "a/same", tmp_path / "b/same"], tmp_path / "page.html").read_text())
+    assert "--out runs/same-1" in text
+    assert "--out runs/same-2" in text
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_anything_is_run(studied, tmp_path):
+    (tmp_path / "file").touch()
+    before = sorted(studied.rglob("*"))
+    with pytest.raises(InputError, match="is a file"):
+        write_report([studied / "skgrl-1"], tmp_path / "file" / "page.html", episodes=5)
+    assert sorted(studied.rglob("*")) == before
+
+
+def test_a_run_without_a_column_has_no_figure_of_it(studied, tmp_path):
+    run = shutil.copytree(studied / "skgrl-1", tmp_path / "run")
+    table = pd.read_csv(run / "episodes.csv")
+    table.drop(columns="mean_squared_force").to_csv(run / "episodes.csv", index=False)
+    assert "success rate over" in write_report([run], tmp_path / "page.html").read_text()
+    table.drop(columns="worst_violation").to_csv(run / "episodes.csv", index=False)
+    with pytest.raises(InputError, match="no worst_violation; train anew"):
+        write_report([run], tmp_path / "page.html")
+    with pytest.raises(InputError, match="no worst_violation; train anew"):
+        plot_run(run)
+    table.assign(fault="NONE").to_csv(run / "episodes.csv", index=False)  # a column of words, as a robot's run has
+    assert plot_run(run).is_file()
 
 
 def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):

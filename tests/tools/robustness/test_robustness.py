@@ -12,7 +12,9 @@ from guiderail.models.units import MM
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import train
 from guiderail.tools.robustness import axes
+from guiderail.tools.robustness import robustness as module
 from guiderail.tools.robustness.axes import AXES, Axis, chosen_axes, points
+from guiderail.tools.robustness.picture import draw
 from guiderail.tools.robustness.robustness import _Who, breaks, robustness
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED, kept_file
 from guiderail.tools.rollouts.null_policies import NullPolicy, white
@@ -42,12 +44,20 @@ def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):
     assert robustness([run], **{**how, "episodes": 2})["rows"] != first["rows"]
 
 
-def test_another_question_leaves_the_answer_to_the_first(run):
+def test_another_question_leaves_the_answer_to_the_first(run, monkeypatch):
     asked = [{}, {"axes": "wall"}, {"environment": {"hold": 2}}]
-    tables = [robustness([run], episodes=1, **one)["table"] for one in asked]
-    assert [table.name for table in tables] == ["robustness.csv", "robustness-wall.csv", "robustness-hold=2.csv"]
+    asked += [{"episodes": 2}, {"seed": 7}, {"beside": {"white": partial(NullPolicy, white)}}]
+    monkeypatch.setattr(module, "EPISODES", 1)
+    tables = [robustness([run], **{"episodes": 1, **one})["table"] for one in asked]
+    words = ["", "-wall", "-hold=2", "-episodes=2", "-seed=7", "-white"]
+    assert [table.stem for table in tables] == [f"robustness{one}" for one in words]
     for table in tables:
         assert all(table.with_suffix(kind).is_file() for kind in (".csv", ".md", ".png"))
+
+
+def test_who_is_called_as_a_formula_would_be_has_a_picture(run, tmp_path):
+    rows = [row | {"who": "a$_{$"} for row in robustness([run], episodes=1)["rows"]]
+    assert draw(tmp_path / "picture.png", rows).is_file()
 
 
 def test_a_place_where_the_policy_fails_is_named(run):
