@@ -76,8 +76,8 @@ class LcNsKmpSystem(LeafSystem):
                 gains (O,).
 
         Raises:
-            InputError: if a gain has the wrong shape or is not finite, the period is not positive, or a shorter history
-                is not shorter, has a length that another has, or other constraints.
+            InputError: if a gain has the wrong shape or is not finite, the period is not positive or not the reference
+                trajectory's, or a shorter history is not shorter, has a length that another has, or other constraints.
         """
         super().__init__()
         outputs = primitive.num_outputs
@@ -90,6 +90,12 @@ class LcNsKmpSystem(LeafSystem):
             if not (np.array_equal(mine.G, its.G) and np.array_equal(mine.c, its.c)):
                 raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
         check_period(period)
+        steps = np.diff(primitive.reference.times)
+        if np.abs(steps - period).max() > 1e-6 * period:
+            raise InputError(
+                f"the reference trajectory has steps of {steps.min():g} to {steps.max():g} s, and a control period is "
+                f"{period:g} s: resample it, or the motion is of another speed than was demonstrated"
+            )
         self._primitive, self._period = primitive, period
         self._by_history_length = {
             other.history: (other, _checked_gain(its_gain, outputs))
@@ -191,10 +197,16 @@ class LcNsKmpSystem(LeafSystem):
         try:
             output, fallback = primitive.predict(step, action, history).output, 0.0
         except UnsolvableError:
-            # What was safe a step ago need not be now, where constraints change on the way.
-            last_safe = context.get_discrete_state(self._last_safe).value()
-            output, fallback = primitive.constraints.nearest(last_safe, step), 1.0
+            output, fallback = self._fall_back(context, step), 1.0
         return _Command(step, output, fallback)
+
+    def _fall_back(self, context: Context, step: int) -> np.ndarray:
+        """What is nearest to the last command: what was safe a step ago need not be now, where constraints change."""
+        last_safe = context.get_discrete_state(self._last_safe).value()
+        try:
+            return self._primitive.constraints.nearest(last_safe, step)
+        except UnsolvableError:
+            return last_safe.copy()  # the arm still has to be told something
 
     def _calc_output(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._command.Eval(context).output)

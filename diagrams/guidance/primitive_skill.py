@@ -68,6 +68,8 @@ class PrimitiveSkill:
             raise InputError(f"history is how many past outputs sKGRL remembers, at least 1, not {self.history}")
         if self.explored is not None and not self.explored:
             raise InputError("a policy must move at least one output: name it in explored")
+        if len(set(self.explored or ())) < len(self.explored or ()):
+            raise InputError(f"explored names an output twice, {self.explored}: each has one action")
         if any(not 0 <= o < self.num_outputs for o in self.explored or ()):
             raise InputError(f"explored names outputs 0 … {self.num_outputs - 1}, not {self.explored}")
 

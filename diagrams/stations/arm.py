@@ -215,6 +215,8 @@ class ArmStation(Station):
     A gripper's limit of force is its actuators'. To the controller and to the wrench sensor it is a rigid tool, open.
     """
 
+    wraps_angles = True
+
     def __init__(
         self,
         workcell: Workcell,

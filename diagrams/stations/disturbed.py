@@ -47,7 +47,8 @@ class DisturbedStation(Station):
         if d.payload and not hasattr(station, "set_payload"):
             raise InputError("a payload hangs from an arm's tool: choose station=arm, or leave payload out")
         self.plant, self.scene_graph = station.plant, station.scene_graph
-        self.control_period = period = _period(d)
+        self.control_period, self.wraps_angles = _period(d), station.wraps_angles
+        period = self.control_period
         builder = DiagramBuilder()
         self._inner = builder.AddNamedSystem("station", station)
         self._commands = commands = builder.AddNamedSystem(

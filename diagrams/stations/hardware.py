@@ -178,6 +178,8 @@ class HardwareStation(Station):
     =====================  =====  =====================================================================================
     """
 
+    wraps_angles = True
+
     def __init__(
         self,
         workcell: Workcell,

@@ -144,6 +144,8 @@ class PouringStation(Station):
     first such plant step on; both (1,).
     """
 
+    wraps_angles = True
+
     def __init__(self, config: PouringConfig):
         super().__init__()
         builder = DiagramBuilder()

@@ -106,6 +106,8 @@ class Station(Diagram):
     scene_graph: SceneGraph
     control_period: float = CONTROL_PERIOD
     """Seconds between commands."""
+    wraps_angles: bool = False
+    """Whether its pose's angles are in (−π, π] and jump there, as a body's do; rails' are how far they turned."""
 
     @property
     def pose_size(self) -> int:

@@ -33,6 +33,8 @@ from guiderail.systems.policy_system import PolicySystem
 from guiderail.systems.reward_system import RewardSystem
 from guiderail.systems.safety_ledger import SafetyLedger
 
+HALF_TURN_MARGIN = 0.1  # [rad] what actions and contact turn a motion further by
+
 
 def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidance: Mapping[str, Any]) -> Known:
     """What a task knows, for guidance on a station.
@@ -48,6 +50,8 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
     if "demonstrations" in knows:
         options = dict(primitive)
         reference = through(task.reference(), options.pop("via_points", ()), options.get("inverse_length", 2.0))
+        if station.wraps_angles:
+            _refuse_half_turns(reference.means)
         skill = PrimitiveSkill(
             reference=reference,
             constraints=task.constraints() or LinearConstraints.none(station.pose_size),
@@ -66,6 +70,16 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
     )
+
+
+def _refuse_half_turns(means: np.ndarray) -> None:
+    """Refuses a motion (N, 6) that comes near an angle at which the station's pose jumps by a full turn."""
+    furthest = np.abs(means[:, 3:]).max(initial=0.0)
+    if furthest > np.pi - HALF_TURN_MARGIN:
+        raise InputError(
+            f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and what this station measures jumps by a full "
+            f"turn at 180°: draw the target's frame turned, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
+        )
 
 
 class Signals:

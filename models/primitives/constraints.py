@@ -5,7 +5,10 @@ from numpy.typing import ArrayLike
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.arrays import numbers
-from guiderail.models.primitives.least_norm import solve_least_norm
+from guiderail.models.primitives.least_norm import UnsolvableError, solve_least_norm
+
+TOLERANCE = 1e-9
+"""The bound that every command keeps, in the unit of a constraint's c (a thousandth of a micrometre for metres)."""
 
 
 class LinearConstraints:
@@ -47,6 +50,11 @@ class LinearConstraints:
         lower, upper = _same_shape(numbers(lower, "a lower bound"), numbers(upper, "an upper bound"))
         if lower.ndim not in (1, 2) or np.isnan(lower).any() or np.isnan(upper).any():
             raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
+        if (lower > upper).any():
+            where = f" at step {np.argwhere(lower > upper)[0, 0]}" if lower.ndim == 2 else ""
+            raise InputError(
+                f"the constraints{where} contradict each other: a lower bound exceeds its upper bound; loosen one"
+            )
         num_outputs = lower.shape[-1]
         rows, bounds = [], []
         for o in range(num_outputs):
@@ -101,14 +109,21 @@ class LinearConstraints:
         return float((self.c[step] - self.G[step] @ output).max())
 
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
-        """The output (O,) within the constraints of a step that is nearest to `output` (O,)."""
+        """The output (O,) within the constraints of a step that is nearest to `output` (O,).
+
+        Raises:
+            UnsolvableError: if the solver doesn't find it.
+        """
         output = np.asarray(output, dtype=float)
         if self.violation(output, step) <= 0:
             return output.copy()
         G, c = (a[0] for a in self.window(np.array([step])))
         scale = 1 / np.where(np.linalg.norm(G, axis=1) > 0, np.linalg.norm(G, axis=1), 1)
         move, _ = solve_least_norm(G * scale[:, None], (c - G @ output) * scale, np.full(len(c), np.inf))
-        return output + move
+        nearest = output + move
+        if not self.violation(nearest, step) <= TOLERANCE:
+            raise UnsolvableError(f"what is nearest is {self.violation(nearest, step):.1e} outside")
+        return nearest
 
     def _refuse_contradictions(self) -> None:
         if self.num_constraints == 0:
@@ -127,6 +142,8 @@ class LinearConstraints:
                 A_ub=-G[step] / scale[:, None],
                 b_ub=-c[step] / scale,
                 bounds=(None, None),
+                # The least that HiGHS takes: a contradiction that is smaller is within what is judged.
+                options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
             )
             if result.status == 2:
                 where = "" if self.G.ndim == 2 else f" at step {step}"

@@ -41,6 +41,9 @@ def window_features(
         history_inputs: (P,) or (P, I), may be empty.
         future_inputs: (H+1,) or (H+1, I).
         history_noise: ħρ, positive where there is a history.
+
+    Raises:
+        InputError: if that is too small for so long a history.
     """
     history_map, K = _conditioned(kernel, history_inputs, future_inputs, history_noise)
     return WindowFeatures(history_map.astype(float), _pivoted_cholesky(K).astype(float))
@@ -83,7 +86,13 @@ def _conditioned(
     K = kernel(future, future)
     history_map = np.zeros((len(future), len(past)), dtype=_Extended)
     if len(past):
-        L = _cholesky(kernel(past, past) + _Extended(history_noise) * np.eye(len(past), dtype=_Extended))
+        with np.errstate(invalid="ignore", divide="ignore"):  # of a singular matrix, which is refused
+            L = _cholesky(kernel(past, past) + _Extended(history_noise) * np.eye(len(past), dtype=_Extended))
+        if not (np.diagonal(L) > 0).all():
+            raise InputError(
+                f"a history of {len(past)} outputs is too long for so small a variance, as rounding hides it: raise "
+                "history_variance, or shorten the history"
+            )
         V = _solve_lower(L, kernel(past, future))
         history_map = _solve_lower(L[::-1, ::-1].T, V[::-1])[::-1].T
         K = K - V.T @ V

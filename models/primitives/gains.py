@@ -104,6 +104,8 @@ def _refuse_deaf(primitive: LcNsKmp, response: np.ndarray) -> None:
 
 def _explored(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray:
     mask = np.zeros(primitive.num_outputs, dtype=bool)
+    if outputs is not None and np.asarray(outputs).dtype == bool:
+        outputs = np.flatnonzero(outputs)
     indices = np.arange(primitive.num_outputs) if outputs is None else np.asarray(outputs, dtype=int)
     if not len(indices) or indices.min() < 0 or indices.max() >= primitive.num_outputs:
         raise InputError(f"explored outputs must be among 0 … {primitive.num_outputs - 1}: {indices.tolist()}")

@@ -54,6 +54,8 @@ class Kmp:
                 f"a primitive needs inputs (N, I), means (N, O) and covariances (N, O, O), not {inputs.shape}, "
                 f"{means.shape} and {covariances.shape}"
             )
+        if not (np.isfinite(inputs).all() and np.isfinite(means).all()):
+            raise InputError("a primitive's inputs and means must be finite: cut those samples out")
         for name, value in (("lambda_", lambda_), ("covariance_lambda", covariance_lambda)):
             if value is not None and not (np.isfinite(value) and value > 0):
                 raise InputError(f"{name} must be positive, not {value}")

@@ -15,15 +15,12 @@ from numpy.typing import ArrayLike
 
 from guiderail.models.errors import InputError, brief
 from guiderail.models.primitives.arrays import numbers
-from guiderail.models.primitives.constraints import LinearConstraints
+from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
 from guiderail.models.primitives.least_norm import UnsolvableError, find_solver
 from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.step import StepFactor, Window
-
-# The bound that every command keeps, in units of the constraint (thousandths of a micrometre for metres).
-TOLERANCE = 1e-9
 
 
 class Prediction:
@@ -139,8 +136,8 @@ class LcNsKmp:
             cache_bytes: how much memory factored steps may take before the oldest is forgotten.
 
         Raises:
-            InputError: if an argument is out of range, sizes don't fit, or the problem is too badly scaled to keep a
-                bound of 1e-9.
+            InputError: if an argument is out of range, sizes don't fit, the problem is too badly scaled to keep a
+                bound of 1e-9, or the history's variance is too small for its length.
         """
         for name, value in (("lambda_", lambda_), ("beta", beta)):
             if not (np.isfinite(value) and value >= 0):
@@ -172,6 +169,8 @@ class LcNsKmp:
         self._shared_features: WindowFeatures | None = None
         self._whole: StepFactor | None = None
         self._history_shape = (self.history, reference.num_outputs)
+        if self.history:
+            self._features(0)  # refuses a history that no step could be conditioned on
 
     @property
     def num_outputs(self) -> int:
@@ -365,7 +364,7 @@ class LcNsKmp:
         if self.history == 0:
             if history is not None and np.size(history):
                 raise InputError("this primitive has no history (P = 0): pass None")
-            x = action
+            x = action.copy()  # a prediction's trajectory is computed when it is asked for
         else:
             past = np.asarray(history, dtype=float) if history is not None else np.zeros(0)
             if past.shape != self._history_shape:

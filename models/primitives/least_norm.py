@@ -7,10 +7,14 @@ to unit length, so that a solver's tolerance is one on the output itself.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 
 from guiderail.models.errors import InputError
+
+OPENED = (1e-10, 1e-9)
+"""Parts of the greatest correction that bounds are opened by, in turn, until a solver finds something between them."""
 
 Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -116,8 +120,27 @@ def solve_least_norm(
     """
     # The problem is homogeneous: at unit scale the solver's absolute tolerance is a relative one.
     scale = max(lower.max(), -upper.min())
-    v, multipliers = solver(rows, lower / scale, upper / scale)
+    lower, upper = lower / scale, upper / scale
+    try:
+        v, multipliers = solver(rows, lower, upper)
+    except UnsolvableError:
+        v, multipliers = _solve_opened(rows, lower, upper, solver)
     return scale * v, scale * multipliers
+
+
+def _solve_opened(
+    rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: Solver
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same between bounds that are a little further apart.
+
+    Many rows of bounds that leave a point and no room, as of an output that may not move, are equations to a solver
+    that contradict each other in their last digits. Whoever asked checks what comes of it against the bounds.
+    """
+    *tried, last = OPENED
+    for opened in tried:
+        with suppress(UnsolvableError):
+            return solver(rows, lower - opened, upper + opened)
+    return solver(rows, lower - last, upper + last)
 
 
 _identities: dict[int, np.ndarray] = {}

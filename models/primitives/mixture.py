@@ -129,7 +129,9 @@ def _scaled(times: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Samples (M·N, 1 + O) of time and outputs in units of their own standard deviations, with centre and scale."""
     data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
     center, deviation = data.mean(axis=0), data.std(axis=0)
-    scale = np.where(deviation > 0, deviation, 1.0)
+    # What an output that never moves differs by is how its mean is rounded.
+    moves = deviation > 1e-12 * np.abs(data).max(axis=0)
+    scale = np.where(moves, deviation, 1.0)
     return (data - center) / scale, center, scale
 
 

@@ -46,6 +46,8 @@ def pose_outputs(
         )
     if not (np.isfinite(positions).all() and np.isfinite(quaternions).all()):
         raise InputError("poses contain NaN or infinity: cut those samples out")
+    if not (np.isfinite(target_position).all() and np.isfinite(target_quaternion_wxyz).all()):
+        raise InputError("the target's pose must be finite")
     if np.linalg.norm(quaternions, axis=1).min() < 1e-6 or np.linalg.norm(target_quaternion_wxyz) < 1e-6:
         raise InputError("a quaternion of length zero is no orientation")
     R_WT = Rotation.from_quat(target_quaternion_wxyz, scalar_first=True)

@@ -157,6 +157,24 @@ def test_where_constraints_change_on_the_way_a_fallback_is_within_those_of_its_o
         assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
 
+def test_where_even_the_nearest_is_not_found_the_last_command_goes_on(monkeypatch):
+    p = primitive(history=0, upper=0.5)
+
+    def never(*arguments):
+        raise UnsolvableError("no")
+
+    system = LcNsKmpSystem(p, None, PERIOD)
+    p.predict = never
+    monkeypatch.setattr(LinearConstraints, "nearest", never)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    started = context.get_discrete_state(1).value().copy()
+    simulator.AdvanceTo(5 * PERIOD)
+    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), started)
+    assert system.get_fallback_output_port().Eval(context)[0] == 1.0
+
+
 def test_first_fallback_is_within_the_constraints():
     p = primitive(history=0, upper=-0.5)
 
@@ -211,7 +229,13 @@ def test_without_constraints_the_violation_is_a_finite_number():
 
 
 @pytest.mark.parametrize(
-    ("gain", "period", "words"), [(np.ones(3), 0.1, "gain"), ([np.nan, 1], 0.1, "gain"), (None, 0.0, "period")]
+    ("gain", "period", "words"),
+    [
+        (np.ones(3), PERIOD, "gain"),
+        ([np.nan, 1], PERIOD, "gain"),
+        (None, 0.0, "period"),
+        (None, 2 * PERIOD, "of another speed than was demonstrated"),
+    ],
 )
 def test_refuses(gain, period, words):
     with pytest.raises(InputError, match=words):

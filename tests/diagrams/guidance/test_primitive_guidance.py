@@ -221,6 +221,7 @@ def test_safe_residual_is_not_offered_where_nobody_wrote_down_what_to_avoid(skil
         {"history": 0},
         {"explored": ()},
         {"explored": (2,)},
+        {"explored": (0, 0)},
     ],
 )
 def test_a_skill_that_makes_no_sense_is_refused(skill, change):

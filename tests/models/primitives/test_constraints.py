@@ -183,3 +183,19 @@ def test_the_nearest_of_the_first_step_unless_said():
     np.testing.assert_allclose(box.nearest([9], 1), [6.0])
     inside = [0.25]
     assert box.nearest(inside) is not inside
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-12])
+def test_what_is_fixed_is_fixed_and_what_contradicts_is_refused(gap):
+    fixed = LinearConstraints.box([0.2, 0.0], [0.2 + gap, 1.0])
+    nearest = fixed.nearest(np.array([5.0, 0.5]))
+    assert fixed.violation(nearest) <= 1e-9
+    np.testing.assert_allclose(nearest, [0.2 + gap, 0.5], atol=1e-9)
+    if gap:
+        with pytest.raises(InputError, match="contradict each other"):
+            LinearConstraints.box([0.2 + gap, 0.0], [0.2, 1.0])
+
+
+def test_a_contradiction_of_general_rows_is_refused_where_it_is_small():
+    with pytest.raises(InputError, match="contradict each other"):
+        LinearConstraints(np.array([[1.0, 1.0], [-1.0, -1.0]]), np.array([1.0, -1.0 + 5e-8]))

@@ -54,6 +54,8 @@ def test_only_named_outputs_are_explored(primitive):
     for gains in (authority_gains(primitive, outputs=[1]), rms_gains(primitive, outputs=[1])):
         assert gains[0] == 0
         assert gains[1] > 0
+    masked = authority_gains(primitive, outputs=np.array([False, True]))
+    np.testing.assert_array_equal(masked, authority_gains(primitive, outputs=[1]))
 
 
 def test_refuses(primitive):

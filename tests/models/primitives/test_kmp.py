@@ -106,6 +106,10 @@ def test_refuses_names_and_arguments():
         Kmp(*data(20, 2), lambda_=0.0)
     with pytest.raises(InputError, match="means"):
         Kmp(np.zeros(3), np.zeros((2, 1)), np.ones((2, 1, 1)))
+    t, means, covariances = data(20, 2)
+    for broken in (np.where(t == t[3], np.nan, t), means), (t, np.where(means == means[3], np.nan, means)):
+        with pytest.raises(InputError, match="finite"):
+            Kmp(*broken, covariances)
 
 
 def test_a_via_point_is_finite_in_each_of_its_inputs():

@@ -306,6 +306,41 @@ def test_passes_through_its_history():
     assert abs(output[0] - (p.reference.means[10, 0] + 0.05)) < 0.005
 
 
+def test_a_history_that_rounding_hides_is_refused_before_anything_is_predicted():
+    t = 0.01 * np.arange(100)
+    reference = ReferenceTrajectory(t, t[:, None], np.full((100, 1, 1), 1e-4))
+    with pytest.raises(InputError, match="raise history_variance, or shorten the history"):
+        LcNsKmp(reference, history=60, history_variance=1e-20)
+
+
+@pytest.mark.parametrize("history", [0, 10])
+@pytest.mark.parametrize(
+    "constraints",
+    [
+        LinearConstraints.box([-9.0, 0.05], [9.0, 0.05]),
+        LinearConstraints(np.array([[0, 1.0], [0, 1.0], [0, 2.0], [0, -1.0]]), np.array([0.05, 0.05, 0.1, -0.05])),
+    ],
+)
+def test_an_output_that_may_not_move_leaves_the_others_their_way(history, constraints):
+    """Bounds without room between them, once and said several times."""
+    t = np.linspace(0, 2, 200)
+    reference = ReferenceTrajectory(t, np.column_stack([np.sin(t), 0.1 * t]), np.tile(1e-4 * np.eye(2), (200, 1, 1)))
+    p = LcNsKmp(reference, history=history, constraints=constraints)
+    past = np.tile(constraints.nearest(reference.means[0]), (history, 1)) if history else None
+    for step in range(200):
+        output = p.predict(step, np.array([0.0, 3.0]), past).output
+        assert constraints.violation(output) <= 1e-9
+        past = np.vstack([past, output])[1:] if history else past
+    assert output[0] == pytest.approx(reference.means[-1, 0], abs=0.02)
+
+
+def test_a_trajectory_does_not_follow_the_callers_array():
+    p, action = LcNsKmp(**small()), np.array([0.1, 0.1])
+    prediction, expected = p.predict(5, action), p.predict(5, action.copy()).trajectory.copy()
+    action[:] = 1e3
+    np.testing.assert_array_equal(prediction.trajectory, expected)
+
+
 def test_any_kernel_and_an_uneven_clock():
     t = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.1, 30))
     reference = ReferenceTrajectory(t, np.column_stack([np.sin(t)]), np.full((30, 1, 1), 1e-4))

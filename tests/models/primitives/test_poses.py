@@ -95,6 +95,9 @@ def test_refuses():
         broken[0 if where is positions else 1][3, 1] = np.nan
         with pytest.raises(InputError, match="NaN"):
             pose_outputs(*broken, np.zeros(3), [1, 0, 0, 0])
+    for target in ([0.0, np.nan, 0.0], [1, 0, 0, 0]), (np.zeros(3), [np.nan, 0, 0, 0]):
+        with pytest.raises(InputError, match="target's pose must be finite"):
+            pose_outputs(positions, quaternions, *target)
     with pytest.raises(InputError, match="length zero"):
         pose_outputs(positions, quaternions, np.zeros(3), [1e-7, 0, 0, 0])
     pose_outputs(positions, quaternions, np.zeros(3), [1e-5, 0, 0, 0])

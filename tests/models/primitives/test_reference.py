@@ -113,3 +113,13 @@ def test_of_two_numbers_of_components_the_better_is_taken():
     rng = np.random.default_rng(0)
     outputs = np.array([0.0, 0.0, 10.0, 10.0])[:, None] + 0.01 * rng.standard_normal((30, 4, 1))
     assert len(fit_mixture(np.arange(4.0), outputs, components=None, seed=0).weights) == 2
+
+
+@pytest.mark.parametrize("height", [0.3, 0.5, 1.0, 0.1])
+def test_an_output_that_never_moves_has_the_same_spread_wherever_it_is(height):
+    """Whether the mean of many equal numbers is that number is a matter of rounding."""
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 1, 50)
+    outputs = [np.column_stack([np.sin(t + 0.05 * rng.normal()), np.full(50, height)]) for _ in range(3)]
+    reference = ReferenceTrajectory.from_demonstrations(Demonstrations([t] * 3, outputs), 4)
+    np.testing.assert_allclose(reference.standard_deviations[:, 1], 1e-3, rtol=1e-6)
