@@ -71,13 +71,14 @@ class LcNsKmpSystem(LeafSystem):
             primitive: O outputs, P past outputs.
             gain: (O,), raw null-space action per unit of the policy's action (`models.primitives.gains`); ones unless
                 given.
-            period: between two control steps [s], positive: that of the reference trajectory.
+            period: between two control steps [s], positive: that of the reference trajectory, or the motion is of
+                another speed than was demonstrated.
             shorter: primitives of the same motion and constraints with histories of 1 … P − 1 outputs, and their
                 gains (O,).
 
         Raises:
-            InputError: if a gain has the wrong shape or is not finite, the period is not positive or not the reference
-                trajectory's, or a shorter history is not shorter, has a length that another has, or other constraints.
+            InputError: if a gain has the wrong shape or is not finite, the period is not positive, or a shorter history
+                is not shorter, has a length that another has, or other constraints.
         """
         super().__init__()
         outputs = primitive.num_outputs
@@ -90,12 +91,6 @@ class LcNsKmpSystem(LeafSystem):
             if not (np.array_equal(mine.G, its.G) and np.array_equal(mine.c, its.c)):
                 raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
         check_period(period)
-        steps = np.diff(primitive.reference.times)
-        if np.abs(steps - period).max() > 1e-6 * period:
-            raise InputError(
-                f"the reference trajectory has steps of {steps.min():g} to {steps.max():g} s, and a control period is "
-                f"{period:g} s: resample it, or the motion is of another speed than was demonstrated"
-            )
         self._primitive, self._period = primitive, period
         self._by_history_length = {
             other.history: (other, _checked_gain(its_gain, outputs))

@@ -69,6 +69,11 @@ class DisturbedStation(Station):
             builder.ExportOutput(station.GetOutputPort(name), name)
         builder.BuildInto(self)
 
+    @property
+    def nominal_period(self) -> float:
+        """Of the station that is disturbed [s]."""
+        return self._inner.nominal_period
+
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the robot at rest with its tool centre at `pose`, (6,), really; `context` is the root context."""
         self._inner.set_pose(context, pose)

@@ -110,6 +110,11 @@ class Station(Diagram):
     """Whether its pose's angles are in (−π, π] and jump there, as a body's do; rails' are how far they turned."""
 
     @property
+    def nominal_period(self) -> float:
+        """Seconds between commands where its clock is right."""
+        return self.control_period
+
+    @property
     def pose_size(self) -> int:
         """O, numbers in a pose."""
         return self.get_pose_output_port().size()

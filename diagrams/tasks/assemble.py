@@ -44,12 +44,17 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
         station: for its period and sizes.
         primitive: options of `PrimitiveSkill` by name.
         guidance: the kind of guidance's own options by name.
+
+    Raises:
+        InputError: if the reference trajectory has another clock than the station, or turns to where the station's
+            angles jump.
     """
     knows = task.knows()
     skill = None
     if "demonstrations" in knows:
         options = dict(primitive)
         reference = through(task.reference(), options.pop("via_points", ()), options.get("inverse_length", 2.0))
+        _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
             _refuse_half_turns(reference.means)
         skill = PrimitiveSkill(
@@ -70,6 +75,16 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
     )
+
+
+def _check_clock(times: np.ndarray, period: float) -> None:
+    """Refuses a reference trajectory whose steps (N,) [s] are not control periods: its clock counts these."""
+    steps = np.diff(times)
+    if np.abs(steps - period).max(initial=0.0) > 1e-6 * period:
+        raise InputError(
+            f"the reference trajectory has steps of {steps.min():g} to {steps.max():g} s, and a control period is "
+            f"{period:g} s: resample it, or the motion is of another speed than was demonstrated"
+        )
 
 
 def _refuse_half_turns(means: np.ndarray) -> None:

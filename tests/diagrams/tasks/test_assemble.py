@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from guiderail import make_env
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.hardware import HardwareStation
 from guiderail.diagrams.stations.rails import RailsStation
@@ -15,7 +16,7 @@ from guiderail.models.primitives import ReferenceTrajectory
 PERIOD = 0.02
 
 
-def known(turn, station):
+def known(turn, station, period=PERIOD):
     """Of a motion that turns by so much [rad] about z."""
     means = np.zeros((30, 6))
     means[:, 3] = np.linspace(0.0, turn, 30)
@@ -23,8 +24,21 @@ def known(turn, station):
     task = SimpleNamespace(
         knows=lambda: {"demonstrations"}, reference=lambda: reference, constraints=lambda: None, isotropic_groups=None
     )
-    where = SimpleNamespace(wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=PERIOD)
+    where = SimpleNamespace(
+        wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=period, nominal_period=period
+    )
     return known_of(task, where, {}, {})
+
+
+@pytest.mark.parametrize("period", [0.01, 0.1])
+def test_a_motion_keeps_the_speed_at_which_it_was_demonstrated(period):
+    with pytest.raises(InputError, match="of another speed than was demonstrated"):
+        known(1.0, RailsStation, period)
+
+
+def test_a_clock_that_is_disturbed_is_no_other_demonstration():
+    env = make_env("BncConnector", control_period=0.01)
+    assert env.unwrapped.task.diagram.GetSubsystemByName("station").control_period == 0.01
 
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
