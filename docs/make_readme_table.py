@@ -74,6 +74,13 @@ TASKS: dict[str, list[Row]] = {
         Row("safe residual RL", "connector_hard_safety", "safe_residual"),
         *_nulls("connector_hard_safety", ("demonstrations", "white", "rule"), names=(*NULLS[:2], NULLS[3])),
     ],
+    "**connector, hard**, learned at a finer contact in Drake, judged in MuJoCo": [
+        Row("KGRL", "connector_hard_fine", "kgrl", "MuJoCo"),
+        Row("KGRL, randomized contact", "connector_hard_fine", "kgrl_randomized", "MuJoCo"),
+        Row("sKGRL, adaptive history", "connector_hard_fine", "skgrl_adaptive", "MuJoCo"),
+        Row("residual RL", "connector_hard_fine", "residual", "MuJoCo"),
+        *_nulls("connector_hard_fine", ("demonstrations", "white", "rule"), "MuJoCo", (*NULLS[:2], NULLS[3])),
+    ],
     "**grid clamp**": [
         Row("RL-SCT", "grid_clamp", "sct"),
         Row("residual RL", "grid_clamp_guidance", "residual"),

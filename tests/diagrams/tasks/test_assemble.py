@@ -38,7 +38,7 @@ def test_a_motion_keeps_the_speed_at_which_it_was_demonstrated(period):
 
 def test_a_clock_that_is_disturbed_is_no_other_demonstration():
     env = make_env("BncConnector", control_period=0.01)
-    assert env.unwrapped.task.diagram.GetSubsystemByName("station").control_period == 0.01
+    assert env.unwrapped.task.diagram.GetSubsystemByName("station").control_period == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
