@@ -9,6 +9,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.recording.places import check_new
 from guiderail.tools.rollouts.rollout import rollout
 from guiderail.tools.tasks import make_environment
 
@@ -35,10 +36,9 @@ def record(run: Path, out: Path, *, episodes: int = 5, signal: str = "commanded"
         raise InputError(f"there is no signal {signal!r} to record: choose one of {', '.join(SIGNALS)}")
     if episodes < 1:
         raise InputError(f"a recording needs at least one episode, not {episodes}")
-    if out.exists():
-        raise InputError(f"{out} already exists: name another file")
     if out.suffix not in (".npz", ".csv"):
         raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
+    check_new(out, "file")
     config, policy = RunFolder(run).config(), Policy.load(run)
     env = make_environment(config.task, config.environment)
     env.reset(seed=config.seed)
@@ -54,6 +54,5 @@ def record(run: Path, out: Path, *, episodes: int = 5, signal: str = "commanded"
     env.close()
     if len(outputs) < episodes:
         raise InputError(f"{run} succeeded {len(outputs)} times in {4 * episodes} episodes: train it further first")
-    out.parent.mkdir(parents=True, exist_ok=True)
     Demonstrations(times, outputs).save(out)
     return out
