@@ -8,6 +8,7 @@ import numpy as np
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 from guiderail.tools.files import check_picture
+from guiderail.tools.recording.places import is_there
 from guiderail.tools.recording.reader import ENDINGS, load_demonstrations
 
 SKILLS = (".yaml", ".yml")
@@ -25,7 +26,7 @@ def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[st
     Raises:
         InputError: if it is neither, or what it holds makes no sense.
     """
-    if not file.exists():
+    if not is_there(file):
         from guiderail.models.skills.loader import shipped_skills
 
         if str(file) in shipped_skills():

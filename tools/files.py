@@ -1,6 +1,6 @@
 """Files that are either complete or not there, and pictures that can be written."""
 
-import os
+import tempfile
 from pathlib import Path
 
 from guiderail.models.errors import InputError
@@ -30,13 +30,13 @@ def check_writable(path: Path) -> None:
     """Refuses a file, or a folder that is to be made, where nothing can be written, before anything is run for it.
 
     Raises:
-        InputError: for a path below a file, in a folder that cannot be written to, or that no system takes.
+        InputError: for a path below a file, in a folder that takes nothing, or with a name that is too long.
     """
     try:
         above = next(one for one in path.absolute().parents if one.exists())
-        if not above.is_dir():
-            raise InputError(f"{path} cannot be written, as {above} is a file: choose another folder")
-        if not os.access(above, os.W_OK):
-            raise InputError(f"{path} cannot be written: choose a folder with room to write")
-    except OSError as error:  # such as a name that is too long
-        raise InputError(f"{path} cannot be written ({error.strerror}): choose another name") from error
+        with tempfile.TemporaryFile(dir=above):  # rights alone don't say it: root has them all
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be written ({error.strerror or error}): choose a folder with room to write"
+        ) from error

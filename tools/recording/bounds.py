@@ -11,6 +11,7 @@ import yaml
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.demonstrated_bounds import DemonstratedBounds, demonstrated_bounds
 from guiderail.tools.files import check_picture, write_atomically
+from guiderail.tools.recording.places import check_new, is_there
 from guiderail.tools.recording.reader import load_demonstrations
 
 
@@ -40,10 +41,10 @@ def constraints(
     """
     if draw is not None:
         check_picture(draw)
-    if out is not None and out.exists():
-        raise InputError(f"{out} already exists: name another file")
-    if out is not None and not out.parent.is_dir():
-        raise InputError(f"there is no folder {out.parent}: make it first")
+    if out is not None:
+        if not is_there(out) and not out.parent.is_dir():
+            raise InputError(f"there is no folder {out.parent}: make it first")
+        check_new(out, "file")
     demonstrations = load_demonstrations(file)
     found = demonstrated_bounds(demonstrations, phases, margin, least, outputs)
     values = as_values(found)

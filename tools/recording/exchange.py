@@ -10,11 +10,13 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.demonstration_files import MOST_NUMBERS
 from guiderail.models.registry import did_you_mean
 from guiderail.tools.recording.formats.csv_layouts import read_csv_files
 from guiderail.tools.recording.formats.lerobot import INFO, read_lerobot, write_lerobot
-from guiderail.tools.recording.formats.recorded import Recorded
+from guiderail.tools.recording.formats.recorded import Recorded, from_zero
 from guiderail.tools.recording.formats.ros_bag import find_bags, read_bags, write_mcap
+from guiderail.tools.recording.places import check_new, is_there
 from guiderail.tools.recording.reader import ENDINGS, load_demonstrations
 
 WRITERS: dict[str, Callable[[Path, Demonstrations], list[str]]] = {"lerobot": write_lerobot, "mcap": write_mcap}
@@ -41,10 +43,12 @@ def import_recording(
         of_csv: unit, time_unit, quaternion and angles, see `read_csv_files`.
 
     Raises:
-        InputError: if it can't be read, or doesn't say what only whoever recorded it knows.
+        InputError: if it can't be read, doesn't say what only whoever recorded it knows, or `out` can't be written.
     """
-    _check_out(out)
-    if not source.exists():
+    if out.suffix not in ENDINGS:
+        raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
+    check_new(out, "file")
+    if not is_there(source):
         raise InputError(f"there is no {source}: name a LeRobot dataset, a bag, an .mcap or .csv file, or a folder")
     if (source / INFO).is_file():
         found, kind = read_lerobot(source, signal), "a LeRobot dataset"
@@ -59,7 +63,9 @@ def import_recording(
     demonstrations = Demonstrations(found.times, found.outputs, found.names)
     if rate is not None:
         demonstrations = _at_rate(demonstrations, rate)
-    out.parent.mkdir(parents=True, exist_ok=True)
+    numbers = sum(len(t) + y.size for t, y in zip(demonstrations.times, demonstrations.outputs, strict=True))
+    if numbers > MOST_NUMBERS:
+        raise InputError(f"{source} holds {numbers} numbers, and a file {MOST_NUMBERS}: give --rate to resample them")
     demonstrations.save(out)
     return (
         {"out": str(out), "from": kind}
@@ -78,29 +84,27 @@ def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None
         rate: to resample to [1/s]; as recorded unless given.
 
     Raises:
-        InputError: for an unknown format, or demonstrations that it can't hold.
+        InputError: for an unknown format, demonstrations that it can't hold, or a place that can't be written to.
     """
     if kind not in WRITERS:
         raise InputError(f"there is no format {kind!r}: {did_you_mean(kind, WRITERS)}")
-    if out.exists():
-        raise InputError(f"{out} already exists: name another folder")
-    demonstrations = load_demonstrations(source)
+    check_new(out, "folder")
+    demonstrations, notes = load_demonstrations(source), []
     if rate is not None:
+        notes = from_zero(demonstrations)
         demonstrations = _at_rate(demonstrations, rate)
-    notes = WRITERS[kind](out, demonstrations)
+    notes = WRITERS[kind](out, demonstrations) + notes
     return {"out": str(out), "to": kind} | _described(demonstrations) | {"note": "; ".join(notes)}
-
-
-def _check_out(out: Path) -> None:
-    if out.suffix not in ENDINGS:
-        raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
-    if out.exists():
-        raise InputError(f"{out} already exists: name another file")
 
 
 def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"--rate is samples in a second and must be positive, not {rate}")
+    samples = sum(float(t[-1] - t[0]) * rate for t in demonstrations.times)
+    if samples * (1 + demonstrations.num_outputs) > MOST_NUMBERS:
+        raise InputError(
+            f"--rate {rate:g} makes {samples:.3g} samples, and a file holds {MOST_NUMBERS} numbers: give a lower one"
+        )
     times, outputs = [], []
     for t, y in zip(demonstrations.times, demonstrations.outputs, strict=True):
         at = np.arange(int(np.floor((t[-1] - t[0]) * rate + 1e-9)) + 1) / rate

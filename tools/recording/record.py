@@ -8,8 +8,8 @@ import numpy as np
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.files import check_writable
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.recording.places import check_new
 from guiderail.tools.rollouts.rollout import check_seed, rollout
 from guiderail.tools.tasks import make_environment
 
@@ -37,11 +37,9 @@ def record(run: Path, out: Path, *, episodes: int = 5, signal: str = "commanded"
     if episodes < 1:
         raise InputError(f"a recording needs at least one episode, not {episodes}")
     check_seed(seed)
-    if out.exists():
-        raise InputError(f"{out} already exists: name another file")
-    check_writable(out)
     if out.suffix not in (".npz", ".csv"):
         raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
+    check_new(out, "file")
     config, policy = RunFolder(run).config(), Policy.load(run)
     env = make_environment(config.task, config.environment)
     env.reset(seed=config.seed)
@@ -57,6 +55,5 @@ def record(run: Path, out: Path, *, episodes: int = 5, signal: str = "commanded"
     env.close()
     if len(outputs) < episodes:
         raise InputError(f"{run} succeeded {len(outputs)} times in {4 * episodes} episodes: train it further first")
-    out.parent.mkdir(parents=True, exist_ok=True)
     Demonstrations(times, outputs).save(out)
     return out

@@ -72,7 +72,7 @@ def test_scenarios_that_would_lie_on_each_other_or_on_the_tasks_own_files_are_re
 def test_a_folder_that_cannot_be_made_is_refused_in_a_sentence(tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="is a file"):
+    with pytest.raises(InputError, match="cannot be written"):
         onboard(plug, socket, tmp_path / "file" / "peg", unit="mm")
 
 

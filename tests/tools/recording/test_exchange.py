@@ -210,3 +210,53 @@ def test_two_publishers_on_a_topic_are_not_mixed(tmp_path):
 def test_bounds_go_into_a_folder_that_is_there(file, tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         constraints(file, out=tmp_path / "none" / "bounds.yaml")
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_an_export_that_fails_on_the_way_can_be_tried_again(kind, file, tmp_path, monkeypatch):
+    pytest.importorskip("rosbags")
+    out = tmp_path / "out"
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        # What is written last.
+        broken.setattr("guiderail.tools.recording.formats.lerobot._statistics", full)
+        broken.setattr("rosbags.rosbag2.Writer.close", full)
+        with pytest.raises(InputError, match="No space left"):
+            export_demonstrations(file, out, kind)
+    assert [one.name for one in tmp_path.iterdir()] == [file.name]
+    export_demonstrations(file, out, kind)
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_where_nothing_can_be_written_is_said_before_anything_is_read(kind, file, tmp_path):
+    (tmp_path / "damaged.csv").write_text("nothing")
+    for place in (file / "set", file / "new" / "set"):
+        with pytest.raises(InputError, match="cannot be written"):
+            export_demonstrations(tmp_path / "damaged.csv", place, kind)
+        with pytest.raises(InputError, match="cannot be written"):
+            import_recording(tmp_path / "damaged.csv", place.with_suffix(".npz"))
+
+
+def test_a_start_that_resampling_leaves_is_said(tmp_path):
+    t = 0.1 * np.arange(5)
+    Demonstrations([t - 0.2], [t[:, None]]).save(tmp_path / "early.npz")
+    found = export_demonstrations(tmp_path / "early.npz", tmp_path / "set", "lerobot", rate=20)
+    assert found["note"].count("where it was -0.2") == 1
+
+
+@pytest.mark.parametrize("rate", [1e15, 1e308])
+def test_more_samples_than_a_file_holds_are_refused(rate, tmp_path):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
+    with pytest.raises(InputError, match="give a lower one"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz", rate=rate)
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path, monkeypatch):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
+    monkeypatch.setattr("guiderail.tools.recording.exchange.MOST_NUMBERS", 15)
+    with pytest.raises(InputError, match=r"16 numbers.*--rate"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+    assert not (tmp_path / "a.npz").exists()

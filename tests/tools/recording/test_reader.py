@@ -4,6 +4,7 @@ import pytest
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.check import check
+from guiderail.tools.recording.bounds import constraints
 from guiderail.tools.recording.reader import load_demonstrations
 
 CLOCK = np.linspace(0, 1, 30)
@@ -42,14 +43,30 @@ def test_what_guiderail_itself_writes_is_read_as_before(tmp_path):
     assert load_demonstrations(tmp_path / "two.csv").num_demonstrations == 2
 
 
+def test_a_mark_at_the_beginning_is_no_part_of_the_first_name(tmp_path):
+    rows = [f"{m},{t},{m + t}" for m in range(2) for t in range(3)]
+    text = "\n".join(["demonstration,time,x", *rows])
+    (tmp_path / "marked.csv").write_text(text, encoding="utf-8-sig")  # as Excel writes it
+    assert load_demonstrations(tmp_path / "marked.csv").num_demonstrations == 2
+
+
+@pytest.mark.parametrize("read", [check, load_demonstrations, constraints])
+@pytest.mark.parametrize("ending", ["", ".csv", ".npz"])
+def test_a_name_that_no_file_can_have_is_refused(read, ending, tmp_path):
+    with pytest.raises(InputError, match="File name too long"):
+        read(tmp_path / ("x" * 300 + ending))
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "line of names"),
-        ("t\n0\n1\n", "one column"),
-        ("0,1,2\n0.1,1,2\n", "no names"),
+        ("", "first line must be"),
+        ("t\n0\n1\n", "first line must be"),
+        ("0,1,2\n0.1,1,2\n", "first line must be"),
+        ("x,y,z\n0,1,2\n1,2,3\n", "first line must be"),
         ("t,x\n0,one\n1,2\n", "could not convert"),
-        ("t,x\n0,1\n1,\n", "NaN"),
+        ("t,x\n0,1\n1,\n", "line 3 holds something that is no number"),
+        ("t,x\n0,1\n1,nan\n", "NaN"),
         ("t,x\n1,1\n0,2\n", "does not increase"),
     ],
 )
@@ -57,6 +74,8 @@ def test_what_is_no_demonstration_is_one_sentence(tmp_path, text, words):
     (tmp_path / "wrong.csv").write_text(text)
     with pytest.raises(InputError, match=words):
         load_demonstrations(tmp_path / "wrong.csv")
+    with pytest.raises(InputError, match=words):
+        Demonstrations.load(tmp_path / "wrong.csv")  # whoever learns from it is told the same
 
 
 def test_a_folder_without_any_or_of_several_kinds_is_refused(tmp_path):

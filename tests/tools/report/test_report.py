@@ -121,7 +121,7 @@ def test_runs_in_folders_of_one_name_go_into_different_ones(studied, tmp_path):
 def test_a_page_that_cannot_be_written_is_refused_before_anything_is_run(studied, tmp_path):
     (tmp_path / "file").touch()
     before = sorted(studied.rglob("*"))
-    with pytest.raises(InputError, match="is a file"):
+    with pytest.raises(InputError, match="cannot be written"):
         write_report([studied / "skgrl-1"], tmp_path / "file" / "page.html", episodes=5)
     assert sorted(studied.rglob("*")) == before
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,11 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.errors import InputError, brief
-from guiderail.tools.recording.formats.recorded import POSE_NAMES, UNITS, Recorded, poses_in_target
+from guiderail.tools.recording.formats.recorded import POSE_NAMES, UNITS, Recorded, poses_in_target, rotations_of
 
 TIME = re.compile(r"(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_ANGLE_UNITS = {"deg": np.pi / 180.0, "rad": 1.0}
 _PERIODS = (1e-4, 1.0)  # [s] between samples of a robot; anything else is another unit
 _PREFIX = r"(?:.*[._/ ])?(?:p|pos|position|tool|tcp|ee|actual_tcp_pose|translation)?[._ ]?"
 _QUATERNION = (("qx", "qy", "qz", "qw"), ("quat_x", "quat_y", "quat_z", "quat_w"), ("ox", "oy", "oz", "ow"))
@@ -35,14 +37,14 @@ def read_csv_files(
 
     Args:
         path: a file, or a folder of them.
-        unit: of positions, m, cm or mm, where no column's name says it.
+        unit: of positions, m, cm or mm, where a column's name doesn't say it; each name is that column's own.
         time_unit: s, ms, us or ns, where neither the name nor the size says it.
         quaternion: "xyzw" or "wxyz", where columns are numbered and not named.
-        angles: "deg" or "rad" of roll, pitch and yaw.
+        angles: "deg" or "rad" of roll, pitch and yaw, where a column's name doesn't say it.
         target: see `poses_in_target`.
 
     Raises:
-        InputError: if a file is none, or doesn't say what only whoever recorded it knows.
+        InputError: if a file is none, doesn't say what only whoever recorded it knows, or says something else.
     """
     files = [path] if path.is_file() else sorted(path.glob("*.csv"))
     if not files:
@@ -70,23 +72,26 @@ def _read(
     like: np.ndarray | None,
 ) -> Recorded:
     try:
-        table = pd.read_csv(file, sep=None, engine="python", skipinitialspace=True).astype(float)
-    except (ValueError, OSError, pd.errors.ParserError) as error:
+        # Excel begins a file with a mark, which plain utf-8 would read as part of the first name.
+        table = pd.read_csv(file, sep=None, engine="python", skipinitialspace=True, encoding="utf-8-sig").astype(float)
+    except (ValueError, OSError, csv.Error, pd.errors.ParserError) as error:
         raise InputError(f"{file} is no table of numbers under a line of names: {brief(str(error))}") from error
+    if len(table) < 2:
+        raise InputError(f"{file} has fewer than two lines of numbers: a motion needs at least two")
     columns = {_plain(name): name for name in table.columns}
     assumed: list[str] = []
     times = _time(file, table, columns, time_unit, assumed)
     position = [_column(columns, axis) for axis in "xyz"]
     if None in position:
         raise InputError(f"{file} has no columns x, y and z: name them so, or use guiderail check on it as it is")
-    named = {m.group(1) for name in position if (m := re.search(r"[\[(_](mm|cm|m)[\])]?$", str(name)))}
-    scale_name = named.pop() if len(named) == 1 else unit
-    if scale_name is None:
-        size = float(np.ptp(table[position].to_numpy(), axis=0).max())
-        raise InputError(f"{file} does not say the unit of x, y and z, which move by {size:.4g}: give --unit m or mm")
-    if scale_name not in UNITS:
-        raise InputError(f"--unit is one of {', '.join(UNITS)}, not {scale_name!r}")
-    positions = table[position].to_numpy() * UNITS[scale_name]
+    positions = table[position].to_numpy()
+    units = _units(file, position, UNITS, unit, "--unit")
+    if None in units:
+        unsaid = [o for o, one in enumerate(units) if one is None]
+        size = float(np.ptp(positions[:, unsaid], axis=0).max())
+        which = _listed(["xyz"[o] for o in unsaid])
+        raise InputError(f"{file} does not say the unit of {which}, moving by {size:.4g}: give --unit m or mm")
+    positions = positions * [UNITS[str(one)] for one in units]
     rotations = _rotations(file, table, columns, quaternion, angles, assumed)
     if rotations is None:
         if target is not None:
@@ -101,6 +106,29 @@ def _plain(name: str) -> str:
     return re.sub(r"[\[(].*", "", str(name)).strip().lower()
 
 
+def _units(
+    file: Path, names: Sequence[object], known: Collection[str], given: str | None, option: str
+) -> list[str | None]:
+    """The unit of each column: what its own name says, else what was given.
+
+    Raises:
+        InputError: if no such unit was given, or a column says another one.
+    """
+    if given is not None and given not in known:
+        raise InputError(f"{option} is one of {', '.join(known)}, not {given!r}")
+    said = [re.search(rf"[\[(_]({'|'.join(known)})(?:rees|ians)?[\])]?$", str(name).strip()) for name in names]
+    units = [given if found is None else found.group(1) for found in said]
+    for name, one in zip(names, units, strict=True):
+        if given not in (None, one):
+            raise InputError(f"{file} has {name}, and {option} says {given}: leave it out, and name each column's unit")
+    return units
+
+
+def _listed(names: Sequence[str]) -> str:
+    *most, last = names
+    return f"{', '.join(most)} and {last}" if most else last
+
+
 def _column(columns: dict[str, str], wanted: str) -> str | None:
     """The column of that name, or the only one that ends in it, with a unit behind or not."""
     ends = [full for name, full in columns.items() if re.fullmatch(rf"{_PREFIX}{wanted}(_mm|_cm|_m|_rad|_deg)?", name)]
@@ -113,10 +141,9 @@ def _time(
     names = [full for name, full in columns.items() if TIME.fullmatch(re.sub(r"_(s|ms|us|ns)$", "", name))]
     if not names:
         raise InputError(f"{file} has no column t, time or timestamp: add one")
-    said = re.search(r"[\[(_](ms|us|ns|s)[\])]?$", names[0])
+    (unit,) = _units(file, names[:1], _TIME_UNITS, given, "--time-unit")
     ticks = table[names[0]].to_numpy()
-    step = float(np.median(np.diff(ticks))) if len(ticks) > 1 else 0.0
-    unit = given or (said.group(1) if said else None)
+    step = float(np.median(np.diff(ticks)))
     if unit is None:
         fitting = [name for name, scale in _TIME_UNITS.items() if _PERIODS[0] <= step * scale < _PERIODS[1]]
         if fitting[:1] != ["s"]:
@@ -126,8 +153,6 @@ def _time(
             )
         unit = "s"
         assumed.append(f"{names[0]} is in seconds, {1.0 / step:.4g} samples in each")
-    if unit not in _TIME_UNITS:
-        raise InputError(f"--time-unit is one of {', '.join(_TIME_UNITS)}, not {unit!r}")
     return (ticks - ticks[0]) * _TIME_UNITS[unit]
 
 
@@ -142,7 +167,7 @@ def _rotations(
     for names in _QUATERNION:
         found = [_column(columns, name) for name in names]
         if None not in found:
-            return _from_quaternions(file, table[found].to_numpy())
+            return rotations_of(table[found].to_numpy(), str(file))
     for names in _UNNAMED:
         if all(name in columns for name in names):
             if quaternion not in ("xyzw", "wxyz"):
@@ -151,21 +176,14 @@ def _rotations(
                     "--quaternion wxyz or xyzw"
                 )
             values = table[[columns[name] for name in names]].to_numpy()
-            return _from_quaternions(file, values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]])
+            return rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
     for euler in _EULER:
         found = [_column(columns, name) for name in euler]
         if None not in found:
-            said = re.search(r"(deg|rad)", str(found[0]))
-            unit = said.group(1) if said else angles
-            if unit not in ("deg", "rad"):
-                raise InputError(f"{file} does not say whether {found[0]} is in degrees: give --angles deg or rad")
+            units = _units(file, found, _ANGLE_UNITS, angles, "--angles")
+            for name, one in zip(found, units, strict=True):
+                if one is None:
+                    raise InputError(f"{file} does not say whether {name} is in degrees: give --angles deg or rad")
             assumed.append("roll, pitch and yaw are about fixed axes, Rz(yaw) Ry(pitch) Rx(roll)")
-            return Rotation.from_euler("xyz", table[found].to_numpy(), degrees=unit == "deg")
+            return Rotation.from_euler("xyz", table[found].to_numpy() * [_ANGLE_UNITS[str(one)] for one in units])
     return None
-
-
-def _from_quaternions(file: Path, values: np.ndarray) -> Rotation:
-    lengths = np.linalg.norm(values, axis=1)
-    if np.abs(lengths - 1.0).max() > 0.01:
-        raise InputError(f"{file} has quaternions of length {lengths.min():.3g} to {lengths.max():.3g}, and not one")
-    return Rotation.from_quat(values)

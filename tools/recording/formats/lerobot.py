@@ -10,7 +10,8 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.recording.formats.recorded import Recorded, choose_signal
+from guiderail.tools.recording.formats.recorded import Recorded, choose_signal, from_zero
+from guiderail.tools.recording.places import whole_folder
 
 VERSION = "v3.0"
 INFO = Path("meta") / "info.json"
@@ -40,15 +41,13 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
         version, features, fps = str(info["codebase_version"]), dict(info["features"]), float(info["fps"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        vectors = [name for name, feature in features.items() if _is_vector(name, feature)]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(f"{folder} is no LeRobot dataset: its {INFO} is missing or damaged") from error
+    if not 0.0 < fps < np.inf:
+        raise InputError(f"{folder} has {fps:g} frames a second: correct fps in its {INFO}")
     if not version.startswith("v3"):
         raise InputError(f"{folder} is a LeRobot dataset of version {version}: convert it to v3.0 by LeRobot's script")
-    vectors = [
-        name
-        for name, one in features.items()
-        if len(one.get("shape", ())) == 1 and name not in _CLOCKS and str(one.get("dtype", "")).startswith("float")
-    ]
     chosen, assumed = choose_signal(sorted(vectors), signal, str(folder), "--signal")
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
@@ -61,7 +60,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
         frames, episodes = (
             np.concatenate([table[name].to_numpy() for table in tables]) for name in ("frame_index", "episode_index")
         )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder} holds data that its {INFO} does not describe: {error}") from error
     names = _names(features[chosen], values.shape[1])
     assumed += [
@@ -77,6 +76,11 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     return found
 
 
+def _is_vector(name: str, feature: dict[str, Any]) -> bool:
+    kind = str(feature.get("dtype", ""))
+    return len(feature.get("shape", ())) == 1 and name not in _CLOCKS and kind.startswith("float")
+
+
 def _names(feature: dict[str, Any], size: int) -> tuple[str, ...]:
     names = feature.get("names")
     if isinstance(names, dict):  # some datasets have {"motors": [...]}
@@ -90,8 +94,9 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     """Writes a dataset whose action is what was commanded.
 
     Raises:
-        InputError: if the demonstrations have no common rate, which a dataset must have.
+        InputError: if the demonstrations have no common rate, which a dataset must have, or it can't be written.
     """
+    import pandas as pd
     import pyarrow as arrow
     import pyarrow.parquet as parquet
 
@@ -102,6 +107,8 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
             "a LeRobot dataset has one rate, and these demonstrations have several: give --rate to resample them"
         )
     fps = round(1.0 / period, 6)
+    if fps == 0.0:
+        raise InputError(f"a LeRobot dataset counts frames in a second, and these are {period:g} s apart: give --rate")
     fps = int(fps) if float(fps).is_integer() else fps
     size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
     values = np.concatenate(demonstrations.outputs).astype(np.float32)
@@ -122,9 +129,6 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         name: {"dtype": "float32", "shape": [size], "names": names} for name in ("action", "observation.state")
     }
     features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _CLOCKS.items()}
-    data = folder / DATA_PATH.format(chunk_index=0, file_index=0)
-    data.parent.mkdir(parents=True)
-    parquet.write_table(arrow.table(columns), data)
     ends = np.cumsum(lengths)
     described = {
         "episode_index": list(range(len(lengths))),
@@ -137,12 +141,6 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         "meta/episodes/chunk_index": [0] * len(lengths),
         "meta/episodes/file_index": [0] * len(lengths),
     }
-    about = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
-    about.parent.mkdir(parents=True)
-    parquet.write_table(arrow.table(described), about)
-    import pandas as pd
-
-    pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task")).to_parquet(folder / "meta" / "tasks.parquet")
     info = {
         "codebase_version": VERSION,
         "robot_type": None,
@@ -158,9 +156,20 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         "video_path": None,
         "features": features,
     }
-    (folder / INFO).write_text(json.dumps(info, indent=4), encoding="utf-8")
-    (folder / "meta" / "stats.json").write_text(json.dumps(_statistics(columns, values), indent=4), encoding="utf-8")
-    return ["action and observation.state are both what was demonstrated, as 32-bit numbers"]
+    with whole_folder(folder) as made:
+        for path, table in (
+            (DATA_PATH.format(chunk_index=0, file_index=0), columns),
+            ("meta/episodes/chunk-000/file-000.parquet", described),
+        ):
+            (made / path).parent.mkdir(parents=True)
+            parquet.write_table(arrow.table(table), made / path)
+        tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task"))
+        tasks.to_parquet(made / "meta" / "tasks.parquet")
+        (made / INFO).write_text(json.dumps(info, indent=4), encoding="utf-8")
+        stats = json.dumps(_statistics(columns, values), indent=4)
+        (made / "meta" / "stats.json").write_text(stats, encoding="utf-8")
+    notes = ["action and observation.state are both what was demonstrated, as 32-bit numbers"]
+    return notes + from_zero(demonstrations)
 
 
 def _statistics(columns: dict[str, Any], values: np.ndarray) -> dict[str, Any]:

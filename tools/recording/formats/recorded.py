@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.errors import InputError
+from guiderail.models.primitives import Demonstrations
 
 POSE_NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -31,6 +32,22 @@ class Recorded:
     outputs: list[np.ndarray]
     names: tuple[str, ...]
     assumed: list[str] = field(default_factory=list)
+
+
+def rotations_of(quaternions: np.ndarray, where: str) -> Rotation:
+    """Rotations of quaternions (N, 4), [x y z w]; `where` names their file in messages.
+
+    Raises:
+        InputError: if one is no rotation: its length is not one, or it holds what is no number.
+    """
+    lengths = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(~(np.abs(lengths - 1.0) <= 0.01))  # as tf2 allows
+    if len(wrong):
+        raise InputError(
+            f"{where} has a quaternion of length {lengths[wrong[0]]:.3g} at sample {wrong[0]}, and a rotation's is 1: "
+            f"cut such samples out ({len(wrong)} of {len(lengths)})"
+        )
+    return Rotation.from_quat(quaternions)
 
 
 def poses_in_target(
@@ -56,6 +73,15 @@ def poses_in_target(
     if like is not None:
         angles -= 2.0 * np.pi * np.round((angles.mean(axis=0) - like[:, 3:].mean(axis=0)) / (2.0 * np.pi))
     return np.column_stack([positions, angles])
+
+
+def from_zero(demonstrations: Demonstrations) -> list[str]:
+    """A sentence where time that is counted from each demonstration's first sample is another than theirs."""
+    starts = sorted(float(t[0]) for t in demonstrations.times)
+    if not any(starts):
+        return []
+    where = f"{starts[0]:g}" if starts[0] == starts[-1] else f"{starts[0]:g} to {starts[-1]:g}"
+    return [f"time is counted from each demonstration's first sample, where it was {where}"]
 
 
 def is_commanded(name: str) -> bool:

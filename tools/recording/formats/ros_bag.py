@@ -7,11 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from guiderail.models.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.recording.formats.recorded import POSE_NAMES, Recorded, choose_signal, poses_in_target
+from guiderail.tools.recording.formats.recorded import (
+    POSE_NAMES,
+    Recorded,
+    choose_signal,
+    from_zero,
+    poses_in_target,
+    rotations_of,
+)
+from guiderail.tools.recording.places import whole_folder
 
 # Where a pose is in a message of each type that robots commonly publish.
 POSES = {
@@ -27,6 +34,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 TOPIC = "/demonstration/commanded_pose"
 DATA = "std_msgs/msg/Float64MultiArray"
 _NANO = 1e-9
+_LATEST = 9e9  # [s]: a bag counts nanoseconds in 63 bits
 
 
 def _rosbags() -> Any:
@@ -58,6 +66,8 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
     found = Recorded([], [], ())
     for bag in find_bags(path):
         times, outputs, names, assumed = _read_bag(bag, topic, target, found.outputs[0] if found.outputs else None)
+        if sorted(names) == sorted(found.names):  # joints come in any order
+            names, outputs = found.names, outputs[:, [names.index(name) for name in found.names]]
         if found.names and names != found.names:
             raise InputError(f"{bag} has {', '.join(names)}, the bag before {', '.join(found.names)}: record the same")
         found.times.append(times)
@@ -101,20 +111,49 @@ def _read_bag(
     messages = [message for _, message in rows]
     if kinds[chosen] == DATA:
         names = tuple(dimension.label for dimension in messages[0].layout.dim) or POSE_NAMES
+        for number, message in enumerate(messages):
+            if len(message.data) != len(names):
+                raise InputError(
+                    f"message {number} on {chosen} of {bag} has {len(message.data)} numbers, and not {len(names)}: "
+                    "record as many in each"
+                )
         return times, np.array([message.data for message in messages]), names, assumed
     if kinds[chosen] == JOINTS:
-        names = tuple(f"{name} [rad]" for name in messages[0].name)
         assumed.append("joints are revolute, so that their positions are in radians")
-        return times, np.array([message.position for message in messages]), names, assumed
+        names = tuple(f"{name} [rad]" for name in messages[0].name)
+        return times, _joint_positions(messages, f"on {chosen} of {bag}"), names, assumed
     poses = [_within(message, POSES[kinds[chosen]]) for message in messages]
     positions = np.array([_xyz(pose) for pose in poses])
     turns = [getattr(pose, "orientation", None) or pose.rotation for pose in poses]
-    rotations = Rotation.from_quat([(q.x, q.y, q.z, q.w) for q in turns])
+    rotations = rotations_of(np.array([(q.x, q.y, q.z, q.w) for q in turns]), str(bag))
     frame = _frame(messages[0], POSES[kinds[chosen]])
     assumed.append("positions are in metres and quaternions by their fields' names, as ROS has them (REP 103)")
     if target is None:
         assumed.append(f"poses stay in the frame {frame!r}: --target says where the task's target is in it")
     return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumed
+
+
+def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
+    """Positions (N, J) in the order of the first message's names: every message has its own.
+
+    Messages of other joints are refused and not left out: which of two devices came first is chance.
+    """
+    wanted = list(messages[0].name)
+    rows = []
+    for number, message in enumerate(messages):
+        names = list(message.name)
+        if len(message.position) != len(names):
+            raise InputError(
+                f"message {number} {where} has {len(message.position)} positions of {len(names)} joints: record a "
+                "position of each"
+            )
+        if sorted(names) != sorted(wanted):
+            raise InputError(
+                f"message {number} {where} is of {', '.join(names)}, and the first of {', '.join(wanted)}: record each "
+                "device on a topic of its own"
+            )
+        rows.append(np.asarray(message.position)[[names.index(name) for name in wanted]])
+    return np.array(rows)
 
 
 def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
@@ -148,7 +187,11 @@ def _frame(message: Any, path: Sequence[str]) -> str:
 
 
 def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
-    """A folder of ROS 2 bags in MCAP, one a demonstration, as arrays of doubles with named dimensions."""
+    """A folder of ROS 2 bags in MCAP, one a demonstration, as arrays of doubles with named dimensions.
+
+    Raises:
+        InputError: if a bag can't hold their time, or it can't be written.
+    """
     _rosbags()
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -158,11 +201,32 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
         store.types[f"std_msgs/msg/{name}"] for name in ("MultiArrayLayout", "MultiArrayDimension", "Float64MultiArray")
     )
     dims = [dimension(label=name, size=1, stride=1) for name in demonstrations.names]
-    path.mkdir(parents=True)
-    for number, (times, outputs) in enumerate(zip(demonstrations.times, demonstrations.outputs, strict=True)):
-        with Writer(path / f"demonstration_{number}", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            connection = writer.add_connection(TOPIC, DATA, typestore=store)
-            for t, y in zip(times, outputs, strict=True):
-                message = array(layout=layout(dim=dims, data_offset=0), data=y)
-                writer.write(connection, round(t / _NANO), store.serialize_cdr(message, DATA))
-    return [f"{TOPIC} holds the outputs as {DATA}, named in its layout; its time is the bag's, to the nanosecond"]
+    stamps, notes = _stamps(demonstrations)
+    with whole_folder(path) as made:
+        for number, (clock, outputs) in enumerate(zip(stamps, demonstrations.outputs, strict=True)):
+            with Writer(made / f"demonstration_{number}", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+                connection = writer.add_connection(TOPIC, DATA, typestore=store)
+                for stamp, y in zip(clock.tolist(), outputs, strict=True):
+                    message = array(layout=layout(dim=dims, data_offset=0), data=y)
+                    writer.write(connection, stamp, store.serialize_cdr(message, DATA))
+    return [
+        f"{TOPIC} holds the outputs as {DATA}, named in its layout; its time is the bag's, to the nanosecond",
+        *notes,
+    ]
+
+
+def _stamps(demonstrations: Demonstrations) -> tuple[list[np.ndarray], list[str]]:
+    """Whole nanoseconds (N_m,) of each, which a bag can't count from before zero; a sentence if they were shifted."""
+    times, notes = list(demonstrations.times), []
+    if min(t[0] for t in times) < 0.0:
+        times, notes = [t - t[0] for t in times], from_zero(demonstrations)
+    stamps = []
+    for number, t in enumerate(times):
+        if t[-1] > _LATEST:
+            raise InputError(
+                f"demonstration {number} ends at {t[-1]:g} s, and a bag's time at {_LATEST:g}: subtract an offset"
+            )
+        stamps.append(np.rint(t / _NANO).astype(np.int64))
+        if (np.diff(stamps[-1]) <= 0).any():
+            raise InputError(f"demonstration {number} has samples less than a nanosecond apart: give --rate")
+    return stamps, notes

@@ -1,0 +1,56 @@
+"""Where recordings are read from and written to."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from guiderail.models.errors import InputError, brief
+from guiderail.tools.files import check_writable
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is a file or a folder.
+
+    Raises:
+        InputError: if that can't be found out, as of a name that is too long.
+    """
+    try:
+        return path.exists()
+    except OSError as error:
+        raise InputError(f"the path {brief(str(path))} can't be read ({error.strerror}): check it") from error
+
+
+def check_new(out: Path, what: str) -> None:
+    """Refuses a place that nothing can be written to, before anything is done for it; `what` is what it would be.
+
+    Raises:
+        InputError: if something is there already, or nothing can be written above it.
+    """
+    if is_there(out):
+        raise InputError(f"{out} already exists: name another {what}")
+    check_writable(out)
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """A folder to write into that becomes `out` in the end; if that fails there is none, so that one can try again.
+
+    Raises:
+        InputError: if it can't be written.
+    """
+    made = out.with_name(f".{out.name}.{os.getpid()}.part")
+    shutil.rmtree(made, ignore_errors=True)
+    try:
+        made.mkdir(parents=True)
+        yield made
+        made.rename(out)
+    except OSError as error:
+        raise InputError(
+            f"{out} cannot be written ({error.strerror or error}): choose a folder with room to write"
+        ) from error
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
