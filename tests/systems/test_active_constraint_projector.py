@@ -122,9 +122,10 @@ def test_a_command_is_taken_in_once_at_each_instant():
 def test_a_request_that_is_not_finite_repeats_the_last_safe_command():
     rig = Rig()
     before, _ = rig.step(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
-    desired, fallback = rig.step(np.full(6, np.nan))
-    assert fallback == 1.0
-    np.testing.assert_array_equal(desired, before)
+    for request in (np.full(6, np.nan), START + [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]):
+        desired, fallback = rig.step(request)
+        assert fallback == 1.0
+        np.testing.assert_array_equal(desired, before)
 
 
 def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
@@ -197,11 +198,12 @@ def test_an_object_that_is_moved_while_it_waits_leads_the_command_inside_no_fast
     assert rig.value("commanded_violation") <= 1e-9
 
 
+@pytest.mark.parametrize("nowhere", [NOWHERE, START + [0.0, 0.0, 0.0, 0.0, np.nan, 0.0]])
 @pytest.mark.parametrize("max_tracking_error", [0.02, np.inf])
-def test_waits_for_a_robot_whose_pose_is_no_number(max_tracking_error):
+def test_waits_for_a_robot_whose_pose_is_no_number(max_tracking_error, nowhere):
     rig = Rig(max_tracking_error=max_tracking_error)
     away = START + [0.001, 0.0, 0.0, 0.0, 0.0, 0.0]
-    before, _ = rig.step(START, measured=NOWHERE)
+    before, _ = rig.step(START, measured=nowhere)
     for _ in range(5):
         desired, fallback = rig.step(away)
         assert fallback == 1.0

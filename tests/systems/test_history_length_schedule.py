@@ -42,6 +42,10 @@ def test_torques_are_no_contact():
     assert lengths_under([0.0] * 5) == [10] * 5
 
 
+def test_a_force_at_the_threshold_is_no_contact_yet():
+    assert lengths_under([2.0] * 3) == [10] * 3
+
+
 def test_a_force_that_is_no_number_is_contact():
     assert lengths_under([np.nan] * 3) == [2, 1, 1]
     assert lengths_under([3.0] * 3 + [np.nan] * 4, dwell_steps=2) == [2, 1, 1, 1, 1, 1, 1]

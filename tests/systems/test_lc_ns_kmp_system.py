@@ -190,6 +190,9 @@ def test_an_initialization_begins_at_the_first_step_with_the_first_safe_command(
     p.predict = predict
     action.GetMutableData()
     np.testing.assert_array_equal(system.get_output_output_port().Eval(context), predict(0, np.zeros(2)).output)
+    context.SetTime(7 * PERIOD)
+    simulator.Initialize()
+    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), predict(7, np.zeros(2)).output)
 
 
 @pytest.mark.parametrize("length", [2.0, 4.0, 0.0, 1.5, np.nan])
