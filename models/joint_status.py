@@ -140,8 +140,8 @@ class StatusLimits:
         positive += (self.max_gap,)
         if not self.velocity or not all(0.0 < value < np.inf for value in positive):
             raise InputError("the limits of a robot's status must be positive")
-        if not min(self.settling, self.clock_drift) >= 0.0:
-            raise InputError("a robot's settling time and its clock's drift must not be negative")
+        if not all(0.0 <= value < np.inf for value in (self.settling, self.clock_drift)):
+            raise InputError("a robot's settling time and its clock's drift must be finite and not negative")
 
     @classmethod
     def at_rate(cls, velocity: Sequence[float], period: float) -> StatusLimits:

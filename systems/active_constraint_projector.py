@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 
 from guiderail.models.errors import InputError
 from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
-from guiderail.models.skills.skill import Skill
+from guiderail.models.skills.skill import INSIDE, Skill
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.skill_frames import SkillFrames
@@ -30,9 +30,10 @@ class ActiveConstraintProjector(LeafSystem):
 
     (`Skill.command`). The last command is state; it is initialized with the measured pose, as far inside the
     constraints as one period leads. Between two control instants the output is a pure function of it and of the
-    request. The last safe command is repeated, and ``fallback`` is 1, where a request is not finite, and where the
-    tracking error exceeds its bound and the request would not reduce it: the command waits for a robot that is held
-    back.
+    request. The last safe command is repeated, and ``fallback`` is 1, where a request or the measured pose is not
+    finite, and where the tracking error exceeds its bound and the request would not reduce it: the command waits for a
+    robot that is held back. Constraints hold while it waits, too: where a transition or a moved object leaves the last
+    command outside of them, it is led inside.
 
     .. pydrake_system::
 
@@ -66,7 +67,8 @@ class ActiveConstraintProjector(LeafSystem):
             max_tracking_error: distance of the robot from its command beyond which that waits [m], positive.
 
         Raises:
-            InputError: if an argument is out of range, or a frame is missing.
+            InputError: if an argument is out of range, or a frame is missing or not finite. At initialization, if the
+                measured pose is not finite.
         """
         super().__init__()
         check_period(period)
@@ -147,12 +149,24 @@ class ActiveConstraintProjector(LeafSystem):
         return self._skill.violation(state, pose_to_transform(pose), self.frames.eval(context))
 
     def _calc_command(self, context: Context) -> np.ndarray:
-        """The command (6,), and 1 if it is the last safe one, else 0."""
+        """The command (6,), and 1 if it waits, else 0."""
         value = context.get_discrete_state(self._last).value()
         last, measured = value[:6], value[6:]
         requested = self._requested_pose_port.Eval(context)
-        if not np.isfinite(requested).all():
-            return np.array([*last, 1.0])
+        if np.isfinite(requested).all() and np.isfinite(measured).all():
+            desired = self._constrained(context, last, requested)
+            tracking_error = math.dist(last[:3], measured[:3])
+            waits = tracking_error > self._max_tracking_error and math.dist(desired[:3], measured[:3]) >= tracking_error
+            if not waits and np.isfinite(desired).all():
+                return np.array([*desired, 0.0])
+        # Only where it has to: projecting what is inside already would let it creep by rounding.
+        if self._violation(context, last) > INSIDE:
+            inside = self._constrained(context, last, last)
+            last = inside if np.isfinite(inside).all() else last
+        return np.array([*last, 1.0])
+
+    def _constrained(self, context: Context, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
+        """What the constraints and one period make of a request, (6,)."""
         command = self._skill.command(
             int(self._state_port.Eval(context)[0]),
             pose_to_transform(last),
@@ -160,11 +174,7 @@ class ActiveConstraintProjector(LeafSystem):
             self.frames.eval(context),
             self._period,
         )
-        desired = transform_to_pose(command.X_WE)
-        tracking_error = math.dist(last[:3], measured[:3])
-        if tracking_error > self._max_tracking_error and math.dist(desired[:3], measured[:3]) >= tracking_error:
-            return np.array([*last, 1.0])
-        return np.array([*desired, 0.0])
+        return transform_to_pose(command.X_WE)
 
     def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._command.Eval(context)[:6])
@@ -183,6 +193,8 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         measured = self._pose_port.Eval(context)
+        if not np.isfinite(measured).all():
+            raise InputError(f"a skill begins where the robot is: its measured pose must be finite, not {measured}")
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
         # Not the state port's value: that is decided at this same instant.
         state = self._skill.state_at(X_WE, frames)

@@ -21,11 +21,11 @@ class ImpedanceGains:
     Args:
         stiffness: (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad.
         wrench_limits: (6,) of the wrench along the stiffness frame's axes [N, Nm], positive.
-        damping_ratio: of every mode, positive.
-        posture: joint positions (n,) that the null space returns to.
-        posture_stiffness: [Nm/rad], not negative.
-        posture_damping: decay rate of motion in the null space [1/s], not negative; its torque is this rate times M v,
-            which takes energy out of the null space in every posture.
+        damping_ratio: of every mode, positive and finite.
+        posture: joint positions (n,) that the null space returns to, finite.
+        posture_stiffness: [Nm/rad], not negative, finite.
+        posture_damping: decay rate of motion in the null space [1/s], not negative, finite; its torque is this rate
+            times M v, which takes energy out of the null space in every posture.
     """
 
     stiffness: np.ndarray
@@ -37,12 +37,19 @@ class ImpedanceGains:
 
     def __post_init__(self) -> None:
         K = np.asarray(self.stiffness, dtype=float)
-        if K.shape != (6, 6) or not np.allclose(K, K.T) or not (np.linalg.eigvalsh(K) > 0.0).all():
+        is_sound = K.shape == (6, 6) and np.isfinite(K).all() and np.allclose(K, K.T)
+        if not is_sound or not (np.linalg.eigvalsh(K) > 0.0).all():
             raise InputError("a Cartesian stiffness must be a symmetric, positive definite 6 × 6 matrix")
         if np.shape(self.wrench_limits) != (6,) or not (np.asarray(self.wrench_limits) > 0.0).all():
             raise InputError(f"an impedance needs six positive wrench limits, not {self.wrench_limits}")
-        if not self.damping_ratio > 0.0 or not min(self.posture_stiffness, self.posture_damping) >= 0.0:
-            raise InputError("an impedance's damping ratio must be positive, and its posture's gains not negative")
+        posture_gains = (self.posture_stiffness, self.posture_damping)
+        if not 0.0 < self.damping_ratio < np.inf or not all(0.0 <= gain < np.inf for gain in posture_gains):
+            raise InputError(
+                "an impedance's damping ratio must be positive, its posture's gains not negative, and all of them "
+                "finite"
+            )
+        if not np.isfinite(self.posture).all():
+            raise InputError(f"an impedance's posture must be finite joint positions, not {self.posture}")
 
 
 class CartesianImpedanceController(LeafSystem):

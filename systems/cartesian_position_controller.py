@@ -53,7 +53,8 @@ class CartesianPositionController(LeafSystem):
 
     (`pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics`; in closed form while no limit of a joint
     binds, which is the same optimum). The optimization keeps the direction of the tool's motion and every joint's
-    limits of position and velocity; where both can't be had, the motion slows down or stops. Where commands stop, the
+    limits of position and velocity; where both can't be had, the motion slows down or stops. A joint that begins beyond
+    a limit of its position may come back, no faster than ever, and goes no farther. Where commands stop, the
     joint command is held: while the desired pose is not finite, older than a timeout or more than a period from the
     future (`CommandCheck`). Near a singular posture a damped pseudoinverse takes over (`models.damped_inverse`): the
     tool leaves its direction a little, the joints stay slow, and the return to the posture leads out.
@@ -96,7 +97,7 @@ class CartesianPositionController(LeafSystem):
             plant: the arm alone, finalized; its joints' limits are kept.
             target: T, fixed in the world.
             tool_centre: P.
-            posture: joint positions (n,) that the null space returns to.
+            posture: joint positions (n,) that the null space returns to, finite.
             period: between two joint commands [s], positive; 100 Hz unless given.
             speed_limits: of the tool centre.
             posture_gain: of the return to the posture [1/s], not negative.
@@ -108,10 +109,12 @@ class CartesianPositionController(LeafSystem):
         super().__init__()
         check_period(period)
         num_joints = plant.num_positions()
-        if not posture_gain >= 0.0:
+        if not 0.0 <= posture_gain < np.inf:
             raise InputError(f"a position controller's posture gain must not be negative, not {posture_gain}")
         if np.shape(posture) != (num_joints,):
             raise InputError(f"a position controller's posture must have {num_joints} joints")
+        if not np.isfinite(posture).all():
+            raise InputError(f"a position controller's posture must be finite joint positions, not {posture}")
         self._plant, self._target, self._tool_centre = plant, target, tool_centre
         self._period, self._speed_limits = period, speed_limits
         self._posture, self._posture_gain = np.array(posture, dtype=float), posture_gain
@@ -121,7 +124,6 @@ class CartesianPositionController(LeafSystem):
         parameters.set_joint_centering_gain(posture_gain * np.eye(num_joints))
         self._position_limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
         self._velocity_limits = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
-        parameters.set_joint_position_limits(self._position_limits)
         parameters.set_joint_velocity_limits(self._velocity_limits)
         self._parameters = parameters
 
@@ -195,11 +197,13 @@ class CartesianPositionController(LeafSystem):
             plant_context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._target, self._target
         )
         q = self._joint_command(context)
-        velocities, is_stuck = self._joint_velocities(q, V, J)
+        # With q among them no limit asks for a leap of a joint that is beyond it, nor forbids every motion.
+        limits = np.minimum(self._position_limits[0], q), np.maximum(self._position_limits[1], q)
+        velocities, is_stuck = self._joint_velocities(q, V, J, limits)
         discrete_state.set_value(self._is_stuck, [float(is_stuck)])
         if velocities is not None:
             # The solver keeps limits to its own tolerance only; what is sent keeps them exactly.
-            discrete_state.set_value(self._command, np.clip(q + self._period * velocities, *self._position_limits))
+            discrete_state.set_value(self._command, np.clip(q + self._period * velocities, *limits))
         return EventStatus.Succeeded()
 
     def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
@@ -212,14 +216,17 @@ class CartesianPositionController(LeafSystem):
             ]
         )
 
-    def _joint_velocities(self, q: np.ndarray, V: np.ndarray, J: np.ndarray) -> tuple[np.ndarray | None, bool]:
+    def _joint_velocities(
+        self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray | None, bool]:
         """For the tool velocity V, or None where there are none; and whether V's direction can't be followed."""
         velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
         if not is_regular:
             velocities /= max(1.0, float((np.abs(velocities) / self._velocity_limits[1]).max()))
             return velocities, not follows(J, velocities, V)
-        if _within(velocities, self._velocity_limits) and _within(q + self._period * velocities, self._position_limits):
+        if _within(velocities, self._velocity_limits) and _within(q + self._period * velocities, position_limits):
             return velocities, False  # no limit binds: the optimum, without the time that its solver takes
+        self._parameters.set_joint_position_limits(position_limits)
         result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
         return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound
 

@@ -18,9 +18,10 @@ from guiderail.systems.support.sampling import check_period
 class DesiredPoseRamp(LeafSystem):
     """Follows a desired pose with limited speed, starting from the measured pose.
 
-    While the authority is zero the output is the measured pose. From then on it goes to the desired pose: at most the
-    speed times the period in each period, along a straight line, and each angle on its own the shorter way. A desired
-    pose that keeps to the speed is passed on as it is.
+    While the authority is zero the output is the measured pose; where there is authority at initialization already, it
+    starts from the pose measured then. From then on it goes to the desired pose: at most the speed times the period in
+    each period, along a straight line, and each angle on its own the shorter way. A desired pose that keeps to the
+    speed is passed on as it is.
 
     .. pydrake_system::
 
@@ -66,6 +67,7 @@ class DesiredPoseRamp(LeafSystem):
                 self.discrete_state_ticket(self._last),
             },
         )
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
 
     def get_desired_pose_input_port(self) -> InputPort:
@@ -103,6 +105,10 @@ class DesiredPoseRamp(LeafSystem):
 
     def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._limited_pose(context))
+
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._pose_port.Eval(context))
+        return EventStatus.Succeeded()
 
     def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._limited_pose(context))

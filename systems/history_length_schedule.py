@@ -22,7 +22,7 @@ class HistoryLengthSchedule(LeafSystem):
 
     Lengths change one by one: to the next shorter at every control step in contact, to the next longer after every
     `dwell_steps` control steps in free space. Contact is detected with hysteresis: it begins where the measured force
-    exceeds `contact_threshold` and ends where it falls to `release_threshold`.
+    exceeds `contact_threshold` and ends where it falls to `release_threshold`; a force that is no number is contact.
 
     .. pydrake_system::
 
@@ -33,7 +33,7 @@ class HistoryLengthSchedule(LeafSystem):
         - history_length
 
     ``wrench`` (W,) is measured, its first three numbers a force [N] (both, where there are only two).
-    ``history_length`` (1,) is P; it is state, and initially the longest.
+    ``history_length`` (1,) is P; it is state, and at initialization the longest.
     """
 
     def __init__(
@@ -82,6 +82,7 @@ class HistoryLengthSchedule(LeafSystem):
             self._calc_history_length,
             prerequisites_of_calc={self.discrete_state_ticket(self._state)},
         )
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_wrench_input_port(self) -> InputPort:
@@ -92,10 +93,15 @@ class HistoryLengthSchedule(LeafSystem):
         """The history length P, (1,)."""
         return self._history_length_port
 
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._state, np.zeros(3))
+        return EventStatus.Succeeded()
+
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         index, in_contact, waited = context.get_discrete_state(self._state).value()
         force = float(np.linalg.norm(self._wrench_port.Eval(context)[:3]))
-        in_contact = force > (self._release_threshold if in_contact else self._contact_threshold)
+        # Asked this way round, what is no number is contact.
+        in_contact = not force <= (self._release_threshold if in_contact else self._contact_threshold)
         if in_contact:
             index, waited = min(index + 1, len(self._lengths) - 1), 0
         else:

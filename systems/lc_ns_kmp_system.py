@@ -52,6 +52,8 @@ class LcNsKmpSystem(LeafSystem):
     of that command: negative is slack, `UNCONSTRAINED` where there is no constraint. ``fallback`` (1,) is 1 where no
     window within the constraints was found: then it is what is nearest to the last command within its own step's.
 
+    A history length that no primitive has raises an `InputError` where it is asked for.
+
     The step is state and counts control periods since time zero; the output is a pure function of step, action and
     history, evaluated once a control step (see CONTRIBUTING.md, "Rates and the order of events").
     """
@@ -104,7 +106,9 @@ class LcNsKmpSystem(LeafSystem):
         self._history_length_port = self.DeclareVectorInputPort("history_length", 1) if shorter else None
         self._step = self.DeclareDiscreteState(1)
         start = primitive.constraints.nearest(primitive.reference.means[0])
+        self._first_safe = start
         self._last_safe = self.DeclareDiscreteState(start)
+        self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
 
         prerequisites = {
@@ -171,6 +175,13 @@ class LcNsKmpSystem(LeafSystem):
         """1 where the command is what is nearest to the last one within the constraints, (1,)."""
         return self._fallback_port
 
+    def _begin(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        step = round(context.get_time() / self._period)
+        discrete_state.set_value(self._step, [step])
+        if step == 0:  # whoever goes on from a later state falls back to the last command
+            discrete_state.set_value(self._last_safe, self._first_safe)
+        return EventStatus.Succeeded()
+
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         step = round(context.get_time() / self._period)
         if step > 0:
@@ -183,7 +194,11 @@ class LcNsKmpSystem(LeafSystem):
         step = int(context.get_discrete_state(self._step).value()[0])
         length = self._primitive.history
         if self._history_length_port is not None:
-            length = int(self._history_length_port.Eval(context)[0])
+            length = self._history_length_port.Eval(context)[0]
+            if length not in self._by_history_length:
+                known = ", ".join(map(str, sorted(self._by_history_length)))
+                raise InputError(f"there is no primitive with a history of {length:g} outputs, only with {known}")
+            length = int(length)
         primitive, gain = self._by_history_length[length]
         action = gain * self._null_space_action_port.Eval(context)
         history = None

@@ -45,7 +45,7 @@ class SctInputMapping(LeafSystem):
             period: for which an input is held [s], positive.
 
         Raises:
-            InputError: if the period is not positive, or a frame is missing.
+            InputError: if the period is not positive, or a frame is missing or not finite.
         """
         super().__init__()
         check_period(period)

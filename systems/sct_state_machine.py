@@ -57,7 +57,7 @@ class SctStateMachine(LeafSystem):
             period: between two control steps [s], positive.
 
         Raises:
-            InputError: if the period is not positive, or a frame is missing.
+            InputError: if the period is not positive, or a frame is missing or not finite.
         """
         super().__init__()
         check_period(period)

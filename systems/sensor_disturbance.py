@@ -20,7 +20,8 @@ class SensorDisturbance(LeafSystem):
 
         y = s ∘ u(t − k h) + b + σ ∘ n,  n ~ N(0, 1) anew every period h
 
-    s and b are parameters, as is the seed of the noise: a reset draws and restores them.
+    s and b are parameters, as is the seed of the noise: a reset draws and restores them. At initialization the noise
+    begins anew, and nothing was measured yet: what is late is zero.
 
     .. pydrake_system::
 
@@ -65,6 +66,7 @@ class SensorDisturbance(LeafSystem):
             self._calc_disturbed,
             prerequisites_of_calc={source, self.discrete_state_ticket(self._newest), self.all_parameters_ticket()},
         )
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_measured_input_port(self) -> InputPort:
@@ -79,6 +81,14 @@ class SensorDisturbance(LeafSystem):
         """Sets s and b, (n,) each, and what the noise is drawn from; `context` is this system's own."""
         for index, values in ((self._scale, scale), (self._bias, bias), (self._seed, [seed])):
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
+
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        size = len(self._noise)
+        discrete_state.set_value(self._count, np.zeros(1))
+        discrete_state.set_value(self._newest, np.zeros(size))
+        if self._late is not None:
+            discrete_state.set_value(self._late, np.zeros(self._delay * size))
+        return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = context.get_discrete_state(self._count).value() + 1.0

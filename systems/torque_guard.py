@@ -175,7 +175,10 @@ class TorqueGuard(LeafSystem):
             self,
             "found",
             self._find_fault,
-            prerequisites_of_calc=memory | fault | measured | {self._torque_port.ticket()},
+            prerequisites_of_calc=memory
+            | fault
+            | measured
+            | {self._torque_port.ticket(), self._status_age_port.ticket()},
         )
         found = {self._found.ticket()}
         self._safe_torque_port = self.DeclareVectorOutputPort(
@@ -305,7 +308,12 @@ class TorqueGuard(LeafSystem):
         if status_fault:
             return status_fault
         # Asked this way round, what is no number is never within a limit.
-        if not (np.abs(self._state_port.Eval(context)[n:]) <= limits.velocity).all():
+        if not self._status_age_port.Eval(context)[0] <= np.inf:
+            return Fault.STALE
+        state = self._state_port.Eval(context)
+        if not np.isfinite(state).all():
+            return Fault.NOT_FINITE
+        if not (np.abs(state[n:]) <= limits.velocity).all():
             return Fault.VELOCITY
         places = [self._pose_port.Eval(context)[:3]]
         if self._memory_of(context)[_PHASE] in (Phase.RAMPING, Phase.RUNNING):
@@ -363,6 +371,7 @@ class TorqueGuard(LeafSystem):
             torque = self._damping_torque(context, 0.0)
         elif phase == Phase.DAMPING and not self._is_started_anew(context):
             torque = self._damping_torque(context, phase_time + self._period)
+        torque = np.where(np.isfinite(torque), torque, 0.0)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
 
     def _is_started_anew(self, context: Context) -> bool:
@@ -385,13 +394,14 @@ class TorqueGuard(LeafSystem):
         """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s].
 
         Nothing where that speed was old when the damping began: whoever was held up himself knows no speed, and
-        somebody else may have stopped the arm meanwhile.
+        somebody else may have stopped the arm meanwhile. Nothing either where it, its age or the posture is no number.
         """
         age = float(self._status_age_port.Eval(context)[0])
-        if np.isfinite(damped) and age - damped > OLDEST_SPEED:
+        state = self._state_port.Eval(context)
+        if (np.isfinite(damped) and not age - damped <= OLDEST_SPEED) or not np.isfinite(state).all():
             return np.zeros(self._num_joints)
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
-        v = self._state_port.Eval(context)[self._num_joints :]
+        v = state[self._num_joints :]
         if np.isfinite(damped):
             v = v + np.linalg.solve(M, self._given_until_now(context))
         damped = min(age, damped)

@@ -27,14 +27,14 @@ class SkillFrames:
             frames: their default poses, one for each name.
 
         Raises:
-            InputError: if a frame of the skill is missing.
+            InputError: if a frame of the skill is missing or not finite.
         """
         missing = [name for name in skill.frames if name not in frames]
         if missing:
             raise InputError(f"the skill {skill.name} needs the frame {missing[0]}: give its pose")
         self._names = skill.frames
         self._indices = [
-            system.DeclareNumericParameter(BasicVector(transform_to_pose(frames[name]))) for name in skill.frames
+            system.DeclareNumericParameter(BasicVector(_checked_pose(name, frames[name]))) for name in skill.frames
         ]
         self._cache = declare_cache(
             system, "skill_frames", self._calc, prerequisites_of_calc={system.all_parameters_ticket()}
@@ -58,16 +58,22 @@ class SkillFrames:
         """Moves frames in the system's context; those that are not named stay where they are.
 
         Raises:
-            InputError: if the skill has no such frame.
+            InputError: if the skill has no such frame, or a pose is not finite.
         """
         for name, X_WF in frames.items():
             if name not in self._names:
                 raise InputError(f"the skill has no frame {name}, only {', '.join(self._names)}")
             index = self._indices[self._names.index(name)]
-            context.get_mutable_numeric_parameter(index).SetFromVector(transform_to_pose(X_WF))
+            context.get_mutable_numeric_parameter(index).SetFromVector(_checked_pose(name, X_WF))
 
     def _calc(self, context: Context) -> dict[str, RigidTransform]:
         return {
             name: pose_to_transform(np.asarray(context.get_numeric_parameter(index).CopyToVector()))
             for name, index in zip(self._names, self._indices, strict=True)
         }
+
+
+def _checked_pose(name: str, X_WF: RigidTransform) -> np.ndarray:
+    if not np.isfinite(X_WF.GetAsMatrix34()).all():
+        raise InputError(f"the frame {name} must be at a finite pose, not at {X_WF.translation()}")
+    return transform_to_pose(X_WF)

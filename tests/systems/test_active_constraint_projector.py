@@ -34,21 +34,23 @@ START = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
 class Rig:
     """The projector with its inputs at hand."""
 
-    def __init__(self, start=START, max_tracking_error=np.inf):
-        self.system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD, max_tracking_error)
+    def __init__(self, start=START, max_tracking_error=np.inf, skill=SKILL):
+        self.system = ActiveConstraintProjector(skill, FRAMES, PERIOD, max_tracking_error)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        self.system.get_state_input_port().FixValue(self.context, [0.0])
+        self.state = self.system.get_state_input_port().FixValue(self.context, [0.0])
         self.measured = self.system.get_pose_input_port().FixValue(self.context, start)
         self.request = self.system.get_requested_pose_input_port().FixValue(self.context, start)
         self.simulator.Initialize()
         self.steps = 0
 
-    def step(self, request, measured=None):
+    def step(self, request, measured=None, state=None):
         """One control step: what was commanded during it, and whether that was a repetition."""
         # The request comes from a hold: it changes with the events of an instant, not before them.
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
         self.request.GetMutableData().set_value(request)
+        if state is not None:
+            self.state.GetMutableData().set_value([state])
         if measured is not None:
             self.measured.GetMutableData().set_value(measured)
         self.steps += 1
@@ -120,9 +122,10 @@ def test_a_command_is_taken_in_once_at_each_instant():
 def test_a_request_that_is_not_finite_repeats_the_last_safe_command():
     rig = Rig()
     before, _ = rig.step(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
-    desired, fallback = rig.step(np.full(6, np.nan))
-    assert fallback == 1.0
-    np.testing.assert_array_equal(desired, before)
+    for request in (np.full(6, np.nan), START + [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]):
+        desired, fallback = rig.step(request)
+        assert fallback == 1.0
+        np.testing.assert_array_equal(desired, before)
 
 
 def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
@@ -137,6 +140,109 @@ def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
     desired, fallback = rig.step(START)
     assert fallback == 0.0
     assert desired[0] < 0.02
+
+
+# The second state's floor is a little above where the first one's transition happens, but within reach of a period.
+RAISED = parse_skill("""
+name: step
+inputs: 3
+frames: [slab]
+max_speed_m_per_s: 0.5
+max_speed_rad_per_s: 1.0
+states:
+  above:
+    input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5}]
+    active_constraints: [{kind: keep_above, frame: slab, height_m: 0.1}]
+    transition_distance: {kind: height, frame: slab}
+    starts_at_m: 1.0
+    transitions: [{to: higher, below_m: 0.3}]
+  higher:
+    input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5}]
+    active_constraints: [{kind: keep_above, frame: slab, height_m: 0.302}]
+    transition_distance: {kind: height, frame: slab}
+    starts_at_m: 0.3
+    ends_at_m: 0.0
+""")
+NOWHERE = np.full(6, np.nan)
+DOWN = START + [0.0, 0.0, -0.1, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("request_", "measured"), [(DOWN, START - [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]), (NOWHERE, START), (DOWN, NOWHERE)]
+)
+def test_constraints_hold_while_it_waits_across_a_transition(request_, measured):
+    rig = Rig(max_tracking_error=0.01, skill=RAISED)
+    assert RAISED.can_enter(1, pose_to_transform(rig.desired()), FRAMES, PERIOD)
+    before, _ = rig.step(START, measured=measured)
+    for _ in range(5):
+        desired, fallback = rig.step(request_, state=1.0)
+        assert fallback == 1.0
+        assert rig.value("commanded_violation") <= 1e-9
+        assert np.linalg.norm(desired[:3] - before[:3]) <= 0.5 * PERIOD * (1 + 1e-9)
+        before = desired
+    np.testing.assert_allclose(desired, [0.0, 0.0, 0.302, 0.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_an_object_that_is_moved_while_it_waits_leads_the_command_inside_no_faster_than_allowed():
+    rig = Rig(max_tracking_error=0.02)
+    rig.step(START, measured=START + [0.0, 0.0, -0.05, 0.0, 0.0, 0.0])
+    rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.3])})
+    # The command that is over is the last of before the object was moved.
+    last, _ = rig.step(START)
+    for _ in range(30):
+        desired, fallback = rig.step(START)
+        assert fallback == 1.0
+        assert np.linalg.norm(desired - last) <= 0.5 * PERIOD * (1 + 1e-9)
+        last = desired
+    assert desired[2] == pytest.approx(0.4)
+    assert rig.value("commanded_violation") <= 1e-9
+
+
+@pytest.mark.parametrize("nowhere", [NOWHERE, START + [0.0, 0.0, 0.0, 0.0, np.nan, 0.0]])
+@pytest.mark.parametrize("max_tracking_error", [0.02, np.inf])
+def test_waits_for_a_robot_whose_pose_is_no_number(max_tracking_error, nowhere):
+    rig = Rig(max_tracking_error=max_tracking_error)
+    away = START + [0.001, 0.0, 0.0, 0.0, 0.0, 0.0]
+    before, _ = rig.step(START, measured=nowhere)
+    for _ in range(5):
+        desired, fallback = rig.step(away)
+        assert fallback == 1.0
+        np.testing.assert_array_equal(desired, before)
+    rig.step(away, measured=START)
+    desired, fallback = rig.step(away)
+    np.testing.assert_allclose(desired, away, atol=1e-15)
+    assert fallback == 0.0
+
+
+def test_refuses_to_begin_where_the_robot_is_nowhere():
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        Rig(start=START + [0.0, np.nan, 0.0, 0.0, 0.0, 0.0])
+
+
+def test_refuses_an_object_that_is_nowhere():
+    nowhere = {"slab": RigidTransform([0.0, np.nan, 0.0])}
+    with pytest.raises(InputError, match="frame slab must be at a finite pose"):
+        ActiveConstraintProjector(SKILL, nowhere, PERIOD)
+    rig = Rig()
+    with pytest.raises(InputError, match="frame slab must be at a finite pose"):
+        rig.system.frames.set(rig.context, nowhere)
+    rig.step(START)
+    assert rig.value("fallback") == 0.0
+
+
+def test_what_is_no_number_is_never_commanded_nor_remembered():
+    """Whoever writes an object's pose past `set`: the last command stays, and it goes on when there is one again."""
+    rig = Rig()
+    before, _ = rig.step(START)
+    sound = rig.context.get_numeric_parameter(0).CopyToVector()
+    rig.context.get_mutable_numeric_parameter(0).SetFromVector([*sound[:2], np.nan, *sound[3:]])
+    desired, fallback = rig.step(DOWN)
+    np.testing.assert_array_equal(desired, before)
+    assert fallback == 1.0
+    rig.context.get_mutable_numeric_parameter(0).SetFromVector(sound)
+    rig.step(DOWN)
+    assert rig.step(DOWN)[1] == 0.0
+    assert rig.desired()[2] < START[2]
 
 
 def test_a_robot_that_starts_outside_is_led_inside():

@@ -275,6 +275,18 @@ def test_damping_gives_every_mode_its_ratio():
         {"wrench_limits": np.zeros(6)},
         {"damping_ratio": 0.0},
         {"posture_stiffness": -1.0},
+        {"stiffness": np.diag([np.inf] * 6)},
+        {"stiffness": np.diag([np.nan] * 6)},
+        {"wrench_limits": np.full(6, np.nan)},
+        {"damping_ratio": np.inf},
+        {"damping_ratio": np.nan},
+        {"posture_stiffness": np.nan},
+        {"posture_stiffness": np.inf},
+        {"posture_damping": -1.0},
+        {"posture_damping": np.nan},
+        {"posture_damping": np.inf},
+        {"posture": np.full(7, np.nan)},
+        {"posture": np.array([0.0] * 6 + [np.inf])},
     ],
 )
 def test_refuses_what_makes_no_sense(wrong):

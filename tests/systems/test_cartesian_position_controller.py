@@ -22,13 +22,15 @@ def arm():
 
 
 class Commanded:
-    """The controller alone, its joint command started at `START`."""
+    """The controller alone, its joint command started at `START`, or at joint positions."""
 
-    def __init__(self, arm, **options):
+    def __init__(self, arm, q_start=None, **options):
         self.plant, model = arm
-        self.q_start = solve_inverse_kinematics(
-            self.plant, model.target, model.tool_centre, pose_to_transform(START), READY_POSTURE
-        )
+        if q_start is None:
+            q_start = solve_inverse_kinematics(
+                self.plant, model.target, model.tool_centre, pose_to_transform(START), READY_POSTURE
+            )
+        self.q_start = q_start
         self.system = CartesianPositionController(
             self.plant, model.target, model.tool_centre, posture=READY_POSTURE, **options
         )
@@ -130,6 +132,47 @@ def test_out_of_reach_it_stays_within_the_joints_limits(arm):
     assert np.isfinite(commanded.joints).all()
 
 
+def beyond(arm, posture, joint, by):
+    """A posture one of whose joints is beyond its upper limit, and the same one as far within it, with its pose."""
+    plant, model = arm
+    outside, inside = np.array(posture, dtype=float), np.array(posture, dtype=float)
+    outside[joint] = plant.GetPositionUpperLimits()[joint] + by
+    inside[joint] = plant.GetPositionUpperLimits()[joint] - by
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, inside)
+    return outside, transform_to_pose(model.tool_centre.CalcPose(context, model.target))
+
+
+BENT, STRETCHED = READY_POSTURE, np.zeros(7)
+
+
+@pytest.mark.parametrize("by", [1e-4, 0.02, 0.3])
+@pytest.mark.parametrize(("posture", "joint"), [(BENT, 1), (BENT, 3), (BENT, 5), (STRETCHED, 1)])
+def test_a_joint_beyond_its_limit_comes_back_without_a_leap(arm, posture, joint, by):
+    """An arm may have been moved there by hand; stretched, a posture is singular as well."""
+    q, goal = beyond(arm, posture, joint, by)
+    commanded = Commanded(arm, q)
+    commanded.command(goal)
+    limit = commanded.plant.GetVelocityUpperLimits()
+    for step in range(400):
+        before = commanded.joints
+        commanded.simulator.AdvanceTo((step + 0.5) * 0.01)
+        moved = commanded.joints - before
+        assert (np.abs(moved) / 0.01 <= limit + 1e-6).all()
+        assert moved[joint] <= 0.0 or commanded.joints[joint] <= commanded.plant.GetPositionUpperLimits()[joint]
+    assert (commanded.joints <= commanded.plant.GetPositionUpperLimits()).all()
+    np.testing.assert_allclose(commanded.pose, goal, atol=1e-3)
+
+
+def test_a_joint_beyond_its_limit_goes_no_farther(arm):
+    q, _ = beyond(arm, BENT, 3, 1e-4)
+    _, farther = beyond(arm, BENT, 3, -0.1)
+    commanded = Commanded(arm, q)
+    commanded.command(farther)
+    commanded.advance(1.0)
+    assert commanded.joints[3] <= q[3]
+
+
 def test_holds_its_joint_command_while_the_desired_pose_is_not_finite(arm):
     commanded = Commanded(arm)
     commanded.command(np.full(6, np.nan))
@@ -181,7 +224,19 @@ def test_command_times_change_nothing_while_commands_come(arm):
     np.testing.assert_array_equal(timed.joints, plain.joints)
 
 
-@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"posture": np.zeros(3)}, {"posture_gain": -1.0}, {"timeout": 0.0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"period": 0.0},
+        {"posture": np.zeros(3)},
+        {"posture": np.full(7, np.nan)},
+        {"posture": np.array([0.0] * 6 + [np.inf])},
+        {"posture_gain": -1.0},
+        {"posture_gain": np.nan},
+        {"posture_gain": np.inf},
+        {"timeout": 0.0},
+    ],
+)
 def test_refuses_what_makes_no_sense(arm, wrong):
     plant, model = arm
     with pytest.raises(InputError):

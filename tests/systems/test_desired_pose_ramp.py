@@ -10,13 +10,13 @@ MEASURED = np.array([0.1, -0.2, 0.3, 1.0, 0.0, 0.0])
 
 
 class Ramped:
-    def __init__(self, desired):
+    def __init__(self, desired, authority=0.0):
         self.system = DesiredPoseRamp(period=PERIOD, speed=SPEED, angular_speed=ANGULAR_SPEED)
         self.simulator = Simulator(self.system)
         context = self.simulator.get_mutable_context()
         self.desired = self.system.get_desired_pose_input_port().FixValue(context, desired)
         self.pose = self.system.get_pose_input_port().FixValue(context, MEASURED)
-        self.authority = self.system.get_authority_input_port().FixValue(context, [0.0])
+        self.authority = self.system.get_authority_input_port().FixValue(context, [authority])
         self.simulator.Initialize()
 
     def go(self, steps=1):
@@ -39,6 +39,25 @@ def test_stays_where_the_robot_is_while_it_stands_by():
     pushed = MEASURED + 0.05
     ramped.pose.GetMutableData().set_value(pushed)
     np.testing.assert_array_equal(ramped.go()[0], pushed)
+
+
+def test_where_there_is_authority_from_the_beginning_it_starts_where_the_robot_is():
+    ramped = Ramped(MEASURED + [10.0, 0.0, 0.0, 0.0, 0.0, 0.0], authority=1.0)
+    step = np.array([SPEED * PERIOD, 0.0, 0.0, 0.0, 0.0, 0.0])
+    first = ramped.system.get_limited_pose_output_port().Eval(ramped.simulator.get_context()).copy()
+    np.testing.assert_allclose(first, MEASURED + step, atol=1e-12)
+    np.testing.assert_allclose(np.diff([first, *ramped.go(4)], axis=0), np.tile(step, (4, 1)), atol=1e-12)
+
+
+def test_an_initialization_starts_where_the_robot_is_then():
+    ramped = Ramped(MEASURED).take_over()
+    ramped.go(3)
+    elsewhere = MEASURED + [0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
+    for port in (ramped.pose, ramped.desired):
+        port.GetMutableData().set_value(elsewhere)
+    ramped.simulator.get_mutable_context().SetTime(0.0)
+    ramped.simulator.Initialize()
+    np.testing.assert_array_equal(ramped.go(2), [elsewhere, elsewhere])
 
 
 def test_goes_from_there_along_a_straight_line_never_faster_than_it_may():

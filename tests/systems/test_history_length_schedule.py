@@ -42,6 +42,31 @@ def test_torques_are_no_contact():
     assert lengths_under([0.0] * 5) == [10] * 5
 
 
+def test_a_force_at_the_threshold_is_no_contact_yet():
+    assert lengths_under([2.0] * 3) == [10] * 3
+
+
+def test_a_force_that_is_no_number_is_contact():
+    assert lengths_under([np.nan] * 3) == [2, 1, 1]
+    assert lengths_under([3.0] * 3 + [np.nan] * 4, dwell_steps=2) == [2, 1, 1, 1, 1, 1, 1]
+
+
+def test_an_initialization_begins_with_the_longest_in_free_space():
+    system = HistoryLengthSchedule([1, 5], PERIOD, dwell_steps=2)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    wrench = system.get_wrench_input_port().FixValue(context, [5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    length = system.get_history_length_output_port()
+    simulator.AdvanceTo(2 * PERIOD)
+    assert length.Eval(context)[0] == 1
+    context.SetTime(0.0)
+    wrench.GetMutableData().set_value([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])  # which ends no contact, and begins none
+    simulator.Initialize()
+    assert length.Eval(context)[0] == 5
+    simulator.AdvanceTo(2 * PERIOD)
+    assert length.Eval(context)[0] == 5
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

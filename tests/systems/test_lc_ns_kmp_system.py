@@ -188,6 +188,42 @@ def test_first_fallback_is_within_the_constraints():
     assert system.get_output_output_port().Eval(context)[0] <= -0.5 + 1e-9
 
 
+def test_an_initialization_begins_at_the_first_step_with_the_first_safe_command():
+    p = primitive(history=0)
+
+    def never(*arguments):
+        raise UnsolvableError("no")
+
+    predict = p.predict
+    system = LcNsKmpSystem(p, None, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    action = system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    simulator.AdvanceTo(20.5 * PERIOD)
+    p.predict = never
+    context.SetTime(0.0)
+    action.GetMutableData()  # what was evaluated is not known to be the same any more
+    simulator.Initialize()
+    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), p.reference.means[0])
+    p.predict = predict
+    action.GetMutableData()
+    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), predict(0, np.zeros(2)).output)
+    context.SetTime(7 * PERIOD)
+    simulator.Initialize()
+    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), predict(7, np.zeros(2)).output)
+
+
+@pytest.mark.parametrize("length", [2.0, 4.0, 0.0, 1.5, np.nan])
+def test_refuses_the_length_of_a_history_that_no_primitive_has(length):
+    system = LcNsKmpSystem(primitive(history=3), None, PERIOD, shorter=[(primitive(history=1), np.ones(2))])
+    context = system.CreateDefaultContext()
+    system.get_null_space_action_input_port().FixValue(context, np.zeros(2))
+    system.get_history_input_port().FixValue(context, np.zeros(6))
+    system.get_history_length_input_port().FixValue(context, [length])
+    with pytest.raises(InputError, match="only with 1, 3"):
+        system.get_output_output_port().Eval(context)
+
+
 def test_the_history_length_selects_the_primitive_which_gets_the_newest_part():
     longest, short = primitive(history=3), primitive(history=1)
     gains = {3: np.array([3.0, 5.0]), 1: np.array([7.0, -2.0])}

@@ -49,6 +49,26 @@ def test_noise_has_the_size_that_was_asked_for_and_repeats_with_its_seed():
     assert not np.allclose(readings(seed=4, noise=np.array([0.1])) - TIMES, first)
 
 
+def test_an_initialization_begins_anew():
+    """Noise repeats with its seed, and nothing that was measured before comes late."""
+    sensor = SensorDisturbance(PERIOD, np.ones(2), delay=3)
+    simulator = Simulator(sensor)
+    context = simulator.get_mutable_context()
+    measured = sensor.get_measured_input_port().FixValue(context, np.full(2, 5.0))
+    episodes = []
+    for value in (5.0, 7.0):
+        measured.GetMutableData().set_value(np.full(2, value))
+        context.SetTime(0.0)
+        simulator.Initialize()
+        readings = [sensor.get_disturbed_output_port().Eval(context).copy()]
+        for step in range(3):
+            simulator.AdvanceTo((step + 0.5) * PERIOD)
+            readings.append(sensor.get_disturbed_output_port().Eval(context) - value * (step == 2))
+        episodes.append(readings)
+    np.testing.assert_array_equal(episodes[0][0], 0.0)
+    np.testing.assert_allclose(episodes[1], episodes[0], atol=1e-12)
+
+
 @pytest.mark.parametrize("wrong", [{"noise": np.array([-1.0])}, {"noise": np.zeros(1), "delay": -1}])
 def test_what_makes_no_sense_is_refused(wrong):
     with pytest.raises(InputError):

@@ -161,7 +161,13 @@ def test_every_fault_is_in_words():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"velocity": ()}, {"max_age": 0.0}, {"position_jump": np.nan}, {"settling": -1.0}, {"clock_drift": -1.0}]
+    "wrong",
+    [
+        {"velocity": ()},
+        {"max_age": 0.0},
+        {"position_jump": np.nan},
+        *({name: value} for name in ("settling", "clock_drift") for value in (-1.0, np.nan, np.inf)),
+    ],
 )
 def test_refuses_limits_that_make_no_sense(wrong):
     with pytest.raises(InputError):

@@ -148,11 +148,58 @@ def test_is_not_told_to_leave_the_workspace(plant):
     assert guarded.fault == Fault.WORKSPACE
 
 
-@pytest.mark.parametrize("port", ["state", "external_torque", "wrench", "pose", "desired_pose"])
-def test_what_is_no_number_is_within_no_limit(plant, port):
+POSITION, VELOCITY = [*([np.nan] * n), *SPEED], [*POSTURE, *([np.nan] * n)]
+NO_NUMBER = {
+    "torque": ({"torque": np.full(n, np.nan)}, Fault.TORQUE),
+    "positions": ({"state": POSITION}, Fault.NOT_FINITE),
+    "velocities": ({"state": VELOCITY}, Fault.NOT_FINITE),
+    "infinite velocity": ({"state": [*POSTURE, *SPEED[:-1], np.inf]}, Fault.NOT_FINITE),
+    "external_torque": ({"external_torque": np.full(n, np.nan)}, Fault.EXTERNAL_TORQUE),
+    "wrench": ({"wrench": np.full(6, np.nan)}, Fault.FORCE),
+    "pose": ({"pose": np.full(6, np.nan)}, Fault.WORKSPACE),
+    "desired_pose": ({"desired_pose": np.full(6, np.nan)}, Fault.WORKSPACE),
+    "status_age": ({"status_age": [np.nan]}, Fault.STALE),
+}
+
+
+@pytest.mark.parametrize("authority", ["none", "some", "all"])
+@pytest.mark.parametrize("what", NO_NUMBER)
+def test_what_is_no_number_is_within_no_limit_and_what_is_sent_is_one(plant, what, authority):
+    """Whether the arm waits, takes over or runs, when it stops and until it is off."""
+    wrong, fault = NO_NUMBER[what]
+    guarded = Guarded(plant, running=authority == "all")
+    if authority != "all":
+        guarded.simulator.Initialize()
+        guarded.go(0.5 * LIMITS.ramp_time if authority == "some" else 0.0)
+    guarded.set(**wrong)
+    assert np.isfinite(guarded["safe_torque"]).all()
+    if authority == "none" and what == "desired_pose":
+        return  # nobody is told to go anywhere yet
+    assert guarded.fault == fault
+    for _ in range(round(LIMITS.damping_time / PERIOD) + 4):
+        guarded.go(PERIOD)
+        assert np.isfinite(guarded["safe_torque"]).all()
+        assert guarded.fault == fault
+    assert guarded.phase == (Phase.WAITING if authority == "none" else Phase.OFF)
+
+
+@pytest.mark.parametrize("wrong", [{"state": POSITION}, {"state": VELOCITY}, {"status_age": [np.nan]}])
+def test_a_speed_that_nobody_knows_is_not_damped(plant, wrong):
     guarded = Guarded(plant)
-    guarded.set(**{port: np.full(len(guarded.ok[port]), np.nan)})
-    assert guarded.fault != Fault.NONE
+    guarded.set(status_fault=[Fault.NOT_FINITE], **wrong)
+    for _ in range(3):
+        np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
+        guarded.go(PERIOD)
+    assert guarded.phase == Phase.DAMPING
+
+
+def test_torques_that_come_out_as_no_numbers_are_none(plant):
+    """From whatever in the state, which a station before this one may have left."""
+    guarded = Guarded(plant)
+    guarded.set(status_fault=[Fault.STALE], status_is_new=[0.0])
+    assert guarded["safe_torque"].any()
+    guarded.context.SetDiscreteState(1, np.full(n, np.nan))
+    np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
 
 
 def test_does_not_go_on_while_something_is_wrong(plant):
@@ -217,11 +264,12 @@ def test_a_speed_of_long_ago_is_not_damped(plant, age, has_torque):
 def test_what_is_wanted_of_an_arm_that_is_not_seen_fades(plant):
     guarded = Guarded(plant)
     sent = []
-    for age in (0.0, 1.0, 1.5, 2.0, 3.0):
+    for age in (0.0, 1.0, 1.5, 2.0, 3.0, np.inf):
         guarded.set(status_age=[age * PERIOD])
         sent.append(guarded["safe_torque"])
     wanted = guarded.ok["torque"]
-    np.testing.assert_allclose(sent, np.outer([1.0, 1.0, 0.5, 0.0, 0.0], wanted))
+    np.testing.assert_allclose(sent, np.outer([1.0, 1.0, 0.5, 0.0, 0.0, 0.0], wanted))
+    assert guarded.fault == Fault.NONE
 
 
 def test_a_silent_robot_is_sent_no_torque_and_then_nothing(plant):
@@ -339,7 +387,7 @@ def test_outputs_have_the_sizes_that_they_say_and_depend_at_once_on_no_more(plan
     measured = {"state", "external_torque", "wrench", "pose", "desired_pose", "torque"}
     assert at_once == {
         "safe_torque": measured | {"status_fault", "status_age", "status_is_new"},
-        "fault": measured | {"status_fault"},
+        "fault": measured | {"status_fault", "status_age"},
         "phase": set(),
         "authority": set(),
         "sending": {"status_fault"},

@@ -16,7 +16,6 @@ from guiderail.tools.report import figures
 from guiderail.tools.report.gather import LEARNED, Gathered, Run, command, finite, flat, gather
 from guiderail.tools.report.statistics import interquartile_mean, median_survival, survival, wilson_of_each
 from guiderail.tools.rollouts.metrics import TOLERANCE, converged_after
-from guiderail.tools.studies.declaration import shipped_studies
 from guiderail.tools.tables import cell
 from guiderail.tools.thesis import differences
 
@@ -263,12 +262,15 @@ def _commands(gathered: Gathered, paths: Sequence[Path]) -> tuple[list[str], lis
 def _studies(judged: pd.DataFrame) -> list[str]:
     """What repeats the studies of a table; a part of one, whose table's name goes on after a dash, with its methods."""
     found = []
-    known = {*(judged["study"] if len(judged) else ()), *shipped_studies()}
-    for name, rows in judged.groupby("study", sort=False) if len(judged) else ():
-        whole = next((one for one in sorted(known) if str(name).startswith(f"{one}-")), name)
-        methods, seeds = (",".join(map(str, dict.fromkeys(rows[column]))) for column in ("method", "seed"))
-        part = f" --methods {methods} --seeds {seeds}" if whole != name else ""
-        found.append(f"guiderail study {whole}{part} --out studies")
+    names = [str(name) for name in dict.fromkeys(judged["study"])] if len(judged) else []
+    for name in names:
+        rows = judged[judged["study"] == name]
+        methods, seeds = ([str(one) for one in dict.fromkeys(rows[column])] for column in ("method", "seed"))
+        parts = ("-".join(chosen) for chosen in ([*methods, *seeds], methods, seeds))
+        wholes = [one for one in names if name.startswith(f"{one}-")]
+        wholes += [name.removesuffix(f"-{part}") for part in parts if name.endswith(f"-{part}")]
+        part = f" --methods {','.join(methods)} --seeds {','.join(seeds)}" if wholes else ""
+        found.append(f"guiderail study {[*wholes, name][0]}{part} --out studies")
     return found
 
 

@@ -108,6 +108,9 @@ def test_rows_of_a_part_of_a_study_are_counted_once_and_its_command_says_so(stud
     assert "beads-learner-1-5: learner 3 held out 2/10" in text
     assert "guiderail study beads --methods learner --seeds 5 --out studies" in text
     assert "Policies that learned nothing" not in text
+    (folder / "beads.csv").unlink()
+    text = text_of(write_report([folder], tmp_path / "page.html").read_text())
+    assert "guiderail study beads --methods learner --seeds 1,5 --out studies" in text
 
 
 def test_runs_in_folders_of_one_name_go_into_different_ones(studied, tmp_path):
