@@ -60,6 +60,9 @@ def import_recording(
         found, kind = read_csv_files(source, target=target, **of_csv), "CSV files"
     else:
         raise InputError(f"{source} is no LeRobot dataset, bag, .mcap or .csv file, nor a folder of them")
+    given = [name for name, value in of_csv.items() if value is not None]
+    if given and kind != "CSV files":
+        raise InputError(f"{kind} say themselves what --{given[0].replace('_', '-')} would: leave it out")
     demonstrations = Demonstrations(found.times, found.outputs, found.names)
     if rate is not None:
         demonstrations = _at_rate(demonstrations, rate)

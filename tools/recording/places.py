@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,6 +23,15 @@ def is_there(path: Path) -> bool:
         return path.exists()
     except OSError as error:
         raise InputError(f"the path {brief(str(path))} can't be read ({error.strerror}): check it") from error
+
+
+def in_order(paths: Iterable[Path]) -> list[Path]:
+    """Sorted by name, and numbers in a name by their size: recording_2 comes before recording_10."""
+
+    def key(path: Path) -> list[tuple[int, str]]:
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+    return sorted(paths, key=key)
 
 
 def check_new(out: Path, what: str) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.recording.places import is_there
+from guiderail.tools.recording.places import in_order, is_there
 
 ENDINGS = (".npz", ".csv")
 
@@ -18,7 +18,7 @@ def load_demonstrations(path: Path) -> Demonstrations:
         InputError: if there are none, or what is there makes no sense.
     """
     if is_there(path) and path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix in ENDINGS)
+        files = in_order(file for file in path.iterdir() if file.suffix in ENDINGS)
         if not files:
             raise InputError(f"there is no file {' or '.join(ENDINGS)} in {path}: name a folder of demonstrations")
         parts = [load_demonstrations(file) for file in files]

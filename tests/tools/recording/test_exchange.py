@@ -260,3 +260,21 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"16 numbers.*--rate"):
         import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
     assert not (tmp_path / "a.npz").exists()
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_what_is_for_tables_is_refused_of_others(kind, file, tmp_path):
+    export_demonstrations(file, tmp_path / "set", kind)
+    with pytest.raises(InputError, match="say themselves what --unit would"):
+        import_recording(tmp_path / "set", tmp_path / "again.npz", unit="mm")
+    assert not (tmp_path / "again.npz").exists()
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_a_dozen_demonstrations_keep_their_order(kind, tmp_path):
+    t = 0.1 * np.arange(6)
+    Demonstrations([t] * 12, [np.full((6, 1), float(k)) for k in range(12)]).save(tmp_path / "many.npz")
+    export_demonstrations(tmp_path / "many.npz", tmp_path / "set", kind)
+    import_recording(tmp_path / "set", tmp_path / "again.npz")
+    again = Demonstrations.load(tmp_path / "again.npz")
+    assert [one[0, 0] for one in again.outputs] == list(range(12))

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.errors import InputError, brief
 from guiderail.tools.recording.formats.recorded import POSE_NAMES, UNITS, Recorded, poses_in_target, rotations_of
+from guiderail.tools.recording.places import in_order
 
 TIME = re.compile(r"(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -46,7 +47,7 @@ def read_csv_files(
     Raises:
         InputError: if a file is none, doesn't say what only whoever recorded it knows, or says something else.
     """
-    files = [path] if path.is_file() else sorted(path.glob("*.csv"))
+    files = [path] if path.is_file() else in_order(path.glob("*.csv"))
     if not files:
         raise InputError(f"there is no .csv file in {path}: name a file, or a folder of them")
     found = Recorded([], [], ())

@@ -18,7 +18,7 @@ from guiderail.tools.recording.formats.recorded import (
     poses_in_target,
     rotations_of,
 )
-from guiderail.tools.recording.places import whole_folder
+from guiderail.tools.recording.places import in_order, whole_folder
 
 # Where a pose is in a message of each type that robots commonly publish.
 POSES = {
@@ -49,7 +49,7 @@ def find_bags(path: Path) -> list[Path]:
     """The bags at a path: itself, or those in the folder, sorted by name."""
     if path.suffix == ".mcap" or (path / "metadata.yaml").is_file():
         return [path]
-    return sorted(one for one in path.iterdir() if one.suffix == ".mcap" or (one / "metadata.yaml").is_file())
+    return in_order(one for one in path.iterdir() if one.suffix == ".mcap" or (one / "metadata.yaml").is_file())
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:
