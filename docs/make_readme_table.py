@@ -54,6 +54,11 @@ TASKS: dict[str, list[Row]] = {
         Row("residual RL", "connector_guidance", "residual"),
         *_nulls("connector_nulls", ("demonstrations", "white", "best_constant", "rule"), "calibration"),
     ],
+    "**connector**, the thesis to the letter": [
+        Row("KGRL", "connector_thesis", "kgrl"),
+        Row("sKGRL", "connector_thesis", "skgrl"),
+        *_nulls("connector_thesis", ("demonstrations", "white"), names=NULLS[:2]),
+    ],
     "**connector**, another offset in every episode": [
         Row("KGRL", "connector_disc", "kgrl"),
         Row("sKGRL", "connector_disc", "skgrl"),

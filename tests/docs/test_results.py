@@ -164,3 +164,14 @@ def test_at_a_finer_contact_what_was_learned_at_hard_is_hardly_harder_in_the_oth
     for method in ("kgrl", "skgrl_adaptive"):
         kept = of("connector_hard_fine", method)[["worst_violation", "training_worst_violation"]]
         assert (kept <= TOLERANCE).all(axis=None)
+
+
+def test_the_thesis_to_the_letter_is_not_reproduced():
+    kgrl, skgrl, white = (of("connector_thesis", method) for method in ("kgrl", "skgrl", "white"))
+    assert (100 * kgrl["success_rate"]).round().tolist() == [6, 60, 17]
+    assert kgrl["training_success_rate"].between(0.55, 0.65).all()
+    assert (skgrl[["success_rate", "training_success_rate"]] == 0.0).all(axis=None)
+    assert white["success_rate"].between(0.37, 0.70).all()
+    for rows in (kgrl, skgrl):
+        assert (rows["training_episodes"] == 45).all()
+        assert (rows[["worst_violation", "training_worst_violation"]] <= TOLERANCE).all(axis=None)
