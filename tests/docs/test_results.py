@@ -166,6 +166,32 @@ def test_at_a_finer_contact_what_was_learned_at_hard_is_hardly_harder_in_the_oth
         assert (kept <= TOLERANCE).all(axis=None)
 
 
+def test_at_other_frictions_what_was_learned_at_the_finer_contact_loses_little_and_the_rule_much():
+    found = {
+        (method, friction): (
+            100 * of("connector_hard_fine_transfer", method, f"MuJoCo, friction × {friction}")["success_rate"]
+        )
+        .round()
+        .tolist()
+        for method in ("kgrl", "skgrl_adaptive", "rule", "white", "demonstrations")
+        for friction in (0.5, 1.5)
+    }
+    assert found == {
+        ("kgrl", 0.5): [79, 91, 95, 93, 93],
+        ("kgrl", 1.5): [77, 98, 98, 98, 96],
+        ("skgrl_adaptive", 0.5): [83, 97, 98, 91, 90],
+        ("skgrl_adaptive", 1.5): [86, 99, 97, 93, 90],
+        ("rule", 0.5): [97],
+        ("rule", 1.5): [58],
+        ("white", 0.5): [12],
+        ("white", 1.5): [5],
+        ("demonstrations", 0.5): [0],
+        ("demonstrations", 1.5): [0],
+    }
+    for method in ("kgrl", "skgrl_adaptive"):
+        assert (of("connector_hard_fine_transfer", method)["worst_violation"] <= TOLERANCE).all()
+
+
 def test_the_thesis_to_the_letter_is_not_reproduced():
     kgrl, skgrl, white = (of("connector_thesis", method) for method in ("kgrl", "skgrl", "white"))
     assert (100 * kgrl["success_rate"]).round().tolist() == [6, 60, 17]
