@@ -192,6 +192,34 @@ def test_at_other_frictions_what_was_learned_at_the_finer_contact_loses_little_a
         assert (of("connector_hard_fine_transfer", method)["worst_violation"] <= TOLERANCE).all()
 
 
+def swept(study, method, quantity, value):
+    """Success of all seeds of a method [%]."""
+    rows = of(study, method, f"{quantity} {value}")
+    return round(100 * float((rows["success_rate"] * rows["episodes"]).sum() / rows["episodes"].sum()))
+
+
+def test_the_connector_breaks_where_actions_end_and_residual_learning_where_less_force_is_allowed():
+    distance, force = "distance of the jack [mm]", "force limit [N]"
+    assert [swept("connector_sweep", "kgrl", distance, at) for at in (0.5, 1.5)] == [85, 80]
+    for method in ("kgrl", "skgrl_adaptive", "residual"):
+        assert swept("connector_sweep", method, distance, 3.25) == 100
+        assert swept("connector_sweep", method, distance, 3.75) <= 60
+    for method in ("kgrl", "skgrl_adaptive", "rule"):
+        assert [swept("connector_sweep", method, force, at) for at in (20, 15, 13, 11)] == [100, 100, 100, 0]
+    assert [swept("connector_sweep", "residual", force, at) for at in (20, 15, 13, 11)] == [100, 70, 0, 0]
+    for quantity, values in (("mouth chamfer [mm]", (0.4, 0.2, 0.1, 0.05)), ("friction", (0.1, 0.2, 0.3, 0.4))):
+        for method in ("kgrl", "skgrl_adaptive", "residual", "rule"):
+            assert min(swept("connector_sweep", method, quantity, at) for at in values) >= 90
+
+
+def test_the_clamp_takes_nine_newtons_and_white_noise_fifteen():
+    force, chamfers = "force limit [N]", "holes' and pegs' chamfers together [mm]"
+    assert [swept("grid_clamp_sweep", "sct", force, at) for at in (35, 10, 9)] == [100, 100, 100]
+    assert [swept("grid_clamp_sweep", "white", force, at) for at in (35, 15, 10)] == [91, 91, 4]
+    assert swept("grid_clamp_sweep", "sct", chamfers, 0.5) == 91
+    assert swept("grid_clamp_sweep", "rule", chamfers, 0.5) == 67
+
+
 def test_the_thesis_to_the_letter_is_not_reproduced():
     kgrl, skgrl, white = (of("connector_thesis", method) for method in ("kgrl", "skgrl", "white"))
     assert (100 * kgrl["success_rate"]).round().tolist() == [6, 60, 17]
