@@ -81,6 +81,8 @@ def figure_3_7(out: Path, seeds: int = 5, episodes: int | None = None) -> dict[s
     for axis, (words, series) in zip(axes, values.items(), strict=True):
         draw_runs(axis, series, colour=shade, label=f"{name} ({len(runs)} runs)")
         axis.set(xlabel="episode", ylabel=f"{words} (mean of 10)")
+        if words.endswith("rate"):
+            axis.set_ylim(-0.04, 1.04)
     return {**leave(out, "figure_3_7", figure, rows), **_poured(rows), "condition": POURING}
 
 
