@@ -220,6 +220,20 @@ def test_the_clamp_takes_nine_newtons_and_white_noise_fifteen():
     assert swept("grid_clamp_sweep", "rule", chamfers, 0.5) == 67
 
 
+def test_who_does_not_look_breaks_where_the_mug_is_beside():
+    found = {
+        method: [
+            swept("pouring_sweep", method, "mug beside where the template believes it is [mm]", at)
+            for at in (0, 15, 25, 35, 45, 60)
+        ]
+        for method in ("rl_sct", "rule", "blind_rule", "white", "zero", "best_constant")
+    }
+    assert found["rl_sct"] == [100, 100, 93, 97, 97, 87]
+    assert found["rule"] == [100] * 6
+    assert found["blind_rule"] == [100, 100, 80, 33, 10, 0]
+    assert found["white"] == found["zero"] == found["best_constant"] == [0] * 6
+
+
 def test_the_thesis_to_the_letter_is_not_reproduced():
     kgrl, skgrl, white = (of("connector_thesis", method) for method in ("kgrl", "skgrl", "white"))
     assert (100 * kgrl["success_rate"]).round().tolist() == [6, 60, 17]
