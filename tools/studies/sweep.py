@@ -30,7 +30,8 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
         rows: of its table; of a method that is judged at several marks the last one counts.
         path: the picture to write.
     """
-    figure, axes = new_figure(1, len(study.sweeps), (4.4 * len(study.sweeps), 3.6))
+    width = max(4.4 * len(study.sweeps), 1.3 * len(study.methods))  # the legend is one line
+    figure, axes = new_figure(1, len(study.sweeps), (width, 3.6))
     for axis, sweep in zip(axes.flat, study.sweeps, strict=True):
         for index, name in enumerate(study.methods):
             values, points = curve(sweep, rows, name)
