@@ -234,6 +234,14 @@ def test_who_does_not_look_breaks_where_the_mug_is_beside():
     assert found["white"] == found["zero"] == found["best_constant"] == [0] * 6
 
 
+def test_the_hard_passage_is_not_learned_and_its_width_decides_nothing():
+    width, radius = "width of the gap [mm]", "radius of the obstacles [mm]"
+    for method, rate in (("kgrl", 32), ("skgrl", 32), ("residual", 0), ("rule", 100), ("white", 0)):
+        assert {swept("narrow_passage_sweep", method, width, at) for at in (60, 45, 30, 25, 20)} == {rate}
+    assert [swept("narrow_passage_sweep", "kgrl", radius, at) for at in (40, 60, 70, 80)] == [100, 100, 100, 32]
+    assert [swept("narrow_passage_sweep", "demonstrations", radius, at) for at in (40, 60, 70)] == [100, 32, 0]
+
+
 def test_the_thesis_to_the_letter_is_not_reproduced():
     kgrl, skgrl, white = (of("connector_thesis", method) for method in ("kgrl", "skgrl", "white"))
     assert (100 * kgrl["success_rate"]).round().tolist() == [6, 60, 17]

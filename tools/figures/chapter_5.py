@@ -357,9 +357,9 @@ def _first(shown: Shown, *, success: bool) -> Shown:
     """The first held-out episode that ends as is meant: white actions find the hole now and then. Nothing is drawn."""
     env = make_environment(shown.task, shown.environment)
     env.reset(seed=shown.run_seed)
-    act = shown.policy(env)
     try:
         for k in range(EPISODES):
+            act = shown.policy(env)  # anew, as where it is shown: who acts at random goes on in his stream otherwise
             if bool(rollout(env, act, seed=shown.seed + k, held_out=True)["success"]) == success:
                 return replace(shown, seed=shown.seed + k)
     finally:
