@@ -432,5 +432,7 @@ def figure_5_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[
             for part in ("linear", "angular")
             for which in ("commanded", "measured")
         },
-        "condition": CONNECTOR + "; gains calibrated by authority, not by RMS",
+        "condition": CONNECTOR
+        + "; each of the first eight episodes keeps to one action, which is smooth through either; gains calibrated by "
+        "authority, not by RMS (figure 5.5 and the study smoothness compare white actions at the same RMS)",
     }
