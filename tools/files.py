@@ -1,6 +1,10 @@
-"""Files that are either complete or not there, and pictures that can be written."""
+"""Files and folders that are either complete or not there, and whether they can be written."""
 
+import os
+import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from guiderail.models.errors import InputError
@@ -37,6 +41,27 @@ def check_writable(path: Path) -> None:
         with tempfile.TemporaryFile(dir=above):  # rights alone don't say it: root has them all
             pass
     except OSError as error:
-        raise InputError(
-            f"{path} cannot be written ({error.strerror or error}): choose a folder with room to write"
-        ) from error
+        raise _unwritable(path, error) from error
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """A folder to write into that becomes `out` in the end; if that fails there is none, so that one can try again.
+
+    Raises:
+        InputError: if it can't be written.
+    """
+    made = out.with_name(f".{out.name}.{os.getpid()}.part")
+    shutil.rmtree(made, ignore_errors=True)
+    try:
+        made.mkdir(parents=True)
+        yield made
+        made.rename(out)
+    except OSError as error:
+        raise _unwritable(out, error) from error
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"{path} cannot be written ({error.strerror or error}): choose a folder with room to write")

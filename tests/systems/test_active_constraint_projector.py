@@ -11,8 +11,7 @@ from guiderail.models.skills import parse_skill
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 
 PERIOD = 2.0**-7
-SKILL = parse_skill("""
-name: slab
+ABOVE = """
 inputs: 3
 frames: [slab]
 max_speed_m_per_s: 0.5
@@ -20,13 +19,18 @@ max_speed_rad_per_s: 1.0
 states:
   above:
     input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5}]
-    active_constraints:
+"""
+SKILL = parse_skill(
+    "name: slab"
+    + ABOVE
+    + """    active_constraints:
       - {kind: keep_above, frame: slab, height_m: 0.1}
       - {kind: fixed_orientation, frame: slab}
     transition_distance: {kind: height, frame: slab}
     starts_at_m: 1.0
     ends_at_m: 0.0
-""")
+"""
+)
 FRAMES = {"slab": RigidTransform()}
 START = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
 
@@ -143,16 +147,10 @@ def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
 
 
 # The second state's floor is a little above where the first one's transition happens, but within reach of a period.
-RAISED = parse_skill("""
-name: step
-inputs: 3
-frames: [slab]
-max_speed_m_per_s: 0.5
-max_speed_rad_per_s: 1.0
-states:
-  above:
-    input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5}]
-    active_constraints: [{kind: keep_above, frame: slab, height_m: 0.1}]
+RAISED = parse_skill(
+    "name: step"
+    + ABOVE
+    + """    active_constraints: [{kind: keep_above, frame: slab, height_m: 0.1}]
     transition_distance: {kind: height, frame: slab}
     starts_at_m: 1.0
     transitions: [{to: higher, below_m: 0.3}]
@@ -162,7 +160,8 @@ states:
     transition_distance: {kind: height, frame: slab}
     starts_at_m: 0.3
     ends_at_m: 0.0
-""")
+"""
+)
 NOWHERE = np.full(6, np.nan)
 DOWN = START + [0.0, 0.0, -0.1, 0.0, 0.0, 0.0]
 

@@ -29,7 +29,7 @@ from guiderail.models.parts.model_files import obj_text
 from guiderail.models.parts.pieces import as_arrays, convex_pieces
 from guiderail.models.parts.sides import sides
 from guiderail.models.units import DEGREE, MM
-from guiderail.tools.files import check_writable
+from guiderail.tools.files import check_writable, whole_folder
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 MODULI = (2e9, 1e10, 3e10)  # [Pa] of what is compliant, tried in this order until it is stiff enough
@@ -161,17 +161,8 @@ def onboard(
     snapping = _snapping(*parts, path)
     say(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
     say(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
-    made = out.with_name(f".{out.name}.part")
-    shutil.rmtree(made, ignore_errors=True)
-    try:
-        made.mkdir(parents=True)
-    except OSError as error:
-        raise InputError(f"{out} cannot be made ({error.strerror}): choose a folder with room to write") from error
-    try:
+    with whole_folder(out) as made:
         measured = _make(made, out.name, parts, path, clearance, snapping, force_limit, friction, scenario, say)
-        made.rename(out)
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
     return {"task": str(out), **measured, "page": str(out / "preview.html")}
 
 

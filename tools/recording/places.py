@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 
 from guiderail.models.errors import InputError, brief
@@ -43,24 +40,3 @@ def check_new(out: Path, what: str) -> None:
     if is_there(out):
         raise InputError(f"{out} already exists: name another {what}")
     check_writable(out)
-
-
-@contextmanager
-def whole_folder(out: Path) -> Iterator[Path]:
-    """A folder to write into that becomes `out` in the end; if that fails there is none, so that one can try again.
-
-    Raises:
-        InputError: if it can't be written.
-    """
-    made = out.with_name(f".{out.name}.{os.getpid()}.part")
-    shutil.rmtree(made, ignore_errors=True)
-    try:
-        made.mkdir(parents=True)
-        yield made
-        made.rename(out)
-    except OSError as error:
-        raise InputError(
-            f"{out} cannot be written ({error.strerror or error}): choose a folder with room to write"
-        ) from error
-    finally:
-        shutil.rmtree(made, ignore_errors=True)

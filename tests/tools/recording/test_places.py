@@ -3,7 +3,8 @@
 import pytest
 
 from guiderail.models.errors import InputError
-from guiderail.tools.recording.places import check_new, is_there, whole_folder
+from guiderail.tools.files import whole_folder
+from guiderail.tools.recording.places import check_new, is_there
 from guiderail.tools.recording.record import record
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from guiderail.models.errors import InputError
 from guiderail.models.primitives import Demonstrations
+from guiderail.tools.files import whole_folder
 from guiderail.tools.recording.formats.recorded import Recorded, choose_signal, from_zero
-from guiderail.tools.recording.places import whole_folder
 
 VERSION = "v3.0"
 INFO = Path("meta") / "info.json"

@@ -10,6 +10,7 @@ import numpy as np
 
 from guiderail.models.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
+from guiderail.tools.files import whole_folder
 from guiderail.tools.recording.formats.recorded import (
     POSE_NAMES,
     Recorded,
@@ -18,7 +19,7 @@ from guiderail.tools.recording.formats.recorded import (
     poses_in_target,
     rotations_of,
 )
-from guiderail.tools.recording.places import in_order, whole_folder
+from guiderail.tools.recording.places import in_order
 
 # Where a pose is in a message of each type that robots commonly publish.
 POSES = {
