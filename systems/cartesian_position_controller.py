@@ -104,7 +104,7 @@ class CartesianPositionController(LeafSystem):
             timeout: age beyond which a desired pose is stale [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: if an argument is out of range. At initialization, if a measured position is not finite.
         """
         super().__init__()
         check_period(period)
@@ -180,7 +180,12 @@ class CartesianPositionController(LeafSystem):
         return context.get_discrete_state(self._command).value()
 
     def _start_at_measured_positions(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._command, self._positions_port.Eval(context))
+        measured = self._positions_port.Eval(context)
+        if not np.isfinite(measured).all():
+            raise InputError(
+                f"a joint command begins where the arm is: its measured positions must be finite, not {measured}"
+            )
+        discrete_state.set_value(self._command, measured)
         discrete_state.set_value(self._is_stuck, [0.0])
         discrete_state.set_value(self._is_holding, [0.0])
         return EventStatus.Succeeded()

@@ -297,3 +297,8 @@ def test_close_to_a_singular_posture_the_tool_still_goes_its_way():
     commanded.advance(3.0)
     np.testing.assert_allclose(commanded.pose, commanded.start + [0, 0, 0, 0, 0.5, 0], atol=1e-4)
     assert commanded.stuck == 0.0
+
+
+def test_an_arm_whose_positions_are_not_known_does_not_begin_to_move(arm):
+    with pytest.raises(InputError, match="measured positions must be finite"):
+        Commanded(arm, q_start=np.full(7, np.nan))

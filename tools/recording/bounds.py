@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from guiderail.diagrams.options import validated
+from guiderail.diagrams.tasks.part_file import Bounds, PartTaskFile, read_task_file, write_task_file
 from guiderail.models.errors import InputError
 from guiderail.models.primitives.demonstrated_bounds import DemonstratedBounds, demonstrated_bounds
-from guiderail.tools.files import check_picture, write_atomically
+from guiderail.tools.files import check_picture, check_writable, write_atomically
 from guiderail.tools.recording.places import check_new, is_there
 from guiderail.tools.recording.reader import load_demonstrations
 
@@ -45,16 +47,19 @@ def constraints(
         if not is_there(out) and not out.parent.is_dir():
             raise InputError(f"there is no folder {out.parent}: make it first")
         check_new(out, "file")
+        check_writable(out)
     demonstrations = load_demonstrations(file)
     found = demonstrated_bounds(demonstrations, phases, margin, least, outputs)
     values = as_values(found)
-    if into is not None:
-        _write_into(into, values)
+    # A picture can be drawn again, a task's bounds are what others rely on: they change last, and are sound by then.
+    bounded = None if into is None else _with_bounds(into, values)
+    if draw is not None:
+        _draw(found, demonstrations, draw)
     if out is not None:
         text = yaml.safe_dump({"outputs": list(found.names), "bounds": values}, sort_keys=False, width=110)
         write_atomically(out, text.encode())
-    if draw is not None:
-        _draw(found, demonstrations, draw)
+    if into is not None and bounded is not None:
+        write_task_file(into, bounded)
     rows = {
         f"{name} in phase {k + 1}": f"{found.lower[k, o]:.4g} to {found.upper[k, o]:.4g}"
         for k in range(phases)
@@ -77,12 +82,9 @@ def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
     return values | ({"phases": bounds.phases.tolist()} if len(bounds.phases) > 1 else {})
 
 
-def _write_into(folder: Path, values: dict[str, Any]) -> None:
-    from guiderail.diagrams.options import validated
-    from guiderail.diagrams.tasks.part_file import Bounds, read_task_file, write_task_file
-
-    file = read_task_file(folder)
-    write_task_file(folder, file.model_copy(update={"bounds": validated(Bounds, values, str(folder))}))
+def _with_bounds(folder: Path, values: dict[str, Any]) -> PartTaskFile:
+    """A task folder's file with these bounds instead of its own."""
+    return read_task_file(folder).model_copy(update={"bounds": validated(Bounds, values, str(folder))})
 
 
 def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> None:

@@ -161,6 +161,18 @@ def test_bounds_that_cannot_be_written_leave_the_task_as_it_was(folder, monkeypa
     assert (folder / "task.yaml").read_text() == before
 
 
+def test_a_picture_that_cannot_be_drawn_leaves_the_task_as_it_was(folder, tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise InputError("no room")
+
+    before = (folder / "task.yaml").read_text()
+    monkeypatch.setattr("guiderail.tools.recording.bounds._draw", fail)
+    args = ("--draw", tmp_path / "bounds.png", "--out", tmp_path / "bounds.yaml", "--into", folder)
+    call("constraints", folder / "demonstrations.npz", *args, code=2)
+    assert (folder / "task.yaml").read_text() == before
+    assert not (tmp_path / "bounds.yaml").exists()
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -94,7 +94,8 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     """Writes a dataset whose action is what was commanded.
 
     Raises:
-        InputError: if the demonstrations have no common rate, which a dataset must have, or it can't be written.
+        InputError: if the demonstrations have no common rate, which a dataset must have, a value is beyond 32 bits, or
+            it can't be written.
     """
     import pandas as pd
     import pyarrow as arrow
@@ -111,7 +112,11 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         raise InputError(f"a LeRobot dataset counts frames in a second, and these are {period:g} s apart: give --rate")
     fps = int(fps) if float(fps).is_integer() else fps
     size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
-    values = np.concatenate(demonstrations.outputs).astype(np.float32)
+    outputs = np.concatenate(demonstrations.outputs)
+    largest = np.abs(outputs).max()
+    if largest > np.finfo(np.float32).max:
+        raise InputError(f"a LeRobot dataset holds numbers of 32 bits, which a value of {largest:g} is beyond")
+    values = outputs.astype(np.float32)
     frames = np.concatenate([np.arange(n) for n in lengths])
     episodes = np.repeat(np.arange(len(lengths)), lengths)
     flat = arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), size)

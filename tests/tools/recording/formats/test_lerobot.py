@@ -46,3 +46,9 @@ def test_samples_too_far_apart_to_be_counted_in_a_second_are_refused(tmp_path):
     with pytest.raises(InputError, match="give --rate"):
         write_lerobot(tmp_path / "set", Demonstrations([np.array([0.0, 1e8])], [np.ones((2, 1))]))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_numbers_that_32_bits_do_not_hold_are_refused(tmp_path):
+    with pytest.raises(InputError, match="1e\\+39 is beyond"):
+        write_lerobot(tmp_path / "set", Demonstrations([CLOCK], [np.full((5, 1), -1e39)]))
+    assert list(tmp_path.iterdir()) == []
