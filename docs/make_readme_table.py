@@ -70,6 +70,7 @@ TASKS: dict[str, list[Row]] = {
         Row("sKGRL", "connector_hard", "skgrl"),
         Row("residual RL", "connector_hard", "residual"),
         Row("safe residual RL", "connector_hard", "safe_residual"),
+        Row("residual RL that reaches farther", "connector_hard", "residual_far"),
         *_nulls("connector_hard_nulls", ("demonstrations", "white", "best_constant", "rule")),
     ],
     "**connector, hard**, commands within 2.8 mm": [
@@ -106,6 +107,7 @@ TASKS: dict[str, list[Row]] = {
     ],
     "**pouring, hard**": [
         Row("RL-SCT", "pouring_hard", "rl_sct"),
+        Row("RL-SCT, longer", "pouring_hard", "rl_sct_longer"),
         Row("RL, shaped by hand", "pouring_hard", "rl"),
         *_nulls("pouring_hard_nulls", ("zero", "white", "best_constant", "rule"), names=NO_DEMONSTRATIONS),
     ],
@@ -116,6 +118,10 @@ TASKS: dict[str, list[Row]] = {
         *_nulls("narrow_passage_nulls", ("demonstrations", "white", "best_constant"), names=NULLS[:3]),
     ],
     "**narrow passage, hard**": [
+        Row("KGRL, shown 10 episodes", "narrow_passage_hard", "kgrl"),
+        Row("sKGRL, shown 10 episodes", "narrow_passage_hard", "skgrl"),
+        Row("residual RL, shown 10 episodes", "narrow_passage_hard", "residual"),
+        Row("safe residual RL, shown 10 episodes", "narrow_passage_hard", "safe_residual"),
         *_nulls(
             "narrow_passage_hard_nulls",
             ("skgrl_demonstrations", "skgrl_white", "skgrl_best_constant", "skgrl_rule"),

@@ -38,16 +38,28 @@ def test_at_hard_policies_that_learned_nothing_fail_and_a_rule_does_not(study, n
     assert (of(study, "rule")["success_rate"] >= 0.95).all()
 
 
-def test_at_hard_all_three_learn_the_connector_and_only_residual_learning_leaves_its_bound():
-    methods = {method: of("connector_hard", method) for method in ("kgrl", "skgrl_adaptive", "residual")}
+def test_at_hard_all_four_learn_the_connector_and_only_residual_learning_leaves_its_bound():
+    names = ("kgrl", "skgrl_adaptive", "residual", "safe_residual")
+    methods = {method: of("connector_hard", method) for method in names}
     for method, rows in methods.items():
         assert len(rows) >= 5
         assert (rows["success_rate"] >= 0.95).all(), method
         assert (rows["training_episodes"] == 60).all()
         worst = rows[["worst_violation", "training_worst_violation"]]
         assert (worst.max(axis=1) > TOLERANCE).all() if method == "residual" else (worst <= TOLERANCE).all(axis=None)
+    rates = [rate for rows in methods.values() for rate in rows["success_rate"]]
+    assert (min(rates), max(rates)) == (0.96, 1.0)
     jerk = {method: rows["training_jerk_commanded_linear_first_10"] for method, rows in methods.items()}
     assert SMOOTHER * jerk["skgrl_adaptive"].max() < min(jerk["kgrl"].min(), jerk["residual"].min())
+
+
+def test_a_farther_reach_helps_residual_learning_at_hard_nothing_and_a_fixed_history_is_too_slow_there():
+    far, fixed = of("connector_hard", "residual_far"), of("connector_hard", "skgrl")
+    assert (far["success_rate"].min(), far["success_rate"].max()) == (0.94, 1.0)
+    assert (far["violating_episodes"] == 100).all()
+    assert far["worst_violation"].between(1.3e-3, 1.6e-3).all()
+    assert (fixed["success_rate"].min(), fixed["success_rate"].max()) == (0.44, 0.93)
+    assert (fixed[["worst_violation", "training_worst_violation"]] <= TOLERANCE).all(axis=None)
 
 
 def test_what_was_learned_at_hard_is_harder_in_the_other_engine():
@@ -108,6 +120,8 @@ def test_where_the_reach_leads_beyond_the_bound_only_residual_learning_follows_i
 
 def test_a_mug_that_is_elsewhere_is_learned_with_a_template():
     assert of("pouring_hard", "rl_sct")["success_rate"].tolist() == [0.93, 0.87, 0.98]
+    assert of("pouring_hard", "rl_sct_longer")["success_rate"].tolist() == [0.99, 0.91, 0.99]
+    assert (of("pouring_hard", "rl_sct_longer")["training_episodes"] == 150).all()
     assert of("pouring_hard", "rl")["success_rate"].tolist() == [0.0, 0.0, 0.0]
     assert (of("pouring_hard", "rl")["training_episodes"] == 300).all()
     assert of("pouring_hard_nulls", "blind_rule")["success_rate"].max() < 1 / 5
