@@ -235,7 +235,9 @@ def _unlike_defaults(config: RunConfig, setting: Setting) -> list[str]:
     from guiderail.tools.tasks import beyond_defaults, check_environment  # Drake takes a second
 
     task, environment = config.task, config.environment
-    chosen = {key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment}
+    chosen: dict[str, Any] = {
+        key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment
+    }
     usual = check_environment(task, chosen) | {"station": check_environment(task, {})["station"]}
     found = []
     for name, value in beyond_defaults(task, environment).items():
