@@ -105,6 +105,7 @@ def trained(bead_run):
         (["serve-iiwa", "--seconds", "nan"], "seconds must be a positive number, not nan"),
         (["serve-iiwa", "--seconds", "-1"], "seconds must be a positive number, not -1"),
         (["serve-iiwa", "--patience", "0"], "patience must be a positive number, not 0"),
+        (["serve-iiwa", "--offset", "1.5,0"], "offset cannot be (1.5, 0.0): give x and y in metres"),
         (["serve-iiwa", "--rate", "0"], "a rate up to 1 of the wall's, not 0"),
         (["run", "new", "--rehearse", "--lcm-url", "udpm://239.255.76.67:7667"], "a bus of its own"),
         (["generate", "objects"], "nothing called 'objects'"),
