@@ -646,7 +646,7 @@ def bench(
     name, folder = (None, ()) if task is None else _named(task, imports)
     told = (*folder, *map(str, imports or ()))
     result, show = run_benchmark(what, picture=picture, task=name, environment=_environment(env), imports=told)
-    typer.echo(json.dumps(result)) if as_json else show(result)
+    typer.echo(_json(result)) if as_json else show(result)
 
 
 @command("stress BncConnector --episodes 1000 --out stress.csv")
@@ -790,10 +790,12 @@ def run(
     there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
     other = Other.in_scenario(scenario, **there)
     if episodes is not None:
+        from guiderail.tools.learning.run_folder import RunFolder
         from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
+        from guiderail.tools.studies.scripted import untrained
 
-        others = _beside(run, {}, "none" if policy is None else policy)
-        acting = None if policy is None else others[policy]
+        config = RunFolder(run).config()
+        acting = None if policy is None else untrained(config.task, policy, config.seed)
         found = evaluate_on_robot(
             run, other, episodes, station=station, policy=policy or "", acting=acting, yes=yes, out=out, say=_say
         )
@@ -1108,12 +1110,24 @@ def _print_differences(differs: Sequence[str], of: str = "") -> None:
         typer.echo(f"  · {words}")
 
 
+def _json(result: Mapping[str, Any]) -> str:
+    """A result for a program."""
+
+    # JSON knows no infinity: what is unbounded, such as the slack of no constraint at all, is null there.
+    def known(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: known(one) for key, one in value.items()}
+        if isinstance(value, list | tuple):
+            return [known(one) for one in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(known(result), allow_nan=False)
+
+
 def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
     """A result for a program or for a person; what others came to in the same episodes stands beside it."""
     if as_json:
-        # JSON knows no infinity: what is unbounded, such as the slack of no constraint at all, is null there.
-        known = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in result.items()}
-        typer.echo(json.dumps(known, allow_nan=False))
+        typer.echo(_json(result))
         return
     from guiderail.tools.rollouts.metrics import STATISTICS, SYMBOLS
     from guiderail.tools.tables import cell

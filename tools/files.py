@@ -1,6 +1,7 @@
 """Files and folders that are either complete or not there, and whether they can be written."""
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -13,10 +14,37 @@ from guiderail.models.writing import write_atomically as write_atomically
 PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 
 
+LOCK = ".lock"
+"""In a folder that one process at a time writes into."""
+_PART = re.compile(r"\..*\.(\d+)\.part")
+
+
 def remove_parts(folder: Path) -> None:
-    """Removes what `write_atomically` left where it was killed; call it where nobody else is writing."""
-    for part in folder.rglob(".*.part"):
-        part.unlink(missing_ok=True)
+    """Removes what `write_atomically` and `whole_folder` left in a folder and below it where they were killed.
+
+    What another process is still writing stays, and so does all that is in a folder below with a lock of its own.
+    """
+    for place, below, files in os.walk(folder):
+        left = [name for name in below if _is_left(name)]
+        below[:] = [name for name in below if not _PART.fullmatch(name) and not Path(place, name, LOCK).exists()]
+        for name in left:
+            shutil.rmtree(Path(place, name), ignore_errors=True)
+        for name in filter(_is_left, files):
+            Path(place, name).unlink(missing_ok=True)
+
+
+def _is_left(name: str) -> bool:
+    """Whether it is the name of a part whose writer is no process any more, or this one."""
+    part = _PART.fullmatch(name)
+    if part is None or int(part[1]) == os.getpid():
+        return part is not None
+    try:
+        os.kill(int(part[1]), 0)  # 0 is no signal: it asks
+    except (ProcessLookupError, OverflowError):
+        return True
+    except PermissionError:  # somebody else's
+        pass
+    return False
 
 
 def check_picture(path: Path) -> None:

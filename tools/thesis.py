@@ -1,7 +1,7 @@
 """What a run differs in from the thesis: the thesis's settings as data, and what a configuration makes of them.
 
 Numbers are the thesis's own, with the place where it says so; where it says nothing there is nothing to differ from,
-and what takes its place is among the remarks.
+and what takes its place is among the remarks. What is not even what this project takes in its place is named as well.
 """
 
 from __future__ import annotations
@@ -20,6 +20,13 @@ from guiderail.tools.learning.presets import PRESETS, Preset, decision_discount
 from guiderail.tools.learning.run_folder import RunConfig
 
 HISTORY = ("history", "history_variance", "history_source", "adaptive_history")
+NEUTRAL = {
+    "guidance": "the method, whose name stands beside",
+    "solver": "three of one problem, with one solution",
+    "lcm_url": "where a robot's messages are",
+    "robot_timeout": "after which a robot that is silent is given up",
+}
+"""Options in which nobody differs from the thesis, and why."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,9 @@ _PRIMITIVE = {
     "horizon": (40,),
     "lambda_": (6.0,),
     "beta": (6.0,),
+    "inverse_length": (2.0,),  # section 4.3.3, "the same kernel in all our experiments"
 }
+_TOLD = ("kappa", "mouth_chamfer", "difficulty")  # options that remarks tell the value of
 _SCALE = (
     "actions of ±1 are κ = {kappa:g} standard deviations of the demonstrations (thesis: no scale is given)",
     _always,
@@ -72,7 +81,12 @@ _HARDER = (
 THESIS = {
     "NarrowPassage": Setting(
         "4.4.1 and 5.4.1",
-        {**_PRIMITIVE, "reward": ("sparse",), "history_variance": (1e-6,)},
+        {
+            **_PRIMITIVE,
+            "reward": ("sparse",),
+            "observation": ("state", "image"),
+            "history_variance": (1e-6,),
+        },
         "table_4_1_simulation",
         ("tqc",),
         (
@@ -87,7 +101,9 @@ THESIS = {
         {
             **_PRIMITIVE,
             "reward": ("sparse",),
+            "observation": ("state",),
             "history_variance": (1e-8,),
+            "bound": (2.0 * MM,),  # equation 4.26
             "uncertainty": ("calibration",),
             "station": ("arm",),
         },
@@ -108,7 +124,13 @@ THESIS = {
     "GridClamp": Setting(
         "3.4.2",
         # 9820 time steps are 17 minutes: ten decisions a second.
-        {"hold": (5,), "reward": ("shaped", "no_force"), "uncertainty": ("calibration",), "station": ("arm",)},
+        {
+            "hold": (5,),
+            "reward": ("shaped", "no_force"),
+            "uncertainty": ("calibration",),
+            "station": ("arm",),
+            "active_constraints": (None, True),
+        },
         "table_3_2_sara",
         ("sac",),
         (
@@ -128,6 +150,7 @@ THESIS = {
             "mug_offset": (0.0,),
             "balls": (2,),
             "ball_diameter": (0.04,),
+            "active_constraints": (None, True),
         },
         "table_3_2_iiwa",
         ("sac", "tqc"),
@@ -187,16 +210,42 @@ def differences(config: RunConfig, *, learns: bool = True) -> list[str]:
         return [f"it has no task {config.task}"]
     environment, found = config.environment, []
     for name, values in setting.options.items():
-        if name not in environment or (name in HISTORY and environment.get("guidance") != "skgrl"):
+        if name not in environment or not _says(name, environment):
             continue
         if not any(_same(environment[name], value) for value in values):
             found.append(f"{_words(name)} {_value(environment[name])} (thesis: {_either(values)})")
     if learns:
         sided = replace(config.learner, symmetry=config.learner.symmetry if _has_sides(config) else False)
         found += _learner_differences(replace(config, learner=sided), setting)
+    found += _unlike_defaults(config, setting)
     chamfer = environment.get("mouth_chamfer", BncDimensions().mouth_chamfer)
     known = {"kappa": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
     found += [words.format(**known) for words, holds in setting.remarks if holds(environment)]
+    return found
+
+
+def _says(name: str, environment: Mapping[str, Any]) -> bool:
+    """Whether the thesis says something of an option with the guidance that there is."""
+    guidance = environment.get("guidance")
+    return guidance == "skgrl" if name in HISTORY else guidance == "sct" or name != "active_constraints"
+
+
+def _unlike_defaults(config: RunConfig, setting: Setting) -> list[str]:
+    """The options of which the thesis says nothing and that are not what the task's difficulty stands for."""
+    from guiderail.tools.tasks import beyond_defaults, check_environment  # Drake takes a second
+
+    task, environment = config.task, config.environment
+    chosen: dict[str, Any] = {
+        key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment
+    }
+    usual = check_environment(task, chosen) | {"station": check_environment(task, {})["station"]}
+    found = []
+    for name, value in beyond_defaults(task, environment).items():
+        compared = name in setting.options and _says(name, environment)
+        if compared or name in (*NEUTRAL, *_TOLD, *HISTORY):
+            continue
+        default = f" (default: {_value(usual[name], 'unset')})" if name in usual else ""
+        found.append(f"{_words(name)} {_value(value, 'unset')}{default}")
     return found
 
 
@@ -257,11 +306,11 @@ def _words(name: str) -> str:
     return _NAMES.get(name, name.replace("_", " "))
 
 
-def _value(value: Any) -> str:
+def _value(value: Any, none: str = "all") -> str:
     if value is None:
-        return "all"
+        return none
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
-        return ", ".join(map(str, value))
+        return ", ".join(map(_value, value)) or "none"
     return f"{value:g}" if isinstance(value, float | int) else str(value)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, field_validator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.observation import affine
@@ -17,6 +17,8 @@ from guiderail.diagrams.tasks.offsets import HiddenOffsets
 from guiderail.diagrams.tasks.task import Task
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.relative_poses import RelativePoses
+
+FARTHEST = 0.3  # [m] along x or y: out of the way of every tool; what is more was meant in millimetres
 
 
 class InsertionReset(ResetOptions):
@@ -29,6 +31,13 @@ class InsertionReset(ResetOptions):
         max_length=2,
         description="(x, y) [m] of the fixture or the workpiece, instead of drawing it",
     )
+
+    @field_validator("offset")
+    @classmethod
+    def _is_near(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and max(map(abs, value)) > FARTHEST:
+            raise ValueError(f"give x and y in metres, from {-FARTHEST} to {FARTHEST}")
+        return value
 
 
 class InsertionTask(Task):

@@ -7,6 +7,7 @@ import pytest
 import guiderail
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.models.objects import bnc_connector, grid_clamp
+from guiderail.tools import benchmarks
 from guiderail.tools.command import app, main
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tasks import as_value
@@ -104,6 +105,7 @@ def trained(bead_run):
         (["serve-iiwa", "--seconds", "nan"], "seconds must be a positive number, not nan"),
         (["serve-iiwa", "--seconds", "-1"], "seconds must be a positive number, not -1"),
         (["serve-iiwa", "--patience", "0"], "patience must be a positive number, not 0"),
+        (["serve-iiwa", "--offset", "1.5,0"], "offset cannot be (1.5, 0.0): give x and y in metres"),
         (["serve-iiwa", "--rate", "0"], "a rate up to 1 of the wall's, not 0"),
         (["run", "new", "--rehearse", "--lcm-url", "udpm://239.255.76.67:7667"], "a bus of its own"),
         (["generate", "objects"], "nothing called 'objects'"),
@@ -120,6 +122,24 @@ def test_what_makes_no_sense_is_one_sentence_and_touches_nothing(arguments, says
     assert err.count("\n") == 1
     assert says in err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("policy", ["none", "white,rule", "whit"])
+def test_in_a_robots_episodes_one_policy_acts_that_there_is(policy, capsys, trained):
+    code, out, err = call(capsys, "run", trained, "--rehearse", "--episodes", 1, "--policy", policy)
+    assert (code, out) == (2, "")
+    assert f"Bead has no policy {policy!r}" in err
+    assert err.count("\n") == 1
+    assert not (trained / "hardware").exists()
+
+
+def test_what_is_endless_is_null_for_a_program_however_deep_it_lies(capsys, monkeypatch):
+    found = {"as it is": [{"part": "there and back", "worst_ms": float("inf"), "median_ms": 1.5, "number": 3}]}
+    monkeypatch.setattr(benchmarks, "run_benchmark", lambda what, **told_of: (found, print))
+    code, out, _ = call(capsys, "bench", "loop", "--json")
+    assert code == 0
+    (row,) = json.loads(out, parse_constant=pytest.fail)["as it is"]
+    assert row == {"part": "there and back", "worst_ms": None, "median_ms": 1.5, "number": 3}
 
 
 def test_an_existing_folder_is_left_alone(capsys, trained):

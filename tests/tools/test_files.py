@@ -1,10 +1,15 @@
 """A place where nothing can be written is refused before anything is run for it."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.files import check_picture, check_writable
+from guiderail.tools.files import LOCK, check_picture, check_writable, remove_parts
+from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.recording.record import record
 from guiderail.tools.rollouts.rollout import check_seed
 from guiderail.tools.viewing.shown import Shown
@@ -40,3 +45,34 @@ def test_a_recording_is_refused_before_an_episode_is_run(bead_run, tmp_path, mon
     monkeypatch.setattr(Policy, "load", lambda path: pytest.fail("it goes on"))
     with pytest.raises(InputError, match="cannot be written"):
         record(bead_run, tmp_path / "file" / "x.npz")
+
+
+@pytest.fixture
+def gone():
+    """The number of a process that is over."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_a_locked_folder_is_rid_of_the_files_and_folders_that_a_killed_process_left(gone, tmp_path):
+    (tmp_path / "checkpoint").mkdir()
+    for number in (gone, os.getpid(), 10**30):
+        (tmp_path / "checkpoint" / f".state.safetensors.{number}.part").touch()
+        (tmp_path / f".peg.{number}.part" / "parts").mkdir(parents=True)
+    (tmp_path / "checkpoint" / ".own.part").touch()  # of somebody who names things otherwise
+    with RunFolder(tmp_path).locked():
+        left = {path.name for path in tmp_path.rglob("*")}
+    assert left == {"checkpoint", ".own.part", LOCK}
+
+
+def test_what_others_are_writing_stays(gone, tmp_path):
+    alive = os.getppid()
+    another = tmp_path / "another_run"
+    kept = [tmp_path / f".report.html.{alive}.part", another / "checkpoint" / f".state.safetensors.{gone}.part"]
+    kept += [tmp_path / f".peg.{alive}.part" / f".part.yaml.{gone}.part", another / LOCK]
+    for path in kept:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    remove_parts(tmp_path)
+    assert all(path.exists() for path in kept)

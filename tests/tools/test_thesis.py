@@ -2,9 +2,13 @@ from dataclasses import replace
 
 import pytest
 
+from guiderail.diagrams.disturbances import Disturbances
+from guiderail.diagrams.guidance.registry import possible_guidance
+from guiderail.diagrams.make import option_models
+from guiderail.diagrams.stations.registry import stations_for
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.thesis import THESIS, differences
+from guiderail.tools.thesis import HISTORY, NEUTRAL, THESIS, differences
 
 
 def told(task, environment=None, **given):
@@ -56,6 +60,92 @@ def test_each_option_that_differs_is_named_with_both_values(changed, words):
     before = told("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
     after = told("BncConnector", AS_PRINTED | changed, algorithm="tqc", preset="table_4_1_robot")
     assert set(after) - set(before) == {words}
+
+
+OTHER_VALUES = {
+    "offset_range": (0.0, 0.001), "start_height": (0.02, 0.03), "explored": (0,), "gains": (1.0, 1.0),
+    "via_points": (10, 0.3, 0.3), "balls_in": 1, "balls": 3, "active_constraints": False, "input_speed": 1.5,
+    "time_step": 0.005, "control_period": 0.004, "robot": "other.urdf", "end_effector": "other", "lcm_url": "udpm://",
+    "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
+}  # fmt: skip
+TOGETHER = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}
+"""What an option of that name needs beside it, for a value that the thesis does not have."""
+
+
+def _another(task, name, field, default):
+    """A value of an option that differs from the thesis if its default does not, and the other way round."""
+    if name in OTHER_VALUES:
+        return OTHER_VALUES[name]
+    theirs = THESIS[task].options.get(name, (default,))
+    usual = theirs if default in theirs else (default,)
+    words = {"reward": TASKS.get(task).rewards, "observation": TASKS.get(task).observations, "difficulty": ("hard",)}
+    words["history_source"], words["impedance_control"] = ("commanded", "measured"), ("joint", "cartesian")
+    words["uncertainty"], words["solver"] = ("calibration", "disc", "known"), ("daqp", "osqp")
+    if isinstance(default, bool):
+        values = (True, False)
+    elif name in words:
+        values = words[name]
+    elif isinstance(default, tuple):
+        values = (tuple(1.0 + one for one in default), tuple(0.5 * one for one in default))
+        values = tuple((min(one), max(one)) for one in values)
+    elif isinstance(default, int):
+        values = (1, 2, 3)
+    else:
+        limits = [getattr(one, bound, None) for one in field.metadata for bound in ("le", "ge")]
+        values = (*(limit for limit in limits if limit is not None), 0.5 * default, 0.25)
+    return next((value for value in values if value not in usual), None)
+
+
+def _options():
+    """Every option of every task, once for each guidance, at the station that it is used at first."""
+    for task in THESIS:
+        declared = TASKS.get(task)
+        for guidance in possible_guidance(declared.knows()):
+            for station in stations_for(declared.world_kind):
+                for model in option_models(declared, guidance, station).values():
+                    for name, field in model.model_fields.items():
+                        yield task, guidance, station, name, field
+
+
+def test_every_option_that_is_not_as_usual_is_named_unless_it_is_neutral():
+    checked = set()
+    for task, guidance, station, name, field in _options():
+        nothing_said = name in (*NEUTRAL, "station") or (name in HISTORY and guidance != "skgrl")
+        if nothing_said or (task, guidance, name) in checked or (task, name) == ("Pouring", "reward"):
+            continue
+        usual = configure(task, {"guidance": guidance, "station": station})
+        value = _another(task, name, field, usual.environment[name])
+        if value is None:
+            assert name in ("reward", "observation"), f"a value of {name} that is not as usual is needed here"
+            continue
+        beside = {"guidance": guidance, "station": station} | TOGETHER.get(name, {})
+        before, after = configure(task, beside), configure(task, beside | {name: value})
+        assert set(differences(after, learns=False)) != set(differences(before, learns=False)), (task, guidance, name)
+        checked.add((task, guidance, name))
+    assert {name for task, _, name in checked if task == "BncConnector"} >= set(Disturbances.model_fields)
+
+
+@pytest.mark.parametrize(
+    ("task", "given", "words"),
+    [
+        ("BncConnector", {"bound": 0.006}, "bound 0.006 (thesis: 0.002)"),
+        ("BncConnector", {"offset_range": (0.0, 0.0)}, "offset range 0, 0 (default: unset)"),
+        ("BncConnector", {"wrench_noise": (5.0, 0.5)}, "wrench noise 5, 0.5 (default: 0, 0)"),
+        ("BncConnector", {"difficulty": "hard", "force_limit": 35.0}, "force limit 35 (default: 20)"),
+        ("Pouring", {"active_constraints": False}, "active constraints no (thesis: yes)"),
+        ("Pouring", {"guidance": "none", "active_constraints": True}, "active constraints yes (default: unset)"),
+        ("NarrowPassage", {"second_obstacle": True}, "second obstacle yes (default: no)"),
+    ],
+)
+def test_what_is_not_as_usual_is_named_with_what_is_usual(task, given, words):
+    assert words in told(task, given)
+
+
+@pytest.mark.parametrize("task", THESIS)
+def test_what_a_difficulty_stands_for_is_one_statement(task):
+    words = told(task, {"difficulty": "hard"})
+    assert sum("difficulty" in one for one in words) == 1
+    assert not any("default:" in one for one in words)
 
 
 def test_kgrl_has_no_history_to_differ_in():

@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass
 
 from guiderail.models.errors import InputError, brief
 from guiderail.models.yaml_files import load_yaml
-from guiderail.tools.files import remove_parts, write_atomically
+from guiderail.tools.files import LOCK, remove_parts, write_atomically
 from guiderail.tools.learning import older
 from guiderail.tools.learning.presets import Preset
 from guiderail.tools.rollouts.metrics import checked_rows
@@ -25,8 +25,6 @@ from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.tasks import check_environment, import_modules, task_content
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
-
-LOCK = ".lock"
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -113,7 +111,7 @@ class RunFolder:
                 f"{self.path} cannot be written ({error.strerror}): choose a folder with room to write"
             ) from error
         try:
-            remove_parts(self.path)  # nobody else is writing one
+            remove_parts(self.path)
             yield
         finally:
             (self.path / LOCK).unlink(missing_ok=True)

@@ -50,7 +50,7 @@ def serve_iiwa(
         say: what a person is told.
 
     Raises:
-        InputError: if the task or the bus is none, or a time or the rate is no positive number.
+        InputError: if the task or the bus is none, a time or the rate is no positive number, or the offset is too far.
     """
     for name, value in {"seconds": seconds, "patience": patience}.items():
         if not 0.0 < value < np.inf:
@@ -60,6 +60,9 @@ def serve_iiwa(
     declared = resolve(task, {}).task
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: serve an insertion")
+    if offset is not None and len(offset) != 2:
+        raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
+    moved = None if offset is None else validated(declared.Reset, {"offset": tuple(offset)}, "a robot")
     start = START if task == TASK else declared.start(np.random.default_rng(0)) + ASIDE
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm, driver = open_bus(url), IIWA_DRIVER
@@ -71,12 +74,8 @@ def serve_iiwa(
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
     Deputy(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
-    if offset is not None:
-        if len(offset) != 2:
-            raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
-        fixture, workpiece = declared.offsets.draw(
-            np.random.default_rng(0), validated(declared.Reset, {"offset": tuple(offset)}, "a robot")
-        )
+    if moved is not None:
+        fixture, workpiece = declared.offsets.draw(np.random.default_rng(0), moved)
         declared.move(robot, simulator.get_mutable_context(), fixture, workpiece)
     put(lcm if rate is None else ears, driver, declared, robot, simulator.get_mutable_context())
     simulator.Initialize()

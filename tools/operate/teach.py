@@ -7,6 +7,7 @@ a hand's speed, the robot by its impedance: pushing means to command beyond what
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +30,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.demonstrated_bounds import demonstrated_bounds
 from guiderail.models.units import DEGREE, MM
 from guiderail.tools.operate.force_gauge import ForceGauge
+from guiderail.tools.recording.places import check_new
 
 # Of each output: how far from its start the slider goes, its step, and the keys that lower and raise it.
 SLIDERS = {
@@ -53,19 +55,45 @@ DEAD_ZONE = 0.15
 SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])  # of the command, a second
 SLOWLY = 0.25  # times real time
 SNAPSHOT = 1.0  # [s] that one undo takes back
+UNDONE = 60  # that can be taken back, one after another: each is as large as all of the simulation's state
 FORCE_EVERY = 5  # control steps: a page that is sent more than it draws falls behind
 LEAST_SAMPLES = 10
 REST = 0.1  # [s] for which the command may stay where it is in a demonstration
 NEAREST = 1.0 * MM  # that a page's camera sees
 
 
+@dataclass(frozen=True)
+class _Snapshot:
+    """Where an undo leads back to: what was so before a control step, and how much was demonstrated by then."""
+
+    context: Context
+    steps: int
+    command: np.ndarray
+    wanted: np.ndarray
+    samples: int
+    resting: int
+
+
 @dataclass
 class _Taken:
-    """What is being demonstrated."""
+    """What is being demonstrated, without its rests: a person looks, and thinks.
 
-    times: list[float] = field(default_factory=list)
+    Attributes:
+        commands: of the control steps that were no rest.
+        resting: control steps for which the command stays where it is by now.
+        snapshots: what an undo can take back; the oldest are forgotten.
+    """
+
     commands: list[np.ndarray] = field(default_factory=list)
-    snapshots: list[tuple[Context, int, np.ndarray, np.ndarray]] = field(default_factory=list)
+    resting: int = 0
+    snapshots: deque[_Snapshot] = field(default_factory=lambda: deque(maxlen=UNDONE))
+
+    def add(self, command: np.ndarray, period: float) -> None:
+        """A control step's command; a rest is cut to `REST`."""
+        stays = bool(self.commands) and np.array_equal(command, self.commands[-1])
+        self.resting = self.resting + 1 if stays else 0
+        if self.resting * period <= REST:
+            self.commands.append(command.copy())
 
 
 class Teaching:
@@ -85,10 +113,11 @@ class Teaching:
             meshcat: the page; a new one on this machine unless given.
 
         Raises:
-            InputError: for a task whose station has no pose of six, or a file that exists.
+            InputError: for a task whose station has no pose of six, a file that exists, or one that can't be written.
         """
-        if out.exists() or out.suffix not in (".npz", ".csv"):
-            raise InputError(f"{out} must be a new file that ends in .npz or .csv")
+        check_new(out, "file")
+        if out.suffix not in (".npz", ".csv"):
+            raise InputError(f"{out} must end in .npz or .csv")
         resolved = resolve(task, environment)
         if resolved.task.world_kind != "workcell":
             raise InputError(f"{task} has no tool that a hand could lead: teach one that puts a part into another")
@@ -143,58 +172,65 @@ class Teaching:
                     self._press(name, say)
 
     def step(self) -> None:
-        """One control step: the command moves towards the sliders, and is recorded."""
+        """One control step: the command moves towards the sliders, and is recorded unless it rests."""
+        before, wanted = self.command, self.wanted
         self._push_sliders()
         scales = np.array([scale for *_, scale in SLIDERS.values()])
         self.wanted = scales * [self.meshcat.GetSliderValue(name) for name in SLIDERS]
         goal = self.start + self.wanted
         self.command = self.command + np.clip(goal - self.command, -SPEED * self._period, SPEED * self._period)
         context = self.simulator.get_mutable_context()
-        if self.steps % round(SNAPSHOT / self._period) == 0:
-            self.taken.snapshots.append((context.Clone(), self.steps, self.command.copy(), self.wanted.copy()))
+        if not np.array_equal(self.command, before) and self._since_snapshot() >= round(SNAPSHOT / self._period):
+            samples, resting = len(self.taken.commands), self.taken.resting
+            self.taken.snapshots.append(_Snapshot(context.Clone(), self.steps, before, wanted, samples, resting))
         self._port().FixValue(context, self.command)
-        self.taken.times.append(self.steps * self._period)
-        self.taken.commands.append(self.command.copy())
+        self.taken.add(self.command, self._period)
         self.steps += 1
         self.simulator.AdvanceTo(self.steps * self._period)
         if self.gauge is not None and self.steps % FORCE_EVERY == 0:
             self.gauge.show(self._force())
 
     def undo(self) -> None:
-        """Takes the last second back: robot, parts, command and sliders. Where nothing was shown there is none."""
+        """Takes the last second in which the command moved back: robot, parts, command and sliders, while there is one.
+
+        Rests before it stay, and so does what is longer ago than `UNDONE` of them.
+        """
         snapshots = self.taken.snapshots
         if not snapshots:
             return
-        if len(snapshots) > 1 and self.steps - snapshots[-1][1] < round(0.5 * SNAPSHOT / self._period):
+        if len(snapshots) > 1 and self._since_snapshot() < round(0.5 * SNAPSHOT / self._period):
             snapshots.pop()
-        context, self.steps, self.command, self.wanted = snapshots[-1]
-        self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(context)
+        last = snapshots.pop()
+        self.steps, self.command, self.wanted = last.steps, last.command, last.wanted
+        self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(last.context)
         self.simulator.Initialize()
-        del self.taken.times[self.steps :], self.taken.commands[self.steps :]
+        del self.taken.commands[last.samples :]
+        self.taken.resting = last.resting
         for (name, (*_, scale)), value in zip(SLIDERS.items(), self.wanted, strict=True):
             self.meshcat.SetSliderValue(name, float(value / scale))
-        snapshots.pop()
 
     def keep(self) -> str:
         """Keeps what was shown, writes all that was kept, and says how it ended.
 
         Raises:
-            InputError: if nothing was shown yet.
+            InputError: if nothing was shown yet, or nothing can be written any more; then it is not kept yet.
         """
-        if len(self.taken.times) < LEAST_SAMPLES:
+        if self.steps < LEAST_SAMPLES:
             raise InputError("nothing was shown yet: move the sliders or press the keys first")
         success = self.is_success()
-        self.kept.append(without_rests(self._period, np.array(self.taken.commands)))
+        commands = np.array(self.taken.commands)
+        kept = [*self.kept, (self._period * np.arange(len(commands)), commands)]
+        _together(kept).save(self.out)
+        self.kept = kept
         self.succeeded.append(success)
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        self.demonstrations().save(self.out)
         ended = {None: "", True: ", at the target", False: ", NOT at the target"}[success]
-        lasts = f"{self.taken.times[-1]:.1f} s, {self.kept[-1][0][-1]:.1f} s of them without rests"
+        shown = (self.steps - 1) * self._period
+        lasts = f"{shown:.1f} s, {self.kept[-1][0][-1]:.1f} s of them without rests"
         return f"kept demonstration {len(self.kept)}: {lasts}{ended}; {self.out}"
 
     def demonstrations(self) -> Demonstrations:
         """All that were kept."""
-        return Demonstrations([t for t, _ in self.kept], [y for _, y in self.kept], NAMES)
+        return _together(self.kept)
 
     def is_success(self) -> bool | None:
         """Whether the workpiece is where the task wants it; None where the task doesn't say it by its pose."""
@@ -266,6 +302,10 @@ class Teaching:
         self._clicks[name] = min(done + 1, clicks)
         return clicks > done
 
+    def _since_snapshot(self) -> float:
+        """Control steps since what an undo leads back to; endless where nothing can be undone."""
+        return self.steps - self.taken.snapshots[-1].steps if self.taken.snapshots else np.inf
+
     def _push_sliders(self) -> None:
         gamepad = self.meshcat.GetGamepad()
         if gamepad.index is None:
@@ -298,19 +338,8 @@ class Teaching:
         return self.simulator.get_system().GetInputPort("desired_pose")
 
 
-def without_rests(period: float, commands: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Times (n,) and commands (n, 6) of a demonstration whose rests are cut to `REST`: a person looks, and thinks.
-
-    Args:
-        period: of the control steps [s].
-        commands: one for each of them, (N, 6).
-    """
-    resting, kept = 0, [0]
-    for step in range(1, len(commands)):
-        resting = resting + 1 if np.array_equal(commands[step], commands[step - 1]) else 0
-        if resting * period <= REST:
-            kept.append(step)
-    return period * np.arange(len(kept)), commands[kept]
+def _together(kept: list[tuple[np.ndarray, np.ndarray]]) -> Demonstrations:
+    return Demonstrations([t for t, _ in kept], [y for _, y in kept], NAMES)
 
 
 def look_at(meshcat: Any, task: Any) -> Viewpoint | None:

@@ -15,29 +15,24 @@ from guiderail.diagrams.tasks.pouring_options import MAX_MUG_OFFSET
 from guiderail.models.pose_coordinates import pose_to_transform
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import Choose, corners
-from guiderail.tools.rollouts.rollout import Decision, EnvObserver
+from guiderail.tools.rollouts.rollout import EnvObserver
 from guiderail.tools.stress.campaign import Campaign, Case
 
 
 class EarlyTilt(EnvObserver):
     """The greatest tilt [rad] that is commanded while the template is in its first state, where it is upright."""
 
-    def begin(self) -> None:
-        """Nothing is tilted yet."""
-        self._diagram, self._context = self.base.task.diagram, self.base.simulator.get_context()
-        self._worst = 0.0
-
-    def see(self, decision: Decision) -> None:
-        """Measures, unless the template is in another state."""
-        if self._diagram.GetOutputPort("state").Eval(self._context)[0] != 0:
-            return
-        X = pose_to_transform(self._diagram.GetOutputPort("desired_pose").Eval(self._context))
-        R = X.rotation().matrix()
-        self._worst = max(self._worst, float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2])))
-
     def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """`early_tilt` [rad]."""
-        return {"early_tilt": self._worst}
+        """`early_tilt` [rad], of all control steps; 0 where the template was never in its first state."""
+        trace = self.base.trace
+        upright = trace.commanded[trace.signals["state"][:, 0] == 0]
+        return {"early_tilt": max(map(_tilt, upright), default=0.0)}
+
+
+def _tilt(pose: np.ndarray) -> float:
+    """The angle between the axis of a thermos with a pose (6,) and what is upwards [rad]."""
+    R = pose_to_transform(pose).rotation().matrix()
+    return float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
 
 
 def _three_inputs(make: Callable[[np.random.Generator], Inputs]) -> Choose:

@@ -16,6 +16,7 @@ import pandas as pd
 
 from guiderail.diagrams.make import known
 from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
+from guiderail.diagrams.tasks.insertion import FARTHEST
 from guiderail.models.errors import InputError
 from guiderail.models.insertion import RHO
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
@@ -42,7 +43,7 @@ TASK = "BncConnector"
 HOLD = 10  # control steps that an action lasts where the connector is learned
 SLOW = 25  # half a second: actions that are as slow as what a low-pass at 1 Hz lets through
 PLACES = ("free", "connector")
-ELSEWHERE = (0.3, 0.3)  # m: where the jack is while the robot moves in free space
+ELSEWHERE = (FARTHEST, FARTHEST)  # m: where the jack is while the robot moves in free space
 ALONE = "demonstration alone"
 OUTPUTS = {"all": (0, 1, 2, 3, 4, 5), "xy": (0, 1)}
 

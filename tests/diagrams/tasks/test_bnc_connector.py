@@ -224,7 +224,15 @@ class TestUncertainty:
         assert np.mean(radii < 1.5 * MM / np.sqrt(2)) == pytest.approx(0.5, abs=0.04)
 
     @pytest.mark.parametrize(
-        "options", [{"ofset": 1}, {"offset": (1, 2, 3)}, {"offset": "far"}, {"offset": (0, np.nan)}]
+        "options",
+        [
+            {"ofset": 1},
+            {"offset": (1, 2, 3)},
+            {"offset": "far"},
+            {"offset": (0, np.nan)},
+            {"offset": (1.5, 0.0)},  # meant in millimetres
+            {"offset": (0.0, -0.5)},
+        ],
     )
     def test_refuses_options_that_make_no_sense(self, kmp, options):
         with pytest.raises(InputError):

@@ -1,3 +1,5 @@
+import numpy as np
+
 from guiderail.tools.benchmarks import loop
 
 
@@ -10,6 +12,17 @@ def test_every_part_is_measured_against_its_period(monkeypatch, capsys):
         assert row["over"] <= row["number"]
     loop.show({"as it is": rows})
     assert "station, with what guards it" in capsys.readouterr().out
+
+
+def test_an_answer_that_is_lost_leaves_the_others_their_numbers():
+    seconds = np.append(np.linspace(0.001, 0.002, 299), np.inf)
+    row = loop._row("there and back over LCM", 0.005, seconds)
+    assert 1.0 < row["median_ms"] < 1.6
+    assert row["median_ms"] < row["p99_ms"] < 2.0
+    assert row["worst_ms"] == np.inf
+    assert (row["over"], row["number"]) == (1, 300)
+    one_of_few = loop._row("there and back over LCM", 0.005, np.append(np.full(10, 0.001), np.inf))
+    assert one_of_few["median_ms"] == 1.0
 
 
 def test_an_answer_that_is_late_is_not_the_next_ones():

@@ -7,6 +7,7 @@ from guiderail.diagrams.cameras import Camera, look_at
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.figures import FIGURES, find_figure, reproduce
 from guiderail.tools.figures.chapter_3 import METHODS
+from guiderail.tools.figures.chapter_4 import MOVED_ELSEWHERE
 from guiderail.tools.figures.thesis import TABLE_3_2, TABLE_4_1, THESIS
 from guiderail.tools.studies.declaration import load_study
 from guiderail.tools.studies.study import JUDGED, TRAINING, Job
@@ -45,7 +46,12 @@ def test_figure_4_2_shows_a_primitive_that_keeps_its_constraints(tmp_path):
     result = reproduce("4.2", out=tmp_path)
     rows = read_table(tmp_path / "figure_4_2.csv")
     assert rows["worst_violation"].max() <= 1e-9
-    assert (rows[rows["panel"].str.startswith("A2")]["worst_violation"] > -1e-9).any()
+    once = rows[rows["panel"].str.startswith("A2")]
+    assert (once["worst_violation"] > -1e-9).any()
+    # One action changes the motion nearby: half a second away it is not a sixth of what it is there.
+    assert (once[MOVED_ELSEWHERE] < once["moved_at_3.2_s"] / 6).all()
+    assert (once[MOVED_ELSEWHERE] > 0.0).all()
+    assert (rows.loc[~rows.index.isin(once.index), MOVED_ELSEWHERE] > 0.05).all()
     assert result["exploration_follows_the_demonstrated_spread"] > 0.8
     assert (tmp_path / "figure_4_2.png").stat().st_size > 10_000
 

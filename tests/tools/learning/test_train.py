@@ -196,7 +196,7 @@ def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
         with pytest.raises(InputError, match="another process writes into"):
             train(folder, bead_config)
         other.kill()  # its lock file stays, and holds nobody back
-    (folder.path / ".episodes.csv.1.part").write_text("from a process that was killed while writing")
+    (folder.path / f".episodes.csv.{other.pid}.part").write_text("from a process that was killed while writing")
     with folder.locked():
         pass
     train(folder, replace(bead_config, episodes=2))

@@ -114,12 +114,49 @@ def test_undo_takes_a_second_back(session):
     lead(session, "x [mm]", 1.0, 60)
     before = [command.copy() for command in session.taken.commands]
     lead(session, "x [mm]", -3.0, 50)
-    session.undo()  # to the last whole second that is at least half a second ago
-    assert session.steps == 50
-    np.testing.assert_allclose(session.taken.commands, before[:50])
+    session.undo()  # to before the motion that was begun a second or more after the one before it
+    assert session.steps == 60
+    np.testing.assert_array_equal(session.taken.commands, before)
     assert session.meshcat.sliders["x [mm]"] == pytest.approx(1.0)
     lead(session, "x [mm]", 1.0, 10)
-    assert session.simulator.get_context().get_time() == pytest.approx(60 * 0.02)
+    assert session.simulator.get_context().get_time() == pytest.approx(70 * 0.02)
+
+
+def test_undo_goes_second_by_second_through_one_motion(session):
+    session.begin()
+    lead(session, "z [mm]", 40.0, 90)  # two seconds of motion, at a hand's speed
+    for steps, left in ((50, 50), (0, 0), (0, 0)):
+        session.undo()
+        assert session.steps == steps
+        assert len(session.taken.commands) == left
+    lead(session, "z [mm]", 40.0, 60)
+    session.undo()  # the second that has only begun is no second: the one before it goes as well
+    assert session.steps == 0
+
+
+def test_whoever_does_nothing_keeps_nothing(session):
+    session.begin()
+    lead(session, "x [mm]", 2.0, 60)
+    held = len(session.taken.commands), len(session.taken.snapshots)
+    before = session.command
+    lead(session, "x [mm]", 2.0, 200)
+    assert (len(session.taken.commands), len(session.taken.snapshots)) == held
+    assert held[0] <= 10
+    assert held[1] == 1
+    session.undo()
+    assert (session.steps, session.taken.commands) == (0, [])
+    assert not np.array_equal(session.command, before)
+
+
+def test_only_so_much_can_be_undone(session, monkeypatch):
+    monkeypatch.setattr(teaching, "UNDONE", 2)
+    session.begin()
+    for turn in (60.0, 0.0, 60.0, 0.0):
+        lead(session, "turn [degrees]", turn, 50)
+    assert len(session.taken.snapshots) == 2
+    for steps in (150, 100, 100):
+        session.undo()
+        assert session.steps == steps
 
 
 def test_where_nothing_was_shown_undo_does_nothing(session):
@@ -221,6 +258,28 @@ def test_every_key_is_one_things(session):
     keys = [key for _, _, *pair, _ in SLIDERS.values() for key in pair] + list(BUTTONS.values())
     assert len(set(keys)) == len(keys)
     assert UNDO in BUTTONS
+
+
+@pytest.mark.parametrize("name", ["file/shown.npz", f"{'x' * 300}.npz", f"{'x' * 300}/shown.npz"])
+def test_where_nothing_can_be_written_nobody_begins_to_show_anything(name, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(teaching, "resolve", lambda *given: pytest.fail("the page opens"))
+    with pytest.raises(InputError, match=r"written|read"):
+        Teaching("GridClamp", {}, tmp_path / name, meshcat=Page())
+
+
+def test_what_cannot_be_written_in_the_end_is_still_there_to_be_kept(session, tmp_path):
+    said = []
+    session.out = tmp_path / "file" / "shown.npz"
+    (tmp_path / "file").touch()
+    session.begin()
+    lead(session, "x [mm]", 2.0, 12)
+    session._press(KEEP, said.append)
+    assert "cannot be written" in said[0]
+    (tmp_path / "file").unlink()
+    session._press(KEEP, said.append)
+    assert "kept demonstration 1" in said[1]
+    assert Demonstrations.load(session.out).num_demonstrations == 1
 
 
 def test_what_makes_no_sense_is_refused(tmp_path):

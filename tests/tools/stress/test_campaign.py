@@ -1,13 +1,19 @@
+from types import SimpleNamespace
+
 import gymnasium
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 
+from guiderail.diagrams.trace import Trace
 from guiderail.models.errors import InputError
+from guiderail.models.pose_coordinates import transform_to_pose
 from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.rollout import Observer, rollout
 from guiderail.tools.stress import STRESSED, bnc_connector, narrow_passage
 from guiderail.tools.stress import campaign as campaign_module
 from guiderail.tools.stress.campaign import ACTIONS, Campaign, Case, Finite, complaints, outcome, run_campaign, stress
+from guiderail.tools.stress.pouring import EarlyTilt
 from guiderail.tools.stress.recompute import RecomputedViolation
 from guiderail.tools.tables import read_table
 from guiderail.tools.tasks import make_environment
@@ -67,6 +73,25 @@ def test_a_witness_sees_every_decision_and_a_case_takes_further_options():
     for hold in (1, 2):
         row = run_campaign(BEAD, at_least(1), environment={"hold": hold})[0]
         assert row["decisions"] == -(-row["steps"] // hold)
+
+
+def _tilted_at(*steps, state=0):
+    """An episode of twenty control steps, two decisions of pouring, in which the command leans over in some."""
+    trace = Trace(20, 6, 0.01, {"state": 1})
+    for step in range(20):
+        pose = transform_to_pose(RigidTransform(RollPitchYaw(0.3 * (step in steps), 0.0, 0.5), [0.1, 0.0, 0.2]))
+        trace.append(pose, pose, 0.0, 0.0, {"state": np.array([state])})
+    return SimpleNamespace(unwrapped=SimpleNamespace(trace=trace))
+
+
+@pytest.mark.parametrize(
+    ("env", "tilt"),
+    [(_tilted_at(), 0.0), (_tilted_at(3), 0.3), (_tilted_at(9), 0.3), (_tilted_at(3, state=1), 0.0)],
+)
+def test_a_tilt_that_comes_too_early_is_seen_at_every_control_step(env, tilt):
+    witness = EarlyTilt(env)
+    witness.begin()
+    assert witness.end({})["early_tilt"] == pytest.approx(tilt, abs=1e-9)
 
 
 def test_numbers_that_are_none_are_counted():
