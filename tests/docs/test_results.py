@@ -77,9 +77,10 @@ def test_a_template_inserts_the_clamp_with_the_least_force_and_residual_learning
         )
     }
     assert force["sct"] < force["none"] < force["residual"]
-    assert (of("grid_clamp_hard", "sct")["success_rate"] >= 0.95).all()
-    assert of("grid_clamp_hard", "residual")["success_rate"].between(0.08, 0.83).all()
-    assert (of("grid_clamp_hard", "none")["success_rate"] <= 0.02).all()
+    assert (of("grid_clamp_hard", "sct")["success_rate"] >= 0.98).all()
+    residual = of("grid_clamp_hard", "residual")["success_rate"]
+    assert (residual.min(), residual.max()) == (0.22, 0.67)
+    assert (of("grid_clamp_hard", "none")["success_rate"] <= 0.01).all()
 
 
 def test_kgrl_stays_clear_of_the_passages_walls_and_safe_residual_learning_gets_stuck():
