@@ -397,16 +397,16 @@ class HardwareStation(Station):
         return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
 
     def load_of_force(self, positions: np.ndarray) -> np.ndarray:
-        """The share of each joint's greatest torque that the impedance's greatest force and torque can take, (n,).
+        """The share of each joint's greatest torque that the impedance's force and torque can take, (n,).
 
+        They are limited along and about each axis of the target by itself: it is of the worst corner of that box.
         Above 1 the guard clips what the impedance wants; the driver would stop at more than 1 / `TORQUE_SHARE`.
 
         Args:
             positions: of the joints, (n,) [rad].
         """
         J, limits = self._jacobian(positions), force_first(self.impedance.limits)
-        force = np.linalg.norm(J[3:], axis=0) * limits[:3].max()
-        return (force + np.linalg.norm(J[:3], axis=0) * limits[3:].max()) / np.array(self.limits.torque)
+        return (limits[:3] @ np.abs(J[3:]) + limits[3:] @ np.abs(J[:3])) / np.array(self.limits.torque)
 
     def _jacobian(self, positions: np.ndarray) -> np.ndarray:
         """Of the tool centre in the target's axes, (6, n), its rotation first."""

@@ -51,7 +51,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
     p_WT = arm.target.CalcPoseInWorld(plant.CreateDefaultContext()).translation()
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     payload = sum(body.default_mass() for body in arm.tool)
-    load = station.load_of_force(positions).max()
+    load, along = station.load_of_force(positions).max(), station.impedance.limits[:3]
     limits, has_deputy = station.limits, station.has_deputy(context)
     nobody = "nobody stands by: start guiderail stand-by on the driver's machine"
     somebody = "somebody commands it: end the other program, or wait until the deputy has brought the arm to rest"
@@ -79,7 +79,11 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
             f"{away / MM:.0f} mm and {np.rad2deg(turned):.0f} degrees away",
             away < FARTHEST and turned < FARTHEST_TURN,
         ),
-        Check("force", f"at most {max(station.impedance.limits[:3]):.0f} N commanded, {limits.force:.0f} N felt"),
+        Check(
+            "force",
+            f"at most {max(along):.0f} N commanded along an axis, {np.linalg.norm(along):.0f} N askew, "
+            f"{limits.force:.0f} N felt",
+        ),
         Check("torques", f"at most {list(limits.torque)} Nm sent; the full force takes {load:.0%} of the nearest"),
         Check("workspace", f"from {limits.lower} to {limits.upper} m around the target"),
     ]
