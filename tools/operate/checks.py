@@ -89,19 +89,36 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
     ]
 
 
-def read_out(checks: Sequence[Check], say: Callable[[str], None], *, is_confirmed: bool) -> None:
+def read_out(
+    checks: Sequence[Check],
+    say: Callable[[str], None],
+    *,
+    again: Callable[[], Sequence[Check]],
+    is_confirmed: bool,
+) -> None:
     """Says them, and has them confirmed.
 
+    Args:
+        checks: of before.
+        say: what a person is told.
+        again: the checks of now: while a person thinks, anything may happen.
+        is_confirmed: nobody is asked.
+
     Raises:
-        InputError: if one fails, or nobody confirms.
+        InputError: if one fails, before or after the question, or nobody confirms.
     """
     for check in checks:
         say(f"{'ok ' if check.is_well else 'NOT'}  {check.name:<12}{check.words}")
+    _refuse_wrong(checks)
+    if not is_confirmed:
+        confirm("Is all of this so, and is the workspace clear?")
+        _refuse_wrong(again())
+
+
+def _refuse_wrong(checks: Sequence[Check]) -> None:
     wrong = [check for check in checks if not check.is_well]
     if wrong:
         raise InputError(f"the arm stays where it is: {wrong[0].name}: {wrong[0].words}")
-    if not is_confirmed:
-        confirm("Is all of this so, and is the workspace clear?")
 
 
 def confirm(question: str) -> None:
