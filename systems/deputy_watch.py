@@ -80,6 +80,15 @@ class DeputyWatch(LeafSystem):
         """What is wrong with the status or the deputy, (1,): a code of `Fault`."""
         return self._fault_port
 
+    def is_heard(self, context: Context) -> bool:
+        """Whether there was a word, and the last one is not too long ago."""
+        return self._word(context) is not None and not self._is_silent(context)
+
+    def _is_silent(self, context: Context) -> bool:
+        word = self._word(context)
+        number, silence = context.get_discrete_state(self._memory).value()
+        return word is not None and word.number == number and silence > self._patience
+
     def _word(self, context: Context) -> DeputyWord | None:
         found = self._word_port.Eval(context)
         return found if isinstance(found, DeputyWord) else None
@@ -100,9 +109,6 @@ class DeputyWatch(LeafSystem):
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         fault = float(self._status_fault_port.Eval(context)[0])
         word = self._word(context)
-        number, silence = context.get_discrete_state(self._memory).value()
-        if fault == Fault.NONE and word is not None:
-            is_silent = word.number == number and silence > self._patience
-            if word.is_acting or is_silent:
-                fault = float(Fault.DEPUTY)
+        if fault == Fault.NONE and word is not None and (word.is_acting or self._is_silent(context)):
+            fault = float(Fault.DEPUTY)
         output.SetAtIndex(0, fault)

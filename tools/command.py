@@ -763,7 +763,9 @@ def run(
     run: Run,
     station: Annotated[str, _opt("Where: a station that is a robot.", of="stations")] = "hardware",
     lcm_url: LcmUrl = "",
-    robot: WhichRobot = "iiwa14",
+    robot: Annotated[
+        str | None, _opt("Of a robot: which arm.  [default: the scenario's, or else iiwa14]", of="robots")
+    ] = None,
     rehearse: Rehearse = False,
     lockstep: Lockstep = False,
     rate: Rate = 0.2,
@@ -787,7 +789,8 @@ def run(
     from guiderail.tools.operate.rehearsal import Other
     from guiderail.tools.operate.run_policy import run_policy
 
-    there = {"lcm_url": lcm_url, "robot": robot, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
+    there: dict[str, Any] = {"lcm_url": lcm_url, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
+    there |= {} if robot is None else {"robot": robot}
     other = Other.in_scenario(scenario, **there)
     if episodes is not None:
         from guiderail.tools.learning.run_folder import RunFolder

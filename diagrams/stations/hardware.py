@@ -35,7 +35,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.errors import InputError
-from guiderail.models.joint_status import MISSED, DeputyWord, StatusLimits
+from guiderail.models.joint_status import MISSED, StatusLimits
 from guiderail.models.parsing import follow_directives
 from guiderail.models.registry import did_you_mean
 from guiderail.models.robots.iiwa import IIWA14
@@ -236,7 +236,9 @@ class HardwareStation(Station):
             "deputy_subscriber", LcmSubscriberSystem(word_channel(driver.command_channel), WordSerializer(), bus)
         )
         # A deputy speaks as often as the robot; it may be late by as much again.
-        deputy = builder.AddNamedSystem("deputy", DeputyWatch(period=period, patience=2.0 * MISSED * period))
+        self._deputy = deputy = builder.AddNamedSystem(
+            "deputy", DeputyWatch(period=period, patience=2.0 * MISSED * period)
+        )
         positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
         velocities = builder.AddNamedSystem("velocities", MatrixGain(np.eye(num_joints, 2 * num_joints, num_joints)))
         wrench = builder.AddNamedSystem(
@@ -354,9 +356,8 @@ class HardwareStation(Station):
         self._status.get_clock_input_port().FixValue(self._status.GetMyMutableContextFromRoot(context), [clock])
 
     def has_deputy(self, context: Context) -> bool:
-        """Whether somebody stands by at the robot; `context` is this station's own."""
-        words = self.GetSubsystemByName("deputy_subscriber")
-        return isinstance(words.get_output_port().Eval(self.GetSubsystemContext(words, context)), DeputyWord)
+        """Whether somebody stands by at the robot, and still speaks; `context` is this station's own."""
+        return self._deputy.is_heard(self.GetSubsystemContext(self._deputy, context))
 
     def take_over(self, context: Context, before: Context) -> None:
         """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.
@@ -397,16 +398,16 @@ class HardwareStation(Station):
         return np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ external_torque)[3:]
 
     def load_of_force(self, positions: np.ndarray) -> np.ndarray:
-        """The share of each joint's greatest torque that the impedance's greatest force and torque can take, (n,).
+        """The share of each joint's greatest torque that the impedance's force and torque can take, (n,).
 
+        They are limited along and about each axis of the target by itself: it is of the worst corner of that box.
         Above 1 the guard clips what the impedance wants; the driver would stop at more than 1 / `TORQUE_SHARE`.
 
         Args:
             positions: of the joints, (n,) [rad].
         """
         J, limits = self._jacobian(positions), force_first(self.impedance.limits)
-        force = np.linalg.norm(J[3:], axis=0) * limits[:3].max()
-        return (force + np.linalg.norm(J[:3], axis=0) * limits[3:].max()) / np.array(self.limits.torque)
+        return (limits[:3] @ np.abs(J[3:]) + limits[3:] @ np.abs(J[:3])) / np.array(self.limits.torque)
 
     def _jacobian(self, positions: np.ndarray) -> np.ndarray:
         """Of the tool centre in the target's axes, (6, n), its rotation first."""

@@ -108,6 +108,45 @@ def test_the_reference_names_no_place_of_this_machine(reference):
         assert " at 0x" not in page, name
 
 
+def test_the_limits_of_a_robot_are_those_that_the_page_names():
+    """Its table of limits, where a number of it has one home."""
+    import numpy as np
+    from pydrake.lcm import DrakeLcm
+
+    from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
+    from guiderail.diagrams.stations.hardware import EXTERNAL_SHARE, TORQUE_SHARE, VELOCITY_SHARE, HardwareStation
+    from guiderail.models.insertion import COLLISION_FORCE
+    from guiderail.models.joint_status import MISSED
+    from guiderail.models.units import MM
+    from guiderail.tools.operate.serve_iiwa import START
+
+    page = (DOCS / "robot.md").read_text(encoding="utf-8").partition("## What each limit is for")[2]
+    rows = dict(re.findall(r"^\| ([^|]+) \| (.+) \|$", page.partition("\n## ")[0], re.MULTILINE))
+    station = HardwareStation(BncWorkcell(), DrakeLcm("memq://"))
+    limits, status, force = station.limits, station.status_limits, np.array(station.impedance.limits[:3])
+    load = station.load_of_force(station.known.solve(START, station.known.posture)).max()
+    age = f"{status.max_age / MM:.0f} ms"
+    said = {
+        "age of a status": f"{MISSED} periods: {age} |",
+        "clock of statuses": f"{status.max_lead / MM:.0f} ms behind the last one, or ahead |",
+        "jump of a position": f"{status.position_jump} rad ",
+        "jump of a velocity": f"{status.velocity_jump} rad/s",
+        "this program's own delay": f"{status.max_gap / MM:.0f} ms ",
+        "the deputy": f"{age} without a command; a robot's clock that goes back by {age}; "
+        f"{2 * MISSED * station.period / MM:.0f} ms without",
+        "a joint's speed": f"{VELOCITY_SHARE:.0%} of its limit".replace("%", " %"),
+        "place of the tool, and of where it is sent": f"±{limits.upper[0]} m beside, −{-limits.lower[2]} to "
+        f"{limits.upper[2]} m above",
+        "force on the tool": f"{limits.force:.0f} N felt; the impedance pushes with {force.max():.0f} N at most along "
+        f"each axis of the target, {np.linalg.norm(force):.0f} N askew",
+        "external torque of a joint": f"{EXTERNAL_SHARE:.0%} of".replace("%", " %"),
+        "torque that is sent": f"{TORQUE_SHARE:.0%} of that".replace("%", " %"),
+        "task's force": f"the task's own, {COLLISION_FORCE:.0f} N",
+    }
+    assert [name for name, words in said.items() if words not in rows[name] + " |"] == []
+    assert f"up to {100 * load:.0f} % of it" in rows["torque that is sent"]
+
+
 def test_whoever_cites_it_cites_this_version():
     import guiderail
 

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -16,13 +17,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
+from guiderail.tools.rollouts.ledger import write_ledger
 from guiderail.tools.rollouts.rollout import Decision
 
 Weights = dict[str, dict[str, np.ndarray]]
@@ -136,16 +137,20 @@ class Student(Learner):
             self.given += 1
 
     def write(self, path: Path, table: pa.Table) -> None:
-        """Has a ledger written there by the other process."""
+        """Has a ledger written there by the other process; what comes in its way is raised by what asks it next."""
         self._send(("write", path, table))
 
     def finish(self) -> None:
-        """Waits until everything is learned, and ends the other process."""
+        """Waits until everything is learned and written, and ends the other process."""
         self.hand_over()
         while self.known < self.given:
             self._take(self._receive())
         self._send(("end",))
         self._process.join()
+        with suppress(EOFError, ConnectionError):
+            refused = self._pipe.recv()
+            if isinstance(refused, InputError):
+                raise refused
 
     def close(self) -> None:
         """Ends the other process, whatever it does."""
@@ -298,8 +303,10 @@ def _restored(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], value
 
 
 def _written(learner: OffPolicyLearner, path: Path, table: pa.Table) -> object:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table, path, compression="NONE", use_dictionary=False)
+    try:
+        write_ledger(path, table)
+    except InputError as error:
+        return error
     return _NOTHING
 
 

@@ -19,7 +19,7 @@ from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.errors import InputError
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.operate.checks import confirm, read_out
-from guiderail.tools.operate.keys import Keys, listening
+from guiderail.tools.operate.keys import listening
 from guiderail.tools.operate.places import Places
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
@@ -29,10 +29,9 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class AtRobot:
-    """What episodes need: the environment, a person's keys, and how regularly the robot was heard until now."""
+    """What episodes need: the environment, and how regularly the robot was heard until now."""
 
     env: RobotEnv
-    keys: Keys
     timing: Callable[[], Mapping[str, Any]]
 
 
@@ -84,8 +83,8 @@ def at_robot(config: RunConfig, other: Other, *, yes: bool, say: Say) -> Iterato
             say=say,
             places=Places(task, station.lcm, station.driver, config.seed) if other.rehearse else None,
         )
-        read_out(env.checks(), say, is_confirmed=yes)
+        read_out(env.checks(), say, again=env.checks_again, is_confirmed=yes)
         if not other.lockstep and not hurry():
             say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
-        say("Enter or Ctrl-C stops the arm, p and Enter pauses it at the end of an episode")
-        yield AtRobot(env, keys, lambda: other.timing(station, clock))
+        say(keys.words(pauses=True))
+        yield AtRobot(env, lambda: other.timing(station, clock))

@@ -51,7 +51,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
     p_WT = arm.target.CalcPoseInWorld(plant.CreateDefaultContext()).translation()
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     payload = sum(body.default_mass() for body in arm.tool)
-    load = station.load_of_force(positions).max()
+    load, along = station.load_of_force(positions).max(), station.impedance.limits[:3]
     limits, has_deputy = station.limits, station.has_deputy(context)
     nobody = "nobody stands by: start guiderail stand-by on the driver's machine"
     somebody = "somebody commands it: end the other program, or wait until the deputy has brought the arm to rest"
@@ -79,25 +79,46 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
             f"{away / MM:.0f} mm and {np.rad2deg(turned):.0f} degrees away",
             away < FARTHEST and turned < FARTHEST_TURN,
         ),
-        Check("force", f"at most {max(station.impedance.limits[:3]):.0f} N commanded, {limits.force:.0f} N felt"),
+        Check(
+            "force",
+            f"at most {max(along):.0f} N commanded along an axis, {np.linalg.norm(along):.0f} N askew, "
+            f"{limits.force:.0f} N felt",
+        ),
         Check("torques", f"at most {list(limits.torque)} Nm sent; the full force takes {load:.0%} of the nearest"),
         Check("workspace", f"from {limits.lower} to {limits.upper} m around the target"),
     ]
 
 
-def read_out(checks: Sequence[Check], say: Callable[[str], None], *, is_confirmed: bool) -> None:
+def read_out(
+    checks: Sequence[Check],
+    say: Callable[[str], None],
+    *,
+    again: Callable[[], Sequence[Check]],
+    is_confirmed: bool,
+) -> None:
     """Says them, and has them confirmed.
 
+    Args:
+        checks: of before.
+        say: what a person is told.
+        again: the checks of now: while a person thinks, anything may happen.
+        is_confirmed: nobody is asked.
+
     Raises:
-        InputError: if one fails, or nobody confirms.
+        InputError: if one fails, before or after the question, or nobody confirms.
     """
     for check in checks:
         say(f"{'ok ' if check.is_well else 'NOT'}  {check.name:<12}{check.words}")
+    _refuse_wrong(checks)
+    if not is_confirmed:
+        confirm("Is all of this so, and is the workspace clear?")
+        _refuse_wrong(again())
+
+
+def _refuse_wrong(checks: Sequence[Check]) -> None:
     wrong = [check for check in checks if not check.is_well]
     if wrong:
         raise InputError(f"the arm stays where it is: {wrong[0].name}: {wrong[0].words}")
-    if not is_confirmed:
-        confirm("Is all of this so, and is the workspace clear?")
 
 
 def confirm(question: str) -> None:

@@ -88,6 +88,7 @@ def evaluate_on_robot(
                         write(rows)
                         env.idle()
                         progress.update(rows[-1])
+                        env.pause()
                 finally:
                     try:
                         env.rest()

@@ -32,6 +32,12 @@ class Keys:
                 self._is_stopped = True
         return self._is_stopped
 
+    def words(self, *, pauses: bool = False) -> str:
+        """What a person is told of them: where nobody can type, Ctrl-C alone; `pauses` where there are episodes."""
+        if not sys.stdin.isatty():
+            return "Ctrl-C stops the arm"
+        return "Enter or Ctrl-C stops the arm" + pauses * ", p and Enter pauses it at the end of an episode"
+
     def press(self) -> None:
         """As if Enter had been pressed."""
         self._is_stopped = True

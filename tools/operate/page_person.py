@@ -43,7 +43,7 @@ class PagePerson(Person):
         self._say, self._sliders = say, list[str]()
         self._clicks: dict[str, int] = {}
         self._view: View | None = None
-        self._looks = False
+        self._looks = self._is_stopped = False
         for name, (key, _) in SAYS.items():
             self.meshcat.AddButton(name, key)
         self.meshcat.AddButton(LET_GO, LET_GO_KEY)
@@ -57,7 +57,7 @@ class PagePerson(Person):
             time.sleep(0.1)
 
     def begin(self, env: gymnasium.Env) -> None:
-        """Shows the episode from here on, with all sliders let go."""
+        """Shows the episode from here on, with all sliders let go; of what was said before it, a stop alone counts."""
         base = cast(Any, env.unwrapped)
         self._name_sliders(base)
         if base.task.query is not None:
@@ -68,7 +68,7 @@ class PagePerson(Person):
             base.simulator.set_monitor(self._view.follow)
             base.simulator.set_target_realtime_rate(1.0)
         self._let_go()
-        self.says()
+        self._is_stopped = self.says() == "stop"
 
     def push(self, observation: np.ndarray) -> np.ndarray | None:
         """Where the sliders are; None while all are let go."""
@@ -79,7 +79,7 @@ class PagePerson(Person):
 
     def says(self) -> str | None:
         """What was clicked last."""
-        said = None
+        said, self._is_stopped = "stop" if self._is_stopped else None, False
         for name, (_, word) in SAYS.items():
             if self._clicked(name):
                 said = word

@@ -48,10 +48,18 @@ class Other:
 
     @classmethod
     def in_scenario(cls, file: Path | None, **given: Any) -> Other:
-        """What a scenario's file says, if there is one, and for the rest what is given by name."""
+        """What a scenario's file says, if there is one, and for the rest what is given by name.
+
+        Raises:
+            InputError: for a file that makes no sense, or another robot or bus than the file's.
+        """
         if file is None:
             return cls(**given)
         said = load_scenario(file)
+        for name, theirs in (("robot", said.robot), ("lcm_url", said.lcm_url)):
+            if given.get(name) and theirs and given[name] != theirs:
+                option = name.replace("_", "-")
+                raise InputError(f"{file} says {theirs}, and --{option} {given[name]}: leave one of the two out")
         rehearse = said.is_simulated or given.get("rehearse", False)
         url = given.get("lcm_url", "") if rehearse else said.lcm_url or given.get("lcm_url", "")
         return cls(**given | {"lcm_url": url, "robot": said.robot, "scenario": file, "rehearse": rehearse})

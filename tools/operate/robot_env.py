@@ -114,6 +114,15 @@ class RobotEnv(GuidedEnv):
         """What the robot's first statuses say, and what is assumed of it: before anything moves."""
         return check_robot(self._elsewhere, self._moving.get_context(), self._start, self._heard.count)
 
+    def checks_again(self) -> list[Check]:
+        """The same of now, after a person took their time, in which nobody listened."""
+        self._pace.begin()
+        self._pass(self._steps)
+        # A simulator that knew where the arm was would not believe at once where somebody moved it meanwhile.
+        self._moving = self._initialized()
+        self._pass(LISTENING)
+        return self.checks()
+
     def _initialized(self) -> Simulator:
         simulator = Simulator(self._elsewhere)
         self._elsewhere.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
@@ -159,6 +168,7 @@ class RobotEnv(GuidedEnv):
 
     def step(self, action):
         """As `GuidedEnv.step`; where the arm is stopped, the episode is truncated."""
+        begun = len(self.trace)
         try:
             following, reward, terminated, truncated, info = super().step(action)
         except RobotStoppedError as stopped:
@@ -166,7 +176,7 @@ class RobotEnv(GuidedEnv):
             self._running, self.fault = False, stopped.fault
             self._come_to_rest()
             terms = dict.fromkeys(self.task.reward_terms, 0.0)
-            info = self._info(0, *self._violations, 0.0, False, terms)
+            info = self._info(0, *self._since(begun), terms)
             info |= {"termination": "stopped", "stopped": str(stopped)}
             return self._observation, 0.0, False, True, info
         if terminated or truncated:
@@ -174,6 +184,20 @@ class RobotEnv(GuidedEnv):
             if info["is_success"] and not self._holds():
                 info |= {"is_success": False, "termination": "did_not_hold"}
         return following, reward, terminated, truncated, info
+
+    def _since(self, begun: int) -> tuple[float, float, float, bool]:
+        """Worst commanded and measured violation, largest force and fallback of the control steps from that one on."""
+        signals = {name: values[begun:, 0] for name, values in self.trace.signals.items()}
+        if not len(self.trace) > begun:
+            return *self._violations, 0.0, False
+        commanded, measured = (float(signals[name].max()) for name in ("commanded_violation", "measured_violation"))
+        return commanded, measured, float(self.trace.force[begun:].max()), bool(signals["fallback"].any())
+
+    def pause(self) -> None:
+        """Brings the arm to rest between two episodes where somebody asked for it; the next reset asks to go on."""
+        if self._keys.wants_pause:
+            self._keys.wants_pause = False
+            self.rest()
 
     def idle(self) -> None:
         """Holds the arm for a control step, so that whoever calls this between other work isn't missed."""
@@ -270,6 +294,8 @@ class RobotEnv(GuidedEnv):
     def _take_over(self) -> None:
         """Until the arm follows."""
         self._elsewhere_acts()
+        if self._elsewhere.get_phase_output_port().Eval(self._mine)[0] == Phase.WAITING:
+            self._pace.begin()  # nothing was sent yet: how long nobody listened is no gap between statuses
         here, waited = self.pose, 0.0
         while self._elsewhere.get_phase_output_port().Eval(self._mine)[0] != Phase.RUNNING:
             self._command(here)

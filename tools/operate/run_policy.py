@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from collections.abc import Callable, Mapping
@@ -12,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
@@ -29,13 +27,13 @@ from guiderail.models.joint_status import FAULTS, Fault
 from guiderail.models.policy import Policy
 from guiderail.models.units import DEGREE, MM
 from guiderail.systems.torque_guard import Phase
-from guiderail.tools.files import write_atomically
+from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.operate.checks import Check, check_robot, read_out
 from guiderail.tools.operate.crawl import CRAWL, crawl, distance, is_near
 from guiderail.tools.operate.keys import listening, no_pauses
 from guiderail.tools.operate.rehearsal import Other
-from guiderail.tools.rollouts.ledger import ledger_file, table
+from guiderail.tools.rollouts.ledger import ledger_file, table, write_ledger
 
 SIGNALS = {"wrench": 6, "saturation": 1, "holding": 1, "fallback": 1, "commanded_violation": 1, "fault": 1, "phase": 1}
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
@@ -98,6 +96,15 @@ class Operation:
     def checks(self) -> list[Check]:
         """What the robot's first statuses say, and what is assumed of it."""
         return check_robot(self._station, self._simulator.get_context(), self._start, self._heard.count)
+
+    def checks_again(self) -> list[Check]:
+        """The same of now, after a person took their time, in which nobody listened."""
+        self._pace.begin()
+        self._pace.advance(self._simulator, self._station, self._steps)
+        # A simulator that knew where the arm was would not believe at once where somebody moved it meanwhile.
+        self._simulator = self._initialized()
+        self._pace.advance(self._simulator, self._station, LISTENING)
+        return self.checks()
 
     def run(self, say: Say) -> Outcome:
         """Takes over where the arm is, approaches the skill's start at a crawl, executes it, and lets the arm rest.
@@ -243,10 +250,8 @@ class Operation:
         for name, values in self._joints.items():
             for joint, column in enumerate(np.reshape(values[: len(self.trace)], (len(self.trace), joints)).T):
                 ledger = ledger.append_column(f"{name}_{joint}", pa.array(column))
-        file = io.BytesIO()
-        pq.write_table(ledger, file, compression="NONE", use_dictionary=False)
         path = ledger_file(folder, number)
-        write_atomically(path, file.getvalue())
+        write_ledger(path, ledger)
         write_atomically(path.with_suffix(".json"), json.dumps(dict(found), indent=2).encode() + b"\n")
         return path
 
@@ -277,10 +282,12 @@ def run_policy(
         say: what a person is told.
 
     Raises:
-        InputError: for what can't be run, where no robot answers, or a check fails or isn't confirmed.
+        InputError: for what can't be run, or recorded there, where no robot answers, or a check fails or isn't
+            confirmed.
     """
-    folder = RunFolder(run)
+    folder, recorded = RunFolder(run), out or run / "hardware"
     config, policy = folder.config(), Policy.load(folder.path)
+    check_writable(ledger_file(recorded, 0))
     environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
     task = resolve(config.task, environment).task
     if not isinstance(task, InsertionTask):
@@ -292,10 +299,10 @@ def run_policy(
         say(f"waiting for {other.robot} on {environment['lcm_url'] or 'LCM'}, channel {bus.driver.status_channel}")
         operation = Operation(task, skill, pace, keys.stops)
         checks = operation.checks()
-        read_out(checks, say, is_confirmed=yes)
+        read_out(checks, say, again=operation.checks_again, is_confirmed=yes)
         if not other.lockstep and not hurry():
             say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
-        say("Enter or Ctrl-C stops the arm")
+        say(keys.words())
         found: dict[str, Any] = {
             "task": config.task,
             "run": folder.path.name,
@@ -310,7 +317,7 @@ def run_policy(
                 outcome = Outcome(Fault.NONE, f"failed: {type(error).__name__}: {error}", len(operation.trace))
                 raise
             finally:
-                operation.keep(out or run / "hardware", outcome, {**found, **other.timing(bus, clock)}, say)
+                operation.keep(recorded, outcome, {**found, **other.timing(bus, clock)}, say)
     return outcome.exit_code
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import yaml
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.lcm import DrakeLcmParams
@@ -12,6 +13,8 @@ from pydrake.multibody.parsing import ModelDirective
 from guiderail.models.errors import InputError
 
 HARDWARE, SIMULATION = "hardware", "simulation"
+# Of Drake's own classes. Another word would be passed over: with a suffix, another robot than the one meant would move.
+FOLLOWED = ("control_mode", "lcm_bus", "lcm_url")
 
 
 @dataclass
@@ -60,7 +63,8 @@ def load_scenario(path: Path) -> Scenario:
     """Reads a scenario.
 
     Raises:
-        InputError: if there is no such file, or it makes no sense.
+        InputError: if there is no such file, it makes no sense, or it says of a driver or a bus what nothing here
+            follows.
     """
     if not path.is_file():
         raise InputError(f"there is no scenario {path}")
@@ -80,4 +84,12 @@ def load_scenario(path: Path) -> Scenario:
         raise InputError(
             f"{path}: {scenario.robot}'s driver is on the bus {driver.lcm_bus!r}, which is none of its own"
         )
+    for said in (driver, scenario.lcm_buses[driver.lcm_bus]):
+        for name in (one.name for one in getattr(said, "__fields__", ()) if one.name not in FOLLOWED):
+            value = getattr(said, name)
+            if not np.array_equal(value, getattr(type(said)(), name)):
+                raise InputError(
+                    f"{path}: {name} is {value!r}, which nothing here follows: leave it out, and start the driver "
+                    "without it"
+                )
     return scenario

@@ -19,7 +19,7 @@ from guiderail.tools.learning.learner import LEARNERS, arguments_of
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.student import Spaces, Student
 from guiderail.tools.operate.at_robot import Say, at_robot
-from guiderail.tools.operate.keys import Keys, no_pauses
+from guiderail.tools.operate.keys import no_pauses
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.robot_env import RobotEnv
 from guiderail.tools.rollouts.ledger import ledger_file, table
@@ -67,7 +67,7 @@ def train_on_robot(
         folder.write_config(config)
         try:
             with no_pauses(), EpisodeProgress(config.episodes, name=config.task) as progress:
-                rows = _learn(folder, config, robot.env, robot.keys, waits=other.lockstep, report=progress.update)
+                rows = _learn(folder, config, robot.env, waits=other.lockstep, report=progress.update)
         finally:
             timing = pd.Series(dict(robot.timing()), dtype=object)
             write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
@@ -82,7 +82,6 @@ def _learn(
     folder: RunFolder,
     config: RunConfig,
     env: RobotEnv,
-    keys: Keys,
     *,
     waits: bool,
     report: Callable[[dict[str, Any]], None],
@@ -129,9 +128,7 @@ def _learn(
                 due.pop(0)
                 env.idle()
             report(row)
-            if keys.wants_pause:
-                keys.wants_pause = False
-                env.rest()
+            env.pause()
         env.rest()
         student.finish()
     except BaseException:

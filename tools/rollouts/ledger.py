@@ -60,10 +60,7 @@ class Ledger(EnvObserver):
     def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Writes; adds no column."""
         started = time.perf_counter()
-        file = io.BytesIO()
-        # Random digits hardly compress, and whoever packs them pays with time.
-        pq.write_table(table(self.base.trace, row["episode"]), file, compression="NONE", use_dictionary=False)
-        write_atomically(ledger_file(self._folder, row["episode"]), file.getvalue())
+        write_ledger(ledger_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
         self.seconds += time.perf_counter() - started
         return {}
 
@@ -97,6 +94,18 @@ def table(trace: Trace, episode: int) -> pa.Table:
 
 def _numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{name}_{index}": values[:, index] for index in range(values.shape[1])}
+
+
+def write_ledger(path: Path, rows: pa.Table) -> None:
+    """Writes an episode's control steps: whole, or not at all.
+
+    Raises:
+        InputError: if they cannot be written.
+    """
+    file = io.BytesIO()
+    # Random digits hardly compress, and whoever packs them pays with time.
+    pq.write_table(rows, file, compression="NONE", use_dictionary=False)
+    write_atomically(path, file.getvalue())
 
 
 def read_ledger(folder: Path, columns: list[str] | None = None) -> pd.DataFrame:

@@ -2,14 +2,19 @@
 
 import gymnasium
 import numpy as np
+import pyarrow as pa
+import pytest
 
+from guiderail.models.errors import InputError
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.presets import resolve_preset
-from guiderail.tools.learning.student import Student
+from guiderail.tools.learning.student import Student, _written
+from guiderail.tools.rollouts.ledger import read_ledger
 from guiderail.tools.rollouts.rollout import Decision
 
 
-def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(forkserver):
+def made(**more):
+    """A student of two numbers, its learner, and what its process is told."""
     space = gymnasium.Env()
     space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
     space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -17,7 +22,33 @@ def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(f
     preset = resolve_preset("robust", "sac", small)
     named = {"hold": 1, "seed": 0, "decisions": 100, "symmetry": None}
     acting = LEARNERS.get("sac")(preset, space, **named)
-    student = Student(acting, ((preset, space), named), waits=True, leaves_out=("stopped",))
+    return Student(acting, ((preset, space), named), waits=True, **more), acting
+
+
+def test_a_ledger_is_whole_or_not_there(tmp_path, monkeypatch):
+    rows, file = pa.table({"episode": np.zeros(9, np.int32)}), tmp_path / "ledger" / "episode-000000.parquet"
+
+    def fail(*names):
+        raise OSError("the process was killed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", fail)
+        assert isinstance(_written(None, file, rows), InputError)
+    assert list(tmp_path.rglob("*.parquet")) == []
+    _written(None, file, rows)
+    assert len(read_ledger(file.parent)) == 9
+
+
+def test_a_ledger_that_cannot_be_written_is_said_by_who_acts(forkserver, tmp_path):
+    (tmp_path / "file").write_text("")
+    student, _ = made()
+    student.write(tmp_path / "file" / "episode-000000.parquet", pa.table({"episode": [0]}))
+    with pytest.raises(InputError, match="cannot be written"):
+        student.finish()
+
+
+def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(forkserver):
+    student, acting = made(leaves_out=("stopped",))
     before = acting.actor().state_dict()["mu.weight"].clone()
     rng, last = np.random.default_rng(0), {"success": False}
     for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):

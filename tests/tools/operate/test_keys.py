@@ -1,4 +1,5 @@
 import gc
+import io
 import os
 import pty
 import signal
@@ -29,6 +30,15 @@ def test_enter_stops_and_p_pauses(terminal):
     assert keys.stops()
     keys.take_back()
     assert not keys.stops()
+
+
+def test_a_person_is_told_of_the_keys_that_there_are(terminal, monkeypatch):
+    assert Keys().words() == "Enter or Ctrl-C stops the arm"
+    assert "p and Enter pauses" in Keys().words(pauses=True)
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))  # a pipe: what comes through it stops nothing
+    keys = Keys()
+    assert not keys.stops()
+    assert keys.words(pauses=True) == "Ctrl-C stops the arm"
 
 
 def test_control_c_stops_the_arm_and_again_the_process():

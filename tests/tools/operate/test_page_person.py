@@ -1,9 +1,12 @@
 """Who watches a run through a page: sliders are a push while they are not let go, and each click is one word."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 
+from guiderail.tools.operate import page_person
 from guiderail.tools.operate.page_person import FARTHEST, KEYS, LET_GO, SAYS, PagePerson
 from guiderail.tools.tasks import make_environment
 
@@ -63,6 +66,18 @@ def test_a_click_is_one_word(env):
     for name, (_, word) in SAYS.items():
         page.clicks[name] += 2
         assert person.says() == word
+        assert person.says() is None
+
+
+def test_of_what_is_said_between_two_episodes_a_stop_alone_counts(env, monkeypatch):
+    page = Page()
+    person = PagePerson(print, page)
+    monkeypatch.setattr(page_person, "look_at", lambda page, declaration: None)
+    monkeypatch.setattr(page_person, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
+    for name, (_, word) in SAYS.items():
+        page.clicks[name] += 1
+        person.begin(env)
+        assert person.says() == ("stop" if word == "stop" else None)
         assert person.says() is None
 
 

@@ -191,8 +191,37 @@ def test_nobody_confirms_for_a_person(monkeypatch):
 def test_a_check_that_fails_is_never_confirmed():
     said = []
     with pytest.raises(InputError, match="stays where it is: load"):
-        checks.read_out([checks.Check("load", "9 N", False)], said.append, is_confirmed=True)
+        checks.read_out([checks.Check("load", "9 N", False)], said.append, again=list, is_confirmed=True)
     assert said == ["NOT  load        9 N"]
+
+
+def test_what_is_confirmed_is_checked_again_before_the_arm_moves(operated, monkeypatch):
+    operation, pace = operated()
+    aside = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
+    monkeypatch.setattr(
+        checks, "confirm", lambda question: pace.robot.set_pose(pace.simulator.get_mutable_context(), aside)
+    )
+    with pytest.raises(InputError, match="stays where it is: start"):
+        checks.read_out(operation.checks(), print, again=operation.checks_again, is_confirmed=False)
+
+
+def test_the_force_that_is_read_out_is_the_largest_that_there_is(operated):
+    operation, _ = operated()
+    words = {check.name: check.words for check in operation.checks()}["force"]
+    limits = operation._station.impedance.limits[:3]
+    assert f"{max(limits):.0f} N commanded along an axis, {np.linalg.norm(limits):.0f} N askew" in words
+
+
+def test_a_place_where_nothing_can_be_recorded_is_refused_before_anything_is_heard(monkeypatch, tmp_path):
+    def subscribe(url):
+        raise AssertionError("the bus was opened")
+
+    monkeypatch.setattr("guiderail.diagrams.stations.hardware.open_bus", subscribe)
+    monkeypatch.setattr(run_policy.Policy, "load", lambda folder: lambda observation: np.zeros(2))
+    RunFolder(tmp_path / "run").write_config(configure("BncConnector", {"guidance": "kmp"}, episodes=1))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        run_policy.run_policy(tmp_path / "run", Other(), yes=True, out=tmp_path / "file" / "out")
 
 
 def test_an_arm_whose_driver_does_not_stop_it_needs_a_deputy(operated):

@@ -6,10 +6,12 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.hardware import SimulatedIiwa
 from guiderail.models.errors import InputError
+from guiderail.tools.command import main
 from guiderail.tools.operate.rehearsal import Other
 from guiderail.tools.operate.scenario import load_scenario
 
 SHIPPED = Path(__file__).parents[3] / "examples" / "connector.scenario.yaml"
+OF_BUS = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only, lcm_bus: bus, %s}}\n"
 DRIVER = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only, lcm_bus: bus}}\n"
 BUS = "lcm_buses: {bus: {lcm_url: 'udpm://239.255.76.67:7668?ttl=0'}}\n"
 
@@ -53,12 +55,36 @@ def test_the_shipped_one_is_a_rehearsal():
         ("directives: 3\n", "is no scenario"),
         ("{{", "is no scenario"),
         ("nonsense: 1\n", "nonsense"),
+        (BUS.replace("'}}", "', channel_suffix: _LEFT}}") + DRIVER, "channel_suffix is '_LEFT'"),
+        (BUS + OF_BUS % "lcm_status_period: 0.001", "lcm_status_period is 0.001"),
+        (BUS + OF_BUS % "desired_kp_gains: [1, 2]", "desired_kp_gains"),
     ],
 )
 def test_refuses_in_a_sentence(written, text, words):
     with pytest.raises(InputError, match=words) as refused:
         load_scenario(written(text))
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [({"robot": "panda"}, "--robot panda"), ({"lcm_url": "udpm://239.255.76.67:7777?ttl=0"}, "--lcm-url udpm")],
+)
+def test_another_robot_or_bus_than_the_files_is_refused(written, given, words):
+    file = written(f"station: hardware\n{BUS}{DRIVER}")
+    with pytest.raises(InputError, match=words):
+        Other.in_scenario(file, **given)
+    same = Other.in_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
+    assert same == Other.in_scenario(file)
+
+
+def test_a_robot_is_the_scenarios_unless_another_one_is_named(written, capsys):
+    file = written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")
+    for more, words in (([], "not a run"), (["--robot", "iiwa14"], "--robot iiwa14")):
+        with pytest.raises(SystemExit) as end:
+            main(["run", str(file.parent), "--scenario", str(file), *more])
+        assert end.value.code == 2
+        assert words in capsys.readouterr().err
 
 
 def test_directives_say_what_stands_around_a_simulated_robot(written, tmp_path):

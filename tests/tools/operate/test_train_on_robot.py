@@ -1,6 +1,7 @@
 """Learning on a robot: episodes as motions, both sides of the bus in one process."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -18,7 +19,7 @@ from guiderail.models.policy import Policy
 from guiderail.systems.torque_guard import Phase
 from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.operate.at_robot import AtRobot
+from guiderail.tools.operate.at_robot import AtRobot, at_robot
 from guiderail.tools.operate.crawl import CRAWL
 from guiderail.tools.operate.evaluate_on_robot import evaluate_on_robot
 from guiderail.tools.operate.keys import Keys
@@ -32,9 +33,9 @@ from guiderail.tools.rollouts.rollout import rollout
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "reward": "shaped", "hold": 5}
 
 
-def make(patch, start):
+def make(patch, start, **options):
     """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
-    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
+    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS | options)
     patch.setattr(resolved.task, "num_steps", 10)
     with patch.context() as bus:
         bus.setattr("guiderail.diagrams.stations.hardware.open_bus", lambda url: lcm)
@@ -90,13 +91,15 @@ def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_pat
     @contextmanager
     def there(config, other, *, yes, say):
         assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
-        yield AtRobot(env, env.keys, dict)
+        yield AtRobot(env, dict)
 
     monkeypatch.setattr("guiderail.tools.operate.evaluate_on_robot.at_robot", there)
     learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
     RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
+    env.keys.wants_pause = True
     found = evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
     assert (found["episodes"], found["success_rate"]) == (2, 0.0)
+    assert (env.asked, env.keys.wants_pause) == (["somebody asked for it"], False)  # after the first, and once
     rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
     assert rows["termination"].tolist() == ["time_limit"] * 2
     with pytest.raises(InputError, match="already exists"):
@@ -124,7 +127,7 @@ def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, t
 
     monkeypatch.setattr(env, "idle", refuse)
     with pytest.raises(InputError, match="not confirmed"):
-        _learn(folder, config, env, env.keys, waits=True, report=lambda row: None)
+        _learn(folder, config, env, waits=True, report=lambda row: None)
     assert "policy.json" not in before[-1]
     assert folder.episodes()["termination"].tolist() == ["time_limit"] * 2
     assert len(read_ledger(folder.ledger)) == 20
@@ -145,6 +148,81 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     assert env.asked == []
     env.reset()
     assert env.asked == ["somebody asked for it"]
+
+
+def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decision_that_was_cut(monkeypatch):
+    monkeypatch.setattr("guiderail.tools.operate.crawl.SETTLE", 0.1)
+    env = make(monkeypatch, START, guidance="residual", bound=0.0005)
+    decisions = []
+
+    def act(observation):
+        decisions.append(observation)
+        if len(decisions) == 2:
+            env.pace.happens = {env.pace.step + 16: env.keys.press}  # in the decision's fourth of five control steps
+        return np.full(2, len(decisions) - 1.0)
+
+    infos = []
+    step = env.step
+    monkeypatch.setattr(env, "step", lambda action: infos.append(found := step(action)) or found)
+    row = rollout(env, act)
+    assert (row["termination"], row["steps"]) == ("stopped", 8)
+    for column, key, signal in (
+        ("worst_violation", "constraint_violation", "commanded_violation"),
+        ("worst_measured_violation", "measured_violation", "measured_violation"),
+    ):
+        seen = env.trace.signals[signal]
+        assert row[column] == seen.max() > seen[:5].max()
+        assert infos[-1][-1][key] == seen[5:].max()
+    assert infos[-1][-1]["contact_force"] == env.trace.force[5:].max()
+
+
+@pytest.fixture
+def ready(monkeypatch):
+    """An arm that waits for `at_robot`, which is told to begin; and what a person is asked."""
+    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
+    pace, asked = Together(resolved.task.world(), lcm, START), []
+
+    @contextmanager
+    def nobody(other, *where):
+        yield
+
+    monkeypatch.setattr("guiderail.diagrams.stations.hardware.open_bus", lambda url: lcm)
+    monkeypatch.setattr(Other, "standing_in", nobody)
+    monkeypatch.setattr(Other, "paces", lambda other, station: (pace, None))
+    monkeypatch.setattr("guiderail.tools.operate.at_robot.hurry", lambda: True)
+    monkeypatch.setattr("guiderail.tools.operate.checks.confirm", asked.append)
+    config = configure("BncConnector", OPTIONS, seed=0, episodes=1)
+    return pace, asked, lambda: at_robot(config, Other(), yes=False, say=lambda words: None)
+
+
+@pytest.mark.parametrize("name", ["start", "deputy", "commands"])
+def test_what_changes_while_the_person_thinks_is_seen_before_the_arm_moves(ready, monkeypatch, name):
+    pace, _, begin = ready
+    lcm = pace.deputy._lcm
+
+    def change(question):
+        if name == "start":
+            pose = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
+            pace.robot.set_pose(pace.simulator.get_mutable_context(), pose)
+        elif name == "deputy":
+            monkeypatch.setattr(pace.deputy, "_driver", replace(IIWA_DRIVER, command_channel="ANOTHER"))
+        else:
+            lcm.Publish(IIWA_DRIVER.command_channel, IIWA_DRIVER.encode(1.0, np.zeros(7)))
+
+    monkeypatch.setattr("guiderail.tools.operate.checks.confirm", change)
+    with pytest.raises(InputError, match=f"stays where it is: {name}"), begin():
+        pass
+
+
+def test_time_in_which_nobody_moves_the_arm_is_no_gap_between_its_statuses(ready, monkeypatch):
+    """Of the person who reads, and of whatever is made before the first reset."""
+    pace, asked, begin = ready
+    with begin() as robot:
+        assert (len(asked), robot.env._heard.count) == (1, 0)  # nothing was sent yet
+        begun, step = [], pace.step
+        monkeypatch.setattr(pace, "begin", lambda: begun.append(pace.step))
+        robot.env._take_over()
+        assert begun == [step]
 
 
 def test_an_arm_that_somebody_else_commands_is_left_alone(monkeypatch):
