@@ -9,13 +9,14 @@ from guiderail.tools.studies.aiming_person import aiming_person, blind_person
 from guiderail.tools.studies.declaration import LEARNED, load_study
 from guiderail.tools.studies.study import Job
 
-HARD = ("pouring_hard", "pouring_hard_nulls", "pouring_balls_nulls", "narrow_passage_hard_nulls")
+HARD = ("pouring_hard", "pouring_hard_nulls", "pouring_balls_nulls", "narrow_passage_hard", "narrow_passage_hard_nulls")
 SWEEPS = ("connector_sweep", "grid_clamp_sweep", "pouring_sweep", "narrow_passage_sweep")
 # Of what was learned at the hardest, by whose study a sweep finds it.
 LEARNED_BY = {
     "connector_sweep": "connector_hard",
     "grid_clamp_sweep": "grid_clamp_hard",
     "pouring_sweep": "pouring_hard",
+    "narrow_passage_sweep": "narrow_passage_hard",
 }
 
 
