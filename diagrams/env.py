@@ -15,7 +15,7 @@ from pydrake.systems.framework import PortDataType
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.trace import Trace
 from guiderail.diagrams.view import View
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.policy_system import PolicyError
 
@@ -185,7 +185,8 @@ class GuidedEnv(DrakeGymEnv):
         """Holds `action` for `hold` control steps, or until the episode ends.
 
         Raises:
-            InputError: if the action is not finite or of the wrong shape; finite ones outside [-1, 1] are clipped.
+            InputError: if the action is not finite or of the wrong shape; finite ones outside [-1, 1] are clipped. If
+                a term of the reward or the observation is not finite where the simulation itself went well.
         """
         action = self._checked(action)
         if not self._running:
@@ -297,7 +298,12 @@ class GuidedEnv(DrakeGymEnv):
     def _observe(self, context) -> np.ndarray:
         if self._image_observation:
             return self.observation_port.Eval(context).data[:, :, :3].copy()
-        return self.observation_port.Eval(context).astype(self.observation_space.dtype)
+        observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)
+        # A learner that takes this in diverges, and is blamed for it episodes later.
+        if not np.isfinite(observation).all():
+            of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
+            raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
+        return observation
 
     def _info(self, termination, commanded_violation, measured_violation, force, fallback, terms) -> dict[str, Any]:
         return {

@@ -181,7 +181,8 @@ class Loop:
         ports = {name: self.signals.get(name, whose) for name in names}
         duration = task.num_steps * station.control_period
         sizes = {name: port.size() for name, port in ports.items()}
-        diagram = self.builder.AddNamedSystem("observation", Observation(observed, sizes, duration, task.clip))
+        seen = Observation(observed, sizes, duration, task.clip, task.name)
+        diagram = self.builder.AddNamedSystem("observation", seen)
         for name, port in ports.items():
             self.builder.Connect(port, diagram.GetInputPort(name))
         return diagram.space, diagram.get_observation_output_port()

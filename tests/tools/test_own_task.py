@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.make import make_env, resolve
-from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.observation import Observed, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.errors import InputError
@@ -127,6 +127,49 @@ def test_settings_of_another_guidance_are_no_mistake():
 def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, says):
     declare(**attributes)
     with pytest.raises(InputError, match=says):
+        first_step()
+
+
+@pytest.mark.parametrize(
+    ("observed", "says"),
+    [
+        ((), "the observation of lab/Own is of nothing: let observed"),
+        ((Observed("pose", entries=()),), "the observation of lab/Own is of nothing"),
+        ((Observed("pose", scale=0.0),), "the scale of the observed signal 'pose' of lab/Own divides it, .* be 0.0"),
+        ((Observed("phase"), Observed("pose", scale=[0.5, 0.0])), "the scale .* 'pose' .* cannot be"),
+        ((Observed("pose", scale=1e-320),), "the scale of the observed signal 'pose' of lab/Own divides it"),
+        ((Observed("pose", scale=np.nan),), "the scale .* 'pose' of lab/Own is a finite number, or 2 of them, not nan"),
+        ((Observed("pose", scale=[1.0, 2.0, 3.0]),), "the scale .* is a finite number, or 2 of them, not"),
+        ((Observed("pose", scale="a"),), "the scale .* is a finite number, or 2 of them, not 'a'"),
+        ((Observed("pose", centre=np.inf),), "the centre .* is a finite number, or 2 of them, not inf"),
+        ((Observed("pose", entries=(0, 5)),), "the entries .* 'pose' of lab/Own are whole numbers from 0 to 1, not"),
+        ((Observed("pose", entries=1),), "the entries .* are whole numbers from 0 to 1, not 1"),
+        ((Observed("pose", entries=((0, 1),)),), "the entries .* are whole numbers from 0 to 1, not"),
+    ],
+)
+def test_what_cannot_be_observed_is_refused_when_the_task_is_assembled(observed, says):
+    declare(observed=lambda self: observed)
+    with pytest.raises(InputError, match=says):
+        make_env("lab/Own", guidance="kmp")
+
+
+def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
+    declare(observed=lambda self: (Observed("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
+    env = make_env("lab/Own", guidance="kmp")
+    seen, _ = env.reset(seed=0)
+    x, y = env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
+    np.testing.assert_allclose(seen, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number):
+    def signals(self, builder, station):
+        broken = builder.AddNamedSystem("broken", affine(np.eye(2), [0.0, number]))
+        builder.Connect(station.get_pose_output_port(), broken.get_input_port())
+        return {"broken": broken.get_output_port()}
+
+    declare(signals=signals, observed=lambda self: (Observed("phase"), Observed("broken", entries=(1,))))
+    with pytest.raises(InputError, match=r"the observation of lab/Own is not finite, but"):
         first_step()
 
 
