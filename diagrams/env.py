@@ -31,6 +31,19 @@ RECORDED = (
 )
 """Ports whose values the trace has for every control step, where a task's diagram has them."""
 
+SAID = (
+    "is_success",
+    "termination",
+    "constraint_violation",
+    "measured_violation",
+    "contact_force",
+    "fallback",
+    "control_steps",
+    "ledger",
+    "simulation_failure",
+)
+"""What `info` says of every task: no reward term and nothing that a reset draws can have one of these names."""
+
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
 # What Drake, or a system with another engine, says when the physics, and not the wiring, went wrong. Drake's own

@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from guiderail.diagrams.env import RECORDED, SAID
 from guiderail.diagrams.make import make_env, resolve
 from guiderail.diagrams.observation import Observed, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
@@ -159,6 +160,29 @@ def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
     seen, _ = env.reset(seed=0)
     x, y = env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
     np.testing.assert_allclose(seen, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*SAID, *RECORDED, "observation", "pose", "desired_pose"])
+def test_no_reward_term_takes_the_place_of_a_safety_number(name):
+    declare(reward_terms=lambda self, num_actions: [RewardTerm(name, {"pose": 2}, self.reward)])
+    with pytest.raises(InputError, match=f"no reward term of lab/Own can be called {name!r}"):
+        make_env("lab/Own", guidance="kmp")
+
+
+@pytest.mark.parametrize("name", SAID)
+def test_nothing_that_a_reset_draws_takes_the_place_of_a_safety_number(name):
+    declare(reset=lambda self, *given: {name: -9.0})
+    env = make_env("lab/Own", guidance="kmp")
+    with pytest.raises(InputError, match=f"reset of lab/Own can call nothing that it drew {name!r}"):
+        env.reset(seed=0)
+
+
+def test_a_term_can_have_the_name_of_what_only_this_guidance_has():
+    declare(reward_terms=lambda self, num_actions: [RewardTerm("held_action", {"pose": 2}, self.reward)])
+    env = make_env("lab/Own", guidance="kmp")
+    env.reset(seed=0)
+    _, reward, *_, info = env.step(np.zeros(env.action_space.shape))
+    assert info["held_action"] == reward != 0.0
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
