@@ -82,6 +82,10 @@ def declare(of=Own, **attributes):
         ({"Options": dict}, "Options of lab/Own must be a class made of Options"),
         ({"Reset": None}, "Reset of lab/Own must be a class made of ResetOptions"),
         ({"clip": None}, "clip of lab/Own must be a positive number"),
+        ({"num_steps": 0}, "num_steps of lab/Own must be a whole number of at least 1, not 0"),
+        ({"num_steps": 1.5}, "num_steps of lab/Own must be a whole number of at least 1, not 1.5"),
+        ({"num_steps": True}, "num_steps of lab/Own must be a whole number of at least 1, not True"),
+        ({"num_steps": "80"}, "num_steps of lab/Own must be a whole number of at least 1, not '80'"),
         ({"rewards": ()}, "rewards of lab/Own must be some words"),
         ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
     ],
@@ -195,6 +199,24 @@ def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number)
     declare(signals=signals, observed=lambda self: (Observed("phase"), Observed("broken", entries=(1,))))
     with pytest.raises(InputError, match=r"the observation of lab/Own is not finite, but"):
         first_step()
+
+
+@pytest.mark.parametrize("number", [0, None])
+def test_a_number_of_steps_that_a_constructor_gets_wrong_is_refused(number):
+    class Late(Own):
+        def __init__(self, options, choice):
+            super().__init__(options, choice)
+            self.num_steps = number
+
+    declare(of=Late, num_steps=np.int64(NUM_STEPS))
+    with pytest.raises(InputError, match=f"num_steps of lab/Own must be a whole number of at least 1, not {number}"):
+        make_env("lab/Own", guidance="kmp")
+
+
+def test_a_world_that_is_none_is_a_sentence():
+    declare(world=lambda self: None)
+    with pytest.raises(InputError, match=r"world\(\) of lab/Own returns nothing: let it return what station='plane'"):
+        make_env("lab/Own", guidance="kmp")
 
 
 def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
