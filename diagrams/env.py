@@ -2,7 +2,7 @@
 
 import re
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -171,6 +171,10 @@ class GuidedEnv(DrakeGymEnv):
         """
         if self._closed:
             raise InputError("the environment is closed: make another one")
+        if options is not None and not isinstance(options, Mapping):
+            raise InputError(
+                f"the options of a reset are values by name, such as {{'held_out': True}}, not {brief(options)}"
+            )
         # Not the parent's reset: it initializes before the state is set, and refuses options.
         gymnasium.Env.reset(self, seed=seed)
         self._running = False

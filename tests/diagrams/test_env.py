@@ -258,6 +258,15 @@ def test_a_simulation_failure_truncates_with_the_last_sound_observation(error):
     assert env.step([1.0])[0][0] == np.float32(0.1)
 
 
+@pytest.mark.parametrize("options", ["x", "", 3, [], [("start", 0.0)]])
+def test_options_of_a_reset_that_are_no_mapping_are_a_sentence(options):
+    env = make()
+    with pytest.raises(InputError, match="the options of a reset are values by name"):
+        env.reset(options=options)
+    assert env.reset(options={"start": 0.0})[1]["start"] == 0.0
+    env.reset(options=None)
+
+
 def test_what_info_says_of_every_task_is_listed():
     env = make(num_steps=2)
     _, info = env.reset()
