@@ -2,7 +2,7 @@
 
 import re
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from pydrake.systems.framework import PortDataType
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.trace import Trace
 from guiderail.diagrams.view import View
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.policy_system import PolicyError
 
@@ -30,6 +30,19 @@ RECORDED = (
     "state",
 )
 """Ports whose values the trace has for every control step, where a task's diagram has them."""
+
+SAID = (
+    "is_success",
+    "termination",
+    "constraint_violation",
+    "measured_violation",
+    "contact_force",
+    "fallback",
+    "control_steps",
+    "ledger",
+    "simulation_failure",
+)
+"""What `info` says of every task: no reward term and nothing that a reset draws can have one of these names."""
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
@@ -158,6 +171,10 @@ class GuidedEnv(DrakeGymEnv):
         """
         if self._closed:
             raise InputError("the environment is closed: make another one")
+        if options is not None and not isinstance(options, Mapping):
+            raise InputError(
+                f"the options of a reset are values by name, such as {{'held_out': True}}, not {brief(options)}"
+            )
         # Not the parent's reset: it initializes before the state is set, and refuses options.
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
@@ -185,7 +202,8 @@ class GuidedEnv(DrakeGymEnv):
         """Holds `action` for `hold` control steps, or until the episode ends.
 
         Raises:
-            InputError: if the action is not finite or of the wrong shape; finite ones outside [-1, 1] are clipped.
+            InputError: if the action is not finite or of the wrong shape; finite ones outside [-1, 1] are clipped. If
+                a term of the reward or the observation is not finite where the simulation itself went well.
         """
         action = self._checked(action)
         if not self._running:
@@ -297,7 +315,12 @@ class GuidedEnv(DrakeGymEnv):
     def _observe(self, context) -> np.ndarray:
         if self._image_observation:
             return self.observation_port.Eval(context).data[:, :, :3].copy()
-        return self.observation_port.Eval(context).astype(self.observation_space.dtype)
+        observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)
+        # A learner that takes this in diverges, and is blamed for it episodes later.
+        if not np.isfinite(observation).all():
+            of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
+            raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
+        return observation
 
     def _info(self, termination, commanded_violation, measured_violation, force, fallback, terms) -> dict[str, Any]:
         return {

@@ -23,7 +23,7 @@ from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.task import TaskDiagram
 from guiderail.diagrams.tasks.assemble import SkillDiagram, assemble, assemble_skill, known_of, randomizes
-from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
+from guiderail.diagrams.tasks.registry import TASKS, check_num_steps, is_task_folder, register_task_folder
 from guiderail.diagrams.tasks.task import Choice, Task
 from guiderail.models.errors import InputError, brief
 from guiderail.models.registry import did_you_mean
@@ -136,7 +136,13 @@ def _known_anywhere(task: type[Task]) -> set[str]:
 def make_station(resolved: Resolved) -> Station:
     """The station of an environment, its world in it."""
     kind, disturbances = resolved.station, resolved.models["disturbances"]
-    build = partial(kind.build, resolved.task.world(), **_values(resolved.models["station"]))
+    check_num_steps(resolved.task.name, getattr(resolved.task, "num_steps", None))
+    world = resolved.task.world()
+    if world is None:
+        raise InputError(
+            f"world() of {resolved.task.name} returns nothing: let it return what station={kind.name!r} works on"
+        )
+    build = partial(kind.build, world, **_values(resolved.models["station"]))
     return (
         disturbed(build, disturbances, kind.simulated, kind.name) if isinstance(disturbances, Disturbances) else build()
     )

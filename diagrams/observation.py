@@ -11,6 +11,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import AffineSystem, Multiplexer, PassThrough, Saturation, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 
+from guiderail.models.errors import InputError, brief
+
 CLOCKS = ("time", "phase")
 """Signals that an observation has by itself: seconds since the episode began, and the same from −1 to 1."""
 
@@ -21,7 +23,7 @@ class Observed:
 
     Attributes:
         signal: its name: a port of station, guidance or task, or one of `CLOCKS`.
-        centre, scale: numbers, or one per entry (n,), in the signal's unit.
+        centre, scale: finite numbers, or one per entry (n,), in the signal's unit; the scale is not 0.
         entries: which of the signal's numbers; all unless given.
     """
 
@@ -45,19 +47,28 @@ class Observation(Diagram):
     ``observation`` is (n,), its entries in the order in which they are listed, clipped to ± the clip.
     """
 
-    def __init__(self, observed: Sequence[Observed], sizes: Mapping[str, int], duration: float, clip: float):
+    def __init__(
+        self, observed: Sequence[Observed], sizes: Mapping[str, int], duration: float, clip: float, of: str = ""
+    ):
         """
         Args:
             observed: what is seen, at least one.
             sizes: of the signals by name.
             duration: of an episode [s].
             clip: the largest number that is seen, positive.
+            of: whose observation it is, for sentences.
+
+        Raises:
+            InputError: if nothing is seen, an entry is none of its signal's, or a centre or a scale would make no
+                finite number of a finite signal.
         """
         super().__init__()
         builder = DiagramBuilder()
         sizes = {**sizes, **dict.fromkeys(CLOCKS, 1)}
-        rows = [_rows(one, sizes[one.signal]) for one in observed]
+        rows = [_rows(one, sizes[one.signal], f" of {of}" if of else "") for one in observed]
         self.size = sum(len(scale) for _, _, scale in rows)
+        if not self.size:
+            raise InputError(f"the observation{f' of {of}' if of else ''} is of nothing: let observed() list a signal")
         together = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
         exported: set[str] = set()
         for index, one in enumerate(observed):
@@ -104,15 +115,40 @@ def _add_clock(builder: DiagramBuilder, name: str, duration: float) -> OutputPor
     return builder.AddNamedSystem(name, clock).get_output_port()
 
 
-def _rows(one: Observed, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rows(one: Observed, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which entries (n, size), their centres (n,) and scales (n,)."""
-    selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
-    number = len(selection)
-    return (
-        selection,
-        np.broadcast_to(one.centre, number).astype(float),
-        np.broadcast_to(one.scale, number).astype(float),
-    )
+    try:
+        selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
+        if selection.ndim != 2:
+            raise ValueError
+    except (IndexError, TypeError, ValueError):
+        raise InputError(
+            f"the entries of the observed signal {one.signal!r}{of} are whole numbers from 0 to {size - 1}, "
+            f"not {brief(one.entries)}"
+        ) from None
+    centre, scale = (_numbers(one, name, len(selection), of) for name in ("centre", "scale"))
+    with np.errstate(all="ignore"):
+        is_usable = np.isfinite(1.0 / scale).all() and np.isfinite(centre / scale).all()
+    if not is_usable:
+        raise InputError(
+            f"the scale of the observed signal {one.signal!r}{of} divides it, so it cannot be {brief(one.scale)}"
+        )
+    return selection, centre, scale
+
+
+def _numbers(one: Observed, name: str, number: int, of: str) -> np.ndarray:
+    """The centre or the scale of each entry, (n,)."""
+    given = getattr(one, name)
+    try:
+        numbers = np.broadcast_to(given, number).astype(float)
+        if not np.isfinite(numbers).all():
+            raise ValueError
+    except (TypeError, ValueError):
+        raise InputError(
+            f"the {name} of the observed signal {one.signal!r}{of} is a finite number, or {number} of them, "
+            f"not {brief(given)}"
+        ) from None
+    return numbers
 
 
 def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:

@@ -48,7 +48,7 @@ class RewardSystem(LeafSystem):
     def __init__(self, terms: Sequence[RewardTerm], of: str = ""):
         """
         Args:
-            terms: at least one, of different names, none of them "reward".
+            terms: at least one, of different names, none of them empty or "reward".
             of: whose reward it is, for sentences.
 
         Raises:
@@ -57,9 +57,11 @@ class RewardSystem(LeafSystem):
         """
         super().__init__()
         names = [term.name for term in terms]
-        if not names or len(set(names)) < len(names) or "reward" in names:
-            raise InputError(f"a reward needs terms of different names, other than 'reward', not {names}")
         self._terms, self._of = tuple(terms), f" of {of}" if of else ""
+        if not names or len(set(names)) < len(names) or "reward" in names or "" in names:
+            raise InputError(
+                f"a reward{self._of} needs terms of different names, neither empty nor 'reward', not {brief(names)}"
+            )
         for term in terms:
             check_takes(term.value, term.inputs, f"reward term {term.name!r}{self._of}")
         self._signals = SignalPorts(self, *(term.inputs for term in terms))

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
-from guiderail.diagrams.options import Options
+from guiderail.diagrams.options import Options, validated
 from guiderail.diagrams.register import register_envs
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_task_folder
@@ -186,6 +186,16 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             raise InputError(f"{task}'s {name} cannot be {brief(value)}: give a value such as {options[name]!r}")
     given = {name: arguments.get(name, default) for name, default in options.items()}
     return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
+
+
+def check_reset(task: str, options: Mapping[str, Any]) -> None:
+    """Refuses options that no reset of a task takes; of an environment that is no task's, whatever it takes is its own.
+
+    Raises:
+        InputError: for an unknown option, or a value of another kind or out of range.
+    """
+    if task in TASKS.names():
+        validated(TASKS.get(task).Reset, options, f"a reset of {task}")
 
 
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,11 +16,13 @@ from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
+    POSE_SIZE,
     ContactOptions,
     Impedance,
     Station,
     add_workcell_plant,
     add_wrench_sensor,
+    checked_pose,
     export_simulation_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
@@ -161,7 +163,7 @@ class KnownArm:
     def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
         """Puts an arm of a station's plant at rest with its tool centre at `pose`, (6,); `context` is the root's."""
         plant_context = plant.GetMyMutableContextFromRoot(context)
-        plant.SetPositions(plant_context, model, self.solve(pose, self.posture))
+        plant.SetPositions(plant_context, model, self.solve(checked_pose(pose, POSE_SIZE), self.posture))
         plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
 
 

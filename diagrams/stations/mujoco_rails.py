@@ -13,9 +13,11 @@ from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
+    POSE_SIZE,
     ContactOptions,
     Impedance,
     Station,
+    checked_pose,
     export_station_ports,
 )
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
@@ -94,7 +96,7 @@ class MujocoStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
-        self.rails.set_pose(self.rails.GetMyMutableContextFromRoot(context), pose)
+        self.rails.set_pose(self.rails.GetMyMutableContextFromRoot(context), checked_pose(pose, POSE_SIZE))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
         """Multiplies the engine's friction and compliance; `context` is the root context."""

@@ -16,7 +16,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
 
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import Station, export_station_ports
+from guiderail.diagrams.stations.station import Station, checked_pose, export_station_ports
 from guiderail.diagrams.task import exact_period
 from guiderail.models.objects.narrow_passage import NarrowPassage
 from guiderail.systems.command_watchdog import CommandWatchdog
@@ -156,7 +156,9 @@ class PlaneStation(Station):
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the robot's centre at (x, y), at rest; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositionsAndVelocities(plant_context, self._robot, np.concatenate([pose, np.zeros(2)]))
+        self.plant.SetPositionsAndVelocities(
+            plant_context, self._robot, np.concatenate([checked_pose(pose, 2), np.zeros(2)])
+        )
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
         """Puts the obstacles to (n, 2), in a world where they move; `context` is the root context."""

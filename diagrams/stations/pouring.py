@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import Station, export_station_ports
+from guiderail.diagrams.stations.station import POSE_SIZE, Station, checked_pose, export_station_ports
 from guiderail.diagrams.task import exact_period
 from guiderail.models.errors import InputError
 from guiderail.models.objects.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
@@ -250,7 +250,7 @@ class PouringStation(Station):
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.arm, self.solve(pose, self.posture))
+        self.plant.SetPositions(plant_context, self.arm, self.solve(checked_pose(pose, POSE_SIZE), self.posture))
         self.plant.SetVelocities(plant_context, self.arm, np.zeros(self.config.arm.num_joints))
         X_WP = self._tip.CalcPoseInWorld(plant_context)
         for ball, p_PB in zip(self._balls, self.config.stack(), strict=True):

@@ -32,6 +32,7 @@ from guiderail.diagrams.stations.station import (
     Impedance,
     Station,
     add_workcell_plant,
+    checked_pose,
     export_simulation_ports,
     export_station_ports,
 )
@@ -139,7 +140,7 @@ class RailsStation(Station):
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.rails, pose)
+        self.plant.SetPositions(plant_context, self.rails, checked_pose(pose, POSE_SIZE))
         self.plant.SetVelocities(plant_context, self.rails, np.zeros(POSE_SIZE))
 
 

@@ -35,6 +35,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field, field_validator
 from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
@@ -44,7 +45,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPor
 from guiderail.diagrams.options import Number, Options
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.task import exact_period
-from guiderail.models.errors import InputError
+from guiderail.models.errors import InputError, brief
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 Robot = TypeVar("Robot")
@@ -154,7 +155,11 @@ class Station(Diagram):
 
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the robot at rest with its tool centre at `pose`, (6,); `context` is the root context."""
+        """Puts the robot at rest with its tool centre at `pose`, (6,); `context` is the root context.
+
+        Raises:
+            InputError: if these are not that many finite numbers (see `checked_pose`).
+        """
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
         """Multiplies all friction and all compliance of the contact by a factor, until the next reset.
@@ -166,6 +171,21 @@ class Station(Diagram):
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Draws what a reset draws of the station itself, and says so; `context` is the root context."""
         return {}
+
+
+def checked_pose(pose: ArrayLike, size: int) -> np.ndarray:
+    """A pose (size,) that a robot can be put to: Drake would end the process for one that is not finite.
+
+    Raises:
+        InputError: if it is not so many finite numbers.
+    """
+    try:
+        numbers = np.asarray(pose, dtype=float)
+        if numbers.shape != (size,) or not np.isfinite(numbers).all():
+            raise ValueError
+    except (TypeError, ValueError):
+        raise InputError(f"a robot is put to a pose of {size} finite numbers, not {brief(pose)}") from None
+    return numbers
 
 
 def change_contact(

@@ -13,6 +13,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.cameras import Camera, add_camera, add_meshcat
+from guiderail.diagrams.env import RECORDED, SAID
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.known import Known
 from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
@@ -181,7 +182,8 @@ class Loop:
         ports = {name: self.signals.get(name, whose) for name in names}
         duration = task.num_steps * station.control_period
         sizes = {name: port.size() for name, port in ports.items()}
-        diagram = self.builder.AddNamedSystem("observation", Observation(observed, sizes, duration, task.clip))
+        seen = Observation(observed, sizes, duration, task.clip, task.name)
+        diagram = self.builder.AddNamedSystem("observation", seen)
         for name, port in ports.items():
             self.builder.Connect(port, diagram.GetInputPort(name))
         return diagram.space, diagram.get_observation_output_port()
@@ -197,7 +199,8 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         render_mode: "rgb_array" exports the picture of the task's camera; a browser view is no part of it.
 
     Raises:
-        InputError: if a signal that the task names doesn't exist here, or a port has the wrong size.
+        InputError: if a signal that the task names doesn't exist here, a port has the wrong size, or a reward term has
+            the name of something else.
     """
     loop = Loop(task, station, guidance)
     builder, signals, period = loop.builder, loop.signals, station.control_period
@@ -231,7 +234,6 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         **violations,
         "observation": loop.observation,
         "reward": reward.get_reward_output_port(),
-        **{name: reward.get_term_output_port(name) for name in reward.term_names},
         "termination": monitor.get_termination_output_port(),
         "contact_force": force,
         "ledger": ledger,
@@ -243,6 +245,14 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         "holding": station.get_holding_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
+    taken = {*exported, *SAID, *RECORDED}
+    for name in reward.term_names:
+        if name in taken:
+            raise InputError(
+                f"no reward term of {task.name} can be called {name!r}, which means something else in every task: "
+                "give it another name"
+            )
+        exported[name] = reward.get_term_output_port(name)
     # What this guidance has beyond the contract, such as the state of a template.
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
@@ -367,6 +377,11 @@ def randomizes(task: Task, station: Station, guidance: Diagram) -> Any:
         if not isinstance(drawn, Mapping):
             raise InputError(
                 f"reset of {task.name} returns what it drew by name, {{}} where it drew nothing, not {brief(drawn)}"
+            )
+        if taken := [name for name in drawn if name in SAID]:
+            raise InputError(
+                f"reset of {task.name} can call nothing that it drew {taken[0]!r}, which info says of every task: "
+                "give it another name"
             )
         return {**drawn, **station.disturb(context, rng)}
 

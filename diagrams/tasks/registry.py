@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
 
 from guiderail.diagrams.options import STANDARD, Options, ResetOptions
 from guiderail.models.errors import InputError, brief
@@ -51,8 +53,21 @@ def _check(name: str, task: type[Task]) -> None:
             raise InputError(f"{attribute} of {name} must be some words, such as ('sparse',), not {brief(given)}")
     if STANDARD not in task.difficulties:
         raise InputError(f"difficulties of {name} must have {STANDARD!r}, not only {brief(list(task.difficulties))}")
+    num_steps = getattr(task, "num_steps", None)  # some say it in their constructor, or as a property
+    if isinstance(num_steps, int | float | complex | str | np.number):
+        check_num_steps(name, num_steps)
     if not isinstance(task.clip, int | float) or not task.clip > 0:
         raise InputError(f"clip of {name} must be a positive number, not {brief(task.clip)}")
+
+
+def check_num_steps(name: str, num_steps: Any) -> None:
+    """Refuses what no episode can last.
+
+    Raises:
+        InputError: if it is no whole number of at least 1.
+    """
+    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer) or num_steps < 1:
+        raise InputError(f"num_steps of {name} must be a whole number of at least 1, not {brief(num_steps)}")
 
 
 def is_task_folder(name: str | Path) -> bool:

@@ -6,7 +6,7 @@ import pytest
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from guiderail.diagrams.env import GuidedEnv
+from guiderail.diagrams.env import SAID, GuidedEnv
 from guiderail.diagrams.task import TaskDiagram, exact_period
 from guiderail.models.errors import InputError
 
@@ -256,6 +256,29 @@ def test_a_simulation_failure_truncates_with_the_last_sound_observation(error):
     env.toy.error = None
     env.reset(options={"start": 0.0})
     assert env.step([1.0])[0][0] == np.float32(0.1)
+
+
+@pytest.mark.parametrize("options", ["x", "", 3, [], [("start", 0.0)]])
+def test_options_of_a_reset_that_are_no_mapping_are_a_sentence(options):
+    env = make()
+    with pytest.raises(InputError, match="the options of a reset are values by name"):
+        env.reset(options=options)
+    assert env.reset(options={"start": 0.0})[1]["start"] == 0.0
+    env.reset(options=None)
+
+
+def test_what_info_says_of_every_task_is_listed():
+    env = make(num_steps=2)
+    _, info = env.reset()
+    said = set(info) - set(env.drawn)
+    said |= set(env.step([0.0])[4])
+    env.toy.error = RuntimeError(SOLVER_FAILURE)
+    said |= set(env.step([0.0])[4])
+    env.toy.error = None
+    env.reset()
+    env.step([0.0])
+    said |= set(env.step([0.0])[4])
+    assert said - set(env.task.reward_terms) == set(SAID)
 
 
 def test_stepping_on_after_the_end_is_refused():

@@ -66,6 +66,7 @@ def test_evaluates_each_term_once_however_many_ports_are_read():
     [
         [],
         [RewardTerm("reward", {"u": 1}, lambda u: 0.0)],
+        [RewardTerm("", {"u": 1}, lambda u: 0.0)],
         [RewardTerm("a", {"u": 1}, lambda u: 0.0), RewardTerm("a", {"u": 1}, lambda u: 0.0)],
         [RewardTerm("a", {"u": 1}, lambda u: 0.0), RewardTerm("b", {"u": 2}, lambda u: 0.0)],
     ],

@@ -7,8 +7,9 @@ import gymnasium
 import numpy as np
 import pytest
 
+from guiderail.diagrams.env import RECORDED, SAID
 from guiderail.diagrams.make import make_env, resolve
-from guiderail.diagrams.observation import Observed
+from guiderail.diagrams.observation import Observed, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.errors import InputError
@@ -81,6 +82,10 @@ def declare(of=Own, **attributes):
         ({"Options": dict}, "Options of lab/Own must be a class made of Options"),
         ({"Reset": None}, "Reset of lab/Own must be a class made of ResetOptions"),
         ({"clip": None}, "clip of lab/Own must be a positive number"),
+        ({"num_steps": 0}, "num_steps of lab/Own must be a whole number of at least 1, not 0"),
+        ({"num_steps": 1.5}, "num_steps of lab/Own must be a whole number of at least 1, not 1.5"),
+        ({"num_steps": True}, "num_steps of lab/Own must be a whole number of at least 1, not True"),
+        ({"num_steps": "80"}, "num_steps of lab/Own must be a whole number of at least 1, not '80'"),
         ({"rewards": ()}, "rewards of lab/Own must be some words"),
         ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
     ],
@@ -128,6 +133,90 @@ def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, 
     declare(**attributes)
     with pytest.raises(InputError, match=says):
         first_step()
+
+
+@pytest.mark.parametrize(
+    ("observed", "says"),
+    [
+        ((), "the observation of lab/Own is of nothing: let observed"),
+        ((Observed("pose", entries=()),), "the observation of lab/Own is of nothing"),
+        ((Observed("pose", scale=0.0),), "the scale of the observed signal 'pose' of lab/Own divides it, .* be 0.0"),
+        ((Observed("phase"), Observed("pose", scale=[0.5, 0.0])), "the scale .* 'pose' .* cannot be"),
+        ((Observed("pose", scale=1e-320),), "the scale of the observed signal 'pose' of lab/Own divides it"),
+        ((Observed("pose", scale=np.nan),), "the scale .* 'pose' of lab/Own is a finite number, or 2 of them, not nan"),
+        ((Observed("pose", scale=[1.0, 2.0, 3.0]),), "the scale .* is a finite number, or 2 of them, not"),
+        ((Observed("pose", scale="a"),), "the scale .* is a finite number, or 2 of them, not 'a'"),
+        ((Observed("pose", centre=np.inf),), "the centre .* is a finite number, or 2 of them, not inf"),
+        ((Observed("pose", entries=(0, 5)),), "the entries .* 'pose' of lab/Own are whole numbers from 0 to 1, not"),
+        ((Observed("pose", entries=1),), "the entries .* are whole numbers from 0 to 1, not 1"),
+        ((Observed("pose", entries=((0, 1),)),), "the entries .* are whole numbers from 0 to 1, not"),
+    ],
+)
+def test_what_cannot_be_observed_is_refused_when_the_task_is_assembled(observed, says):
+    declare(observed=lambda self: observed)
+    with pytest.raises(InputError, match=says):
+        make_env("lab/Own", guidance="kmp")
+
+
+def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
+    declare(observed=lambda self: (Observed("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
+    env = make_env("lab/Own", guidance="kmp")
+    seen, _ = env.reset(seed=0)
+    x, y = env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
+    np.testing.assert_allclose(seen, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*SAID, *RECORDED, "observation", "pose", "desired_pose"])
+def test_no_reward_term_takes_the_place_of_a_safety_number(name):
+    declare(reward_terms=lambda self, num_actions: [RewardTerm(name, {"pose": 2}, self.reward)])
+    with pytest.raises(InputError, match=f"no reward term of lab/Own can be called {name!r}"):
+        make_env("lab/Own", guidance="kmp")
+
+
+@pytest.mark.parametrize("name", SAID)
+def test_nothing_that_a_reset_draws_takes_the_place_of_a_safety_number(name):
+    declare(reset=lambda self, *given: {name: -9.0})
+    env = make_env("lab/Own", guidance="kmp")
+    with pytest.raises(InputError, match=f"reset of lab/Own can call nothing that it drew {name!r}"):
+        env.reset(seed=0)
+
+
+def test_a_term_can_have_the_name_of_what_only_this_guidance_has():
+    declare(reward_terms=lambda self, num_actions: [RewardTerm("held_action", {"pose": 2}, self.reward)])
+    env = make_env("lab/Own", guidance="kmp")
+    env.reset(seed=0)
+    _, reward, *_, info = env.step(np.zeros(env.action_space.shape))
+    assert info["held_action"] == reward != 0.0
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number):
+    def signals(self, builder, station):
+        broken = builder.AddNamedSystem("broken", affine(np.eye(2), [0.0, number]))
+        builder.Connect(station.get_pose_output_port(), broken.get_input_port())
+        return {"broken": broken.get_output_port()}
+
+    declare(signals=signals, observed=lambda self: (Observed("phase"), Observed("broken", entries=(1,))))
+    with pytest.raises(InputError, match=r"the observation of lab/Own is not finite, but"):
+        first_step()
+
+
+@pytest.mark.parametrize("number", [0, None])
+def test_a_number_of_steps_that_a_constructor_gets_wrong_is_refused(number):
+    class Late(Own):
+        def __init__(self, options, choice):
+            super().__init__(options, choice)
+            self.num_steps = number
+
+    declare(of=Late, num_steps=np.int64(NUM_STEPS))
+    with pytest.raises(InputError, match=f"num_steps of lab/Own must be a whole number of at least 1, not {number}"):
+        make_env("lab/Own", guidance="kmp")
+
+
+def test_a_world_that_is_none_is_a_sentence():
+    declare(world=lambda self: None)
+    with pytest.raises(InputError, match=r"world\(\) of lab/Own returns nothing: let it return what station='plane'"):
+        make_env("lab/Own", guidance="kmp")
 
 
 def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():

@@ -2,7 +2,7 @@
 
 import platform
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, field, replace
 from functools import cache
 from importlib import metadata
@@ -125,6 +125,20 @@ class RunFolder:
         """
         self.refuse_existing()
         self.write_config(config)
+
+    def remove_unbegun(self, *, made: bool) -> None:
+        """Removes what `create` wrote of a run of which nothing else was written; otherwise nothing.
+
+        Args:
+            made: whether the folder itself is to go too.
+        """
+        if [one.name for one in self.path.iterdir() if not one.name.startswith(".")] != ["config.yaml"]:
+            return
+        (self.path / "config.yaml").unlink()
+        if made:
+            (self.path / LOCK).unlink(missing_ok=True)
+            with suppress(OSError):  # somebody keeps something in it
+                self.path.rmdir()
 
     def refuse_existing(self) -> None:
         """Raises an InputError if the folder holds something already, but for hidden files."""

@@ -52,7 +52,8 @@ def train(
         The rows of `episodes.csv`.
 
     Raises:
-        InputError: if the folder holds another run, another process writes into it, or nobody demonstrates or watches.
+        InputError: if the folder holds another run, another process writes into it, or nobody demonstrates or watches;
+            or of whatever was wrong in an episode: if that was the first one, no folder is left that wasn't there.
     """
     if config.with_person and person is None:
         raise InputError("a person watches this run: give --with-person")
@@ -81,12 +82,22 @@ def train(
     env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
     if not resume:
         folder.refuse_existing()
+    made = not folder.path.exists()
     try:
         with folder.locked():
             if config.learner.pipelined:
                 given = (config.learner, Spaces(env)), named
                 learner = Student(learner, given, waits=True, imports=config.imports)
-            return _train(folder, config, env, learner, resume, report, demonstrator, person)
+            if not resume:
+                folder.create(config)
+            try:
+                return _train(folder, config, env, learner, resume, report, demonstrator, person)
+            except InputError:
+                # What was wrong is to be put right and tried again, and a configuration alone is in the way of that.
+                # What a learner diverged with is kept.
+                if not resume and not learner.has_diverged():
+                    folder.remove_unbegun(made=made)
+                raise
     finally:
         learner.close()
         env.close()
@@ -102,13 +113,13 @@ def _train(
     demonstrator: Callable[[gymnasium.Env], Act] | None,
     person: Person | None,
 ) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
     if resume:
-        rows = _resume(folder, learner, env)
+        rows, written = _resume(folder, learner, env)
+        if written < len(rows):
+            folder.write_episodes(rows)  # a run that is complete writes no table any more
         if len(rows) < config.episodes:
             folder.remove_policy()  # killed from here on, it has one of fewer episodes than its table
-    else:
-        rows = []
-        folder.create(config)
     watched = None
     if config.with_person and person is not None:
         watched = Watched(config, person, load_checkpoint(folder.checkpoint)[1] if rows else {})
@@ -166,11 +177,13 @@ def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: 
     folder.write_episodes(rows)
 
 
-def _resume(folder: RunFolder, learner: Learner, env: Any) -> list[dict[str, Any]]:
-    """Puts learner and environment back to the last checkpoint; returns the rows up to it."""
+def _resume(folder: RunFolder, learner: Learner, env: Any) -> tuple[list[dict[str, Any]], int]:
+    """Puts learner and environment back to the last checkpoint; returns the rows up to it, and how many of them the
+    table has: fewer where the run was killed between the two.
+    """
     table = folder.path / "episodes.csv"
     if not folder.checkpoint.exists() and not table.exists():
-        return []  # it was killed in its first episode
+        return [], 0  # it was killed in its first episode
     arrays, values = load_checkpoint(folder.checkpoint)
     try:
         rows = values["rows"]
@@ -187,4 +200,4 @@ def _resume(folder: RunFolder, learner: Learner, env: Any) -> list[dict[str, Any
         raise InputError(
             f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
         ) from error
-    return rows
+    return rows, len(written)

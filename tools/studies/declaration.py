@@ -15,6 +15,7 @@ from guiderail.models.yaml_files import load_yaml
 from guiderail.tools.rollouts.evaluate import HELD_OUT_SEED
 from guiderail.tools.rollouts.metrics import STATISTICS
 
+Whole = Annotated[int, Field(strict=True)]  # YAML's `true` would be 1 otherwise
 FolderName = Annotated[str, Field(pattern=r"^[\w.-]+$")]
 SHIPPED = Path(__file__).parent
 LEARNED = "learned"
@@ -52,7 +53,7 @@ class LearnerChoice(_Strict):
     algorithm: str | None = None  # a learner's name
     preset: str | None = None  # of the learner's settings
     settings: dict[str, Any] = {}  # in place of the preset's
-    episodes: int | None = Field(default=None, ge=1)  # of training; the last mark unless given
+    episodes: Whole | None = Field(default=None, ge=1)  # of training; the last mark unless given
 
 
 class Method(_Strict):
@@ -62,7 +63,7 @@ class Method(_Strict):
     learner: LearnerChoice = LearnerChoice()  # in place of the study's
     policy: str = LEARNED  # or a null policy, best_constant, rule, or a rule's name
     grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # of each number of an action, for best_constant
-    seeds: tuple[int, ...] | None = None  # the study's unless given: what doesn't depend on them needs one
+    seeds: tuple[Whole, ...] | None = None  # the study's unless given: what doesn't depend on them needs one
 
 
 class JudgedOn(_Strict):
@@ -71,10 +72,10 @@ class JudgedOn(_Strict):
     name: str = "held out"  # in the table
     env: dict[str, Any] = {}  # other arguments than where it learned
     sampled: dict[str, tuple[float, float]] = {}  # arguments that are uniform in a range, anew every few episodes
-    every: int = Field(default=4, ge=1)
+    every: Whole = Field(default=4, ge=1)
     options: dict[str, Any] = {}  # of each reset
-    episodes: int = Field(default=100, ge=1)  # how many
-    first_seed: int = Field(default=HELD_OUT_SEED, ge=0)  # of the first episode; each has the next
+    episodes: Whole = Field(default=100, ge=1)  # how many
+    first_seed: Whole = Field(default=HELD_OUT_SEED, ge=0)  # of the first episode; each has the next
     file: EvaluatedFile = "{name}-{mark}-{digest}.csv"  # in the run's folder: what was evaluated already
 
 
@@ -84,7 +85,7 @@ class Sweep(_Strict):
     quantity: str  # what is varied, with its unit, under the picture
     at: dict[float, dict[str, Any]] = Field(min_length=1)  # the environment's arguments by its value, the easiest first
     options: dict[str, Any] = {}  # of each reset
-    episodes: int = Field(default=40, ge=1)  # at each value
+    episodes: Whole = Field(default=40, ge=1)  # at each value
 
     def judged_on(self, value: float) -> JudgedOn:
         """What is judged at one of its values."""
@@ -109,9 +110,9 @@ class Study(_Strict):
     env: dict[str, Any] = {}  # options of the environment, of every method
     learner: LearnerChoice = LearnerChoice()  # of every method that learns
     methods: dict[FolderName, Method] = Field(min_length=1)  # by name, of a folder and a legend
-    seeds: tuple[int, ...] = Field(min_length=1)  # of training
+    seeds: tuple[Whole, ...] = Field(min_length=1)  # of training
     marks: tuple[
-        Annotated[int, Field(ge=1)], ...
+        Annotated[Whole, Field(ge=1)], ...
     ] = ()  # training episodes after which a policy is judged; all of them unless given
     judged_on: tuple[JudgedOn, ...] = (JudgedOn(),)  # each of them, after every mark
     sweeps: tuple[Sweep, ...] = ()  # of which each value is judged on, too
@@ -144,6 +145,17 @@ class Study(_Strict):
                     raise ValueError(f"a ratio is of no method {method!r}: {did_you_mean(method, self.methods)}")
         return self
 
+    @model_validator(mode="after")
+    def _reaches_its_marks(self) -> Study:
+        learning = [method.learner for method in self.methods.values() if method.policy == LEARNED]
+        lasting = [learner.episodes or self.learner.episodes or max(self.marks, default=0) for learner in learning]
+        if beyond := [mark for mark in self.marks if lasting and mark > max(lasting)]:
+            raise ValueError(
+                f"no method learns as long as the mark {beyond[0]}: leave it out, or give more than {max(lasting)} "
+                "learner episodes"
+            )
+        return self
+
     def part_name(self, chosen: Study) -> str | None:
         """What the table of a part of this study is called; None for all of it, which has the study's own name."""
         methods = [] if chosen.methods.keys() == self.methods.keys() else list(chosen.methods)
@@ -169,10 +181,10 @@ class Smoothness(_Strict):
 
     program: Literal["smoothness"]  # what makes it this kind of study
     name: FolderName  # of the tables
-    episodes: int = Field(default=4, ge=1)  # of each way to explore
+    episodes: Whole = Field(default=4, ge=1)  # of each way to explore
     kappa: float = Field(default=1.0, gt=0.0)  # κ of all of them
     outputs: Literal["all", "xy"] = "all"  # which of them are explored
-    seed: int = Field(default=0, ge=0)  # of the actions
+    seed: Whole = Field(default=0, ge=0)  # of the actions
 
 
 class Certifiable(_Strict):
@@ -188,7 +200,7 @@ class Certificates(_Strict):
     program: Literal["certificates"]  # what makes it this kind of study
     name: FolderName  # of the table
     skills: dict[FolderName, Certifiable] = Field(min_length=1)  # by name
-    attack: int = Field(default=1_000_000, ge=1)  # steps of the adversary, on each
+    attack: Whole = Field(default=1_000_000, ge=1)  # steps of the adversary, on each
 
 
 Program = Smoothness | Certificates

@@ -39,7 +39,7 @@ from guiderail.tools.studies.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.studies.scripted import untrained
 from guiderail.tools.studies.sweep import broken, draw_sweeps
 from guiderail.tools.tables import write_table
-from guiderail.tools.tasks import changed_environment, import_modules, make_environment, task_content
+from guiderail.tools.tasks import changed_environment, check_reset, import_modules, make_environment, task_content
 from guiderail.tools.thesis import differences
 
 BEST_CONSTANT = "best_constant"
@@ -266,6 +266,7 @@ def _check(job: Job) -> None:
         sampled = {name: low for name, (low, _) in judged.sampled.items()}
         where = changed_environment(config.task, config.environment, judged.env)
         configure(job.study.task, where | sampled, episodes=1)
+        check_reset(job.study.task, judged.options)
     for mark, judged in itertools.product(job.marks, job.study.judgements):
         _refuse_other_rows(job, _evaluated_file(job, mark, judged), judged, mark)
     if (job.folder.path / "config.yaml").exists():

@@ -253,6 +253,53 @@ def test_a_run_killed_between_checkpoint_and_table_loses_nothing(bead_config, tm
     assert_same_run(whole, torn)
 
 
+def test_a_complete_run_whose_table_lacks_episodes_gets_them_from_its_checkpoint(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, bead_config)
+    table = folder.path / "episodes.csv"
+    whole = table.read_bytes()
+    for left in (b"".join(whole.splitlines(keepends=True)[:2]), None):
+        table.unlink() if left is None else table.write_bytes(left)
+        train(folder, bead_config, resume=True)
+        assert table.read_bytes() == whole
+
+
+def refused_in(episode):
+    """Demonstrates until the episode of that number, in which something is wrong."""
+    asked = []
+
+    def demonstrator(env):
+        asked.append(env)
+        if len(asked) == episode + 2:  # the first was asked before anything moved
+            raise InputError("this is wrong")
+        return always_left(env)
+
+    return demonstrator
+
+
+def test_a_run_that_is_refused_in_its_first_episode_leaves_nothing_in_the_way_of_the_next(bead_config, tmp_path):
+    there = tmp_path / "there"
+    there.mkdir()
+    (there / ".of_somebody").write_text("")
+    for path, is_left in ((tmp_path / "new", []), (there, [".of_somebody"])):
+        with pytest.raises(InputError, match="this is wrong"):
+            train(RunFolder(path), shown(bead_config, 3), demonstrator=refused_in(0))
+        assert path.exists() is bool(is_left)
+        assert [one.name for one in path.glob("*")] == is_left
+    train(RunFolder(tmp_path / "new"), replace(bead_config, episodes=1))
+
+
+def test_a_run_that_is_refused_later_or_going_on_keeps_what_it_has(bead_config, tmp_path):
+    config, later, begun = shown(bead_config, 3), RunFolder(tmp_path / "later"), RunFolder(tmp_path / "begun")
+    with pytest.raises(InputError, match="this is wrong"):
+        train(later, config, demonstrator=refused_in(1))
+    assert len(later.episodes()) == 1
+    begun.create(config)
+    with pytest.raises(InputError, match="this is wrong"):
+        train(begun, config, resume=True, demonstrator=refused_in(0))
+    assert begun.config() == config
+
+
 def test_a_run_killed_before_its_first_checkpoint_begins_again(bead_config, tmp_path):
     whole, begun = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "begun")
     train(whole, bead_config)

@@ -272,7 +272,14 @@ WRONG = [
     ({"methods": {}}, "methods"),
     ({"seeds": []}, "seeds"),
     ({"seeds": ["x"]}, "seeds"),
+    ({"seeds": [True]}, "seeds, 0: input should be a valid integer, not True"),
+    ({"methods": {"learner": {"seeds": [True]}}}, "input should be a valid integer, not True"),
     ({"marks": [0]}, "greater than or equal to 1"),
+    ({"marks": [True]}, "input should be a valid integer, not True"),
+    ({"marks": [5], "learner": {"episodes": 1}}, "no method learns as long as the mark 5"),
+    ({"marks": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}}, "no method learns as long as the mark 5"),
+    ({"task": "NarrowPassage", "judged on": [{"options": {"held_otu": True}}]}, "did you mean held_out"),
+    ({"task": "NarrowPassage", "judged on": [{"options": {"held_out": "far"}}]}, "held_out cannot be 'far'"),
     ({"marks": [], "learner": {}}, "how long does learner learn"),
     ({"task": "Beat"}, "did you mean Bead"),
     ({"tsak": "Bead"}, "did you mean task"),
@@ -304,6 +311,13 @@ def test_what_makes_no_sense_is_one_sentence_and_nothing_is_written(changed, wor
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_mark_that_only_some_methods_reach_is_of_these():
+    methods = {"short": {"learner": {"episodes": 2}}, "long": {}, "nothing": {"policy": "zero"}}
+    one = study(methods=methods)
+    assert [Job(one, name, 5, None).marks for name in methods] == [[2], [2, 4], [0]]
+    assert study(methods={"nothing": {"policy": "zero"}}, learner={"episodes": 1}).marks == (2, 4)
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "\x00", "just words"])

@@ -1,0 +1,24 @@
+import numpy as np
+import pytest
+
+from guiderail.diagrams.make import make_station, resolve
+from guiderail.models.errors import InputError
+
+PLACES = [
+    ("NarrowPassage", "plane"),
+    ("Pouring", "pouring"),
+    ("BncConnector", "rails"),
+    ("BncConnector", "mujoco"),
+    ("BncConnector", "arm"),
+]
+
+
+@pytest.mark.parametrize(("task", "place"), PLACES)
+def test_a_robot_is_put_only_to_a_pose_of_finite_numbers(task, place):
+    station = make_station(resolve(task, {"station": place}))
+    context = station.CreateDefaultContext()
+    whole = np.zeros(station.pose_size)
+    broken = [np.r_[np.nan, whole[1:]], np.r_[whole[1:], -np.inf], whole[1:], [*whole, 0.0], ["a"] * len(whole), None]
+    for pose in broken:
+        with pytest.raises(InputError, match=f"put to a pose of {station.pose_size} finite numbers, not"):
+            station.set_pose(context, pose)
