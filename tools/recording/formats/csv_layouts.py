@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.errors import InputError, brief
+from guiderail.models.primitives.demonstration_files import SECONDS
 from guiderail.tools.recording.formats.recorded import POSE_NAMES, UNITS, Recorded, poses_in_target, rotations_of
 from guiderail.tools.recording.places import in_order
 
@@ -26,7 +27,7 @@ _ALSO = {
     "m": ("meter", "meters", "metre", "metres"),
     "deg": ("degree", "degrees", "\u00b0"),
     "rad": ("radian", "radians"),
-    "s": ("sec", "secs", "second", "seconds"),
+    "s": SECONDS,
     "ms": ("msec",),
     "us": ("usec", "\u03bcs"),
     "ns": ("nsec",),
