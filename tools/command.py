@@ -361,7 +361,7 @@ def certify(
 @command("replay runs/passage --html replay.html")
 def replay(
     shown: Shown,
-    html: Annotated[Path | None, _opt("The page to write.  [default: replay.html in the run]")] = None,
+    html: Annotated[Path | None, _opt("The page to write, .html.  [default: replay.html in the run]")] = None,
     seed: Seed = 1_000_000,
     env: Env = None,
     station: Annotated[str | None, _opt("Where the policy acts: rails or arm.")] = None,

@@ -12,6 +12,7 @@ from guiderail.models.errors import InputError
 from guiderail.models.writing import write_atomically as write_atomically
 
 PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
+PAGES = (".html", ".htm")
 
 
 LOCK = ".lock"
@@ -58,13 +59,27 @@ def check_picture(path: Path) -> None:
     check_writable(path)
 
 
+def check_page(path: Path) -> None:
+    """Refuses a page that cannot be written, or that nobody would name so, before anything is run for it.
+
+    Raises:
+        InputError: for an ending that is none of `PAGES`, or a place where nothing can be written.
+    """
+    if path.suffix.lower() not in PAGES:
+        raise InputError(f"{path} has the ending {path.suffix!r}: a page is {', '.join(PAGES)}")
+    check_writable(path)
+
+
 def check_writable(path: Path) -> None:
     """Refuses a file, or a folder that is to be made, where nothing can be written, before anything is run for it.
 
     Raises:
-        InputError: for a path below a file, in a folder that takes nothing, or with a name that is too long.
+        InputError: for a folder that is there, a path below a file, in a folder that takes nothing, or with a name that
+            is too long.
     """
     try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder that is already there: name another place")
         above = next(one for one in path.absolute().parents if one.exists())
         with tempfile.TemporaryFile(dir=above):  # rights alone don't say it: root has them all
             pass

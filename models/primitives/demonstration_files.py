@@ -35,7 +35,8 @@ _LARGEST_NAMES = 1_000_000  # [bytes]
 _LARGEST_DIRECTORY = 100_000  # [bytes] of an archive
 
 # Whoever writes a demonstration a file calls its clock one of these, with or without a unit.
-_TIME = re.compile(r"(t|time|timestamp)\s*([\[(/].*)?", re.IGNORECASE)
+_TIME = re.compile(r"(?:t|time|timestamp)\s*(?P<unit>[\[(/].*)?", re.IGNORECASE)
+SECONDS = ("s", "sec", "secs", "second", "seconds")
 
 
 class Recording(NamedTuple):
@@ -268,8 +269,14 @@ def _read_csv(data: bytes) -> Recording:
     try:
         header = [name.strip() for name in next(lines, [])]
         several = header[:2] == ["demonstration", "time"]
-        if len(header) < 2 + several or not (several or _TIME.fullmatch(header[0])):
+        clock = _TIME.fullmatch(header[several]) if len(header) >= 2 + several else None
+        if clock is None:
             raise InputError("the first line must be demonstration,time,<outputs> or time,<outputs>")
+        if clock["unit"] is not None and clock["unit"].strip("[(/)] ").lower() not in SECONDS:
+            raise InputError(
+                f"time is in seconds, and the first line has {brief(header[several])}: convert it, or let guiderail "
+                "import do so where the outputs are poses"
+            )
         for row in lines:
             if len(row) != len(header):
                 if not row:

@@ -140,8 +140,8 @@ class Demonstrations:
         """Reads what `save` writes, and what others write.
 
         An `.npz` may also hold `times` (N,) or (M, N) with `outputs` (M, N, O). A `.csv` whose first line is `t` (or
-        `time`, with or without a unit) and the outputs' names is one demonstration, and a folder of such files is as
-        many. Nothing in a file is ever executed: arrays of Python objects are refused.
+        `time`, `time [s]`) and the outputs' names is one demonstration, and a folder of such files is as many. Time is
+        in seconds. Nothing in a file is ever executed: arrays of Python objects are refused.
 
         Raises:
             InputError: if there is no such file, it is truncated, damaged or too large, or what it holds are no

@@ -8,7 +8,7 @@ import pytest
 
 from guiderail.models.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.files import LOCK, check_picture, check_writable, remove_parts
+from guiderail.tools.files import LOCK, check_page, check_picture, check_writable, remove_parts
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.recording.record import record
 from guiderail.tools.rollouts.rollout import check_seed
@@ -27,6 +27,19 @@ def test_a_file_below_a_file_cannot_be_written(tmp_path):
 def test_a_name_that_no_system_takes_is_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         check_writable(tmp_path / ("x" * 300) / "x.png")
+
+
+def test_a_folder_that_is_there_is_no_file_to_write(tmp_path):
+    (tmp_path / "page.html").mkdir()
+    for refused in (check_writable, check_page):
+        with pytest.raises(InputError, match="is a folder"):
+            refused(tmp_path / "page.html")
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "config.yaml", "page", "."])
+def test_a_page_is_not_written_over_what_is_none(name, tmp_path):
+    with pytest.raises(InputError, match=r"has the ending.*a page is \.html"):
+        check_page(tmp_path / name)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**31])

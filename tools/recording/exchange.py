@@ -37,7 +37,7 @@ def import_recording(
     Args:
         source: a file or a folder.
         out: .npz or .csv; it must not exist.
-        signal: a topic or a feature; found out unless given.
+        signal: a topic or a feature, of which a CSV file has none; found out unless given.
         target: pose of the task's target in the recording's frame, [x y z] in metres and [rx ry rz] in degrees.
         rate: to resample to [1/s]; as recorded unless given.
         of_csv: unit, time_unit, quaternion and angles, see `read_csv_files`.
@@ -57,6 +57,8 @@ def import_recording(
     elif source.suffix == ".mcap" or (source.is_dir() and find_bags(source)):
         found, kind = read_bags(source, signal, target), "ROS 2 bags"
     elif source.suffix == ".csv" or (source.is_dir() and any(source.glob("*.csv"))):
+        if signal is not None:
+            raise InputError("a CSV file holds one motion and no signals to choose from: leave --signal out")
         found, kind = read_csv_files(source, target=target, **of_csv), "CSV files"
     else:
         raise InputError(f"{source} is no LeRobot dataset, bag, .mcap or .csv file, nor a folder of them")

@@ -11,7 +11,7 @@ import jinja2
 import pandas as pd
 
 from guiderail.models.errors import InputError
-from guiderail.tools.files import check_writable, write_atomically
+from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.report import figures
 from guiderail.tools.report.gather import LEARNED, Gathered, Run, command, finite, flat, gather
 from guiderail.tools.report.statistics import interquartile_mean, median_survival, survival, wilson_of_each
@@ -60,11 +60,9 @@ def write_report(paths: Sequence[Path], out: Path, *, episodes: int = 0) -> Path
     Raises:
         InputError: if there is nothing to report on, or `out` is no page.
     """
-    if out.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{out} has the ending {out.suffix!r}: a report is a page, .html")
     if episodes < 0:
         raise InputError(f"runs are judged on a number of episodes from 0, not {episodes}")
-    check_writable(out)
+    check_page(out)
     gathered = gather(paths, episodes)
     write_atomically(out, page(gathered, paths).encode())
     return out

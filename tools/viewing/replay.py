@@ -18,7 +18,7 @@ from pydrake.geometry import Rgba
 
 from guiderail.diagrams.scene import Scene, in_plane
 from guiderail.models.errors import InputError
-from guiderail.tools.files import check_writable, write_atomically
+from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.guidance import is_demonstrated
 from guiderail.tools.rollouts.metrics import TOLERANCE
 from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
@@ -65,17 +65,17 @@ def write_page(html: Path, episode: Shown, *, episodes: int | None = None) -> di
     the demonstration alone (an action of zero) where guidance has one, and uniform random actions where it has none.
 
     Args:
-        html: the page.
+        html: the page, .html.
         episode: the first; the seeds that follow its own are the others.
         episodes: how many to pick from, `EPISODES` unless given.
 
     Raises:
-        InputError: if the task cannot be shown, or there is no episode to show.
+        InputError: if the task cannot be shown, there is no episode to show, or `html` is no page.
     """
     episodes = EPISODES if episodes is None else episodes
     if episodes < 1:
         raise InputError(f"a page shows at least one episode, not {episodes}")
-    check_writable(html)
+    check_page(html)
     logging.getLogger("drake").setLevel(logging.WARNING)  # where Meshcat listens is of no interest to a page
     env = make_environment(episode.task, episode.environment, render_mode="human")
     base = cast(Any, env.unwrapped)

@@ -202,12 +202,21 @@ def test_every_kind_of_number_is_read_as_it_is(tmp_path, kind):
 
 def test_one_demonstration_as_other_programs_write_it(tmp_path):
     path = tmp_path / "d.csv"
-    for first in ("t", "time", "Time [s]", " timestamp (ms)"):
+    for first in ("t", "time", "Time [s]", " timestamp (Sec)", "t/s", "t [ s ]"):
         path.write_text(f"{first},x,y [m],z\n0,1,2,3\n0.5,4,5,6\n1e0, 7,8,-9.5e-1\n\n", encoding="utf-8-sig")
         loaded = Demonstrations.load(path)
         assert loaded.names == ("x", "y [m]", "z")
         np.testing.assert_array_equal(loaded.times[0], [0, 0.5, 1])
         np.testing.assert_array_equal(loaded.outputs[0], [[1, 2, 3], [4, 5, 6], [7, 8, -0.95]])
+
+
+@pytest.mark.parametrize("clock", ["t [ms]", "time (us)", "Timestamp/ns", "t [min]", "t []", "t (UTC)"])
+def test_time_in_another_unit_than_seconds_is_refused(clock, tmp_path):
+    (tmp_path / "d.csv").write_text(f"{clock},x\n0,1\n1,2\n")
+    said = refused(tmp_path / "d.csv")
+    assert "time is in seconds" in said
+    assert clock in said
+    assert "guiderail import" in said
 
 
 def test_a_folder_is_as_many_demonstrations_as_it_has_files(tmp_path):

@@ -270,6 +270,12 @@ def test_what_is_for_tables_is_refused_of_others(kind, file, tmp_path):
     assert not (tmp_path / "again.npz").exists()
 
 
+def test_a_signal_is_refused_of_a_table(tmp_path):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
+    with pytest.raises(InputError, match="leave --signal out"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz", signal="foo")
+
+
 @pytest.mark.parametrize("kind", ["lerobot", "mcap"])
 def test_a_dozen_demonstrations_keep_their_order(kind, tmp_path):
     t = 0.1 * np.arange(6)

@@ -178,7 +178,7 @@ def test_the_command_of_a_run_makes_the_same_run(bead_config):
 
 @pytest.mark.parametrize("name", ["report.pdf", "report"])
 def test_what_is_no_page_is_refused_before_anything_is_read(name, tmp_path):
-    with pytest.raises(InputError, match=r"a report is a page, .html"):
+    with pytest.raises(InputError, match=r"a page is .html"):
         write_report([tmp_path / "missing"], tmp_path / name)
 
 

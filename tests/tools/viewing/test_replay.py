@@ -125,3 +125,12 @@ def test_a_page_without_an_episode_is_refused(tmp_path):
     shown = Shown("NarrowPassage", {}, lambda env: NullPolicy(white, env), "white", "white")
     with pytest.raises(InputError, match="at least one episode"):
         write_page(tmp_path / "replay.html", shown, episodes=0)
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "."])
+def test_a_page_that_would_replace_what_is_none_is_refused_before_an_episode_is_run(name, tmp_path):
+    (tmp_path / "policy.safetensors").write_text("weights")
+    shown = Shown("NarrowPassage", {}, lambda env: pytest.fail("it goes on"), "white", "white")
+    with pytest.raises(InputError, match="a page is"):
+        write_page(tmp_path / name, shown)
+    assert (tmp_path / "policy.safetensors").read_text() == "weights"
