@@ -249,8 +249,9 @@ def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable
     tree = values if data.draw(st.booleans()) and changed.keys() else data.draw(changed_trees([values]))
     save_checkpoint(folder.checkpoint, changed, tree)
     folder.write_episodes(ROWS[: data.draw(st.sampled_from([3, len(ROWS)]))])
-    rows = attempt("checkpoint, other content", InputError, lambda: _resume(folder, learner, env))
-    if rows is not None:
+    resumed = attempt("checkpoint, other content", InputError, lambda: _resume(folder, learner, env))
+    if resumed is not None:
+        rows, _ = resumed
         assert rows == tree["rows"]
         found, known = learner.state()
         assert json.loads(json.dumps(known)) == tree["learner"]
