@@ -90,6 +90,23 @@ def test_kgrl_stays_clear_of_the_passages_walls_and_safe_residual_learning_gets_
     assert (of("narrow_passage", "safe_residual")["training_success_rate"] < 0.5).all()
 
 
+def test_at_hard_skgrl_learns_the_passage_with_every_seed_and_who_has_no_primitive_with_none():
+    rates = {
+        method: (100 * of("narrow_passage_hard", method)["success_rate"]).round().tolist()
+        for method in ("kgrl", "skgrl", "residual", "safe_residual")
+    }
+    assert rates["skgrl"] == [100] * 5
+    assert sorted(rates["kgrl"]) == [39, 39, 100, 100, 100]
+    assert (min(rates["residual"]), max(rates["residual"])) == (0, 39)
+    assert rates["safe_residual"] == [0] * 5
+    kgrl, skgrl = (of("narrow_passage_hard", method) for method in ("kgrl", "skgrl"))
+    for rows in (kgrl, skgrl):
+        assert (rows["training_episodes"] == 120).all()
+        assert (rows[["worst_violation", "training_worst_violation"]] <= TOLERANCE).all(axis=None)
+    jerk = "training_jerk_commanded_linear_first_10"
+    assert kgrl[jerk].min() / skgrl[jerk].max() == pytest.approx(19, abs=1)
+
+
 def test_in_the_other_engine_every_policy_of_the_clamp_inserts_all_and_white_noise_most():
     policies, white = (of("grid_clamp_transfer", method) for method in ("sct", "white"))
     assert len(policies) == 9
@@ -252,9 +269,11 @@ def test_who_does_not_look_breaks_where_the_mug_is_beside():
 
 def test_the_hard_passage_is_not_learned_and_its_width_decides_nothing():
     width, radius = "width of the gap [mm]", "radius of the obstacles [mm]"
-    for method, rate in (("kgrl", 32), ("skgrl", 32), ("residual", 0), ("rule", 100), ("white", 0)):
+    rates = {"kgrl": 100, "skgrl": 100, "residual": 32, "safe_residual": 0, "rule": 100, "white": 0}
+    for method, rate in rates.items():
         assert {swept("narrow_passage_sweep", method, width, at) for at in (60, 45, 30, 25, 20)} == {rate}
-    assert [swept("narrow_passage_sweep", "kgrl", radius, at) for at in (40, 60, 70, 80)] == [100, 100, 100, 32]
+    for method in ("kgrl", "skgrl"):
+        assert {swept("narrow_passage_sweep", method, radius, at) for at in (40, 60, 70, 80, 90, 100)} == {100}
     assert [swept("narrow_passage_sweep", "demonstrations", radius, at) for at in (40, 60, 70)] == [100, 32, 0]
 
 
