@@ -54,9 +54,7 @@ def check_picture(path: Path) -> None:
     Raises:
         InputError: for an ending that is none of `PICTURES`, or a place where nothing can be written.
     """
-    if path.suffix.lower() not in PICTURES:
-        raise InputError(f"{path} has the ending {path.suffix!r}: a picture is {', '.join(PICTURES)}")
-    check_writable(path)
+    _check_named(path, "picture", PICTURES)
 
 
 def check_page(path: Path) -> None:
@@ -65,8 +63,12 @@ def check_page(path: Path) -> None:
     Raises:
         InputError: for an ending that is none of `PAGES`, or a place where nothing can be written.
     """
-    if path.suffix.lower() not in PAGES:
-        raise InputError(f"{path} has the ending {path.suffix!r}: a page is {', '.join(PAGES)}")
+    _check_named(path, "page", PAGES)
+
+
+def _check_named(path: Path, what: str, endings: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{path} has the ending {path.suffix!r}: a {what} is {', '.join(endings)}")
     check_writable(path)
 
 
