@@ -17,6 +17,7 @@ from guiderail.tools.operate.crawl import distance
 FARTHEST, FARTHEST_TURN = 0.15, 1.0  # [m], [rad] from the skill's start, beyond which nobody wants to approach it alone
 STANDSTILL = 0.05  # [rad/s] of a joint
 UNLOADED = 5.0  # [N]: what a robot feels at rest whose payload is known to it
+LISTENING = 20  # statuses before anything is judged
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,13 +20,12 @@ from guiderail.models.errors import InputError
 from guiderail.models.joint_status import FAULTS, Fault
 from guiderail.models.units import MM
 from guiderail.systems.torque_guard import Phase
-from guiderail.tools.operate.checks import Check, check_robot
+from guiderail.tools.operate.checks import LISTENING, Check, check_robot
 from guiderail.tools.operate.crawl import back, crawl, distance, is_near
 from guiderail.tools.operate.keys import Keys
 
 PULL, GIVES_WAY, LEAST_PULL = 3.0 * MM, 1.0 * MM, 1.5  # [m] commanded, [m] followed at most, [N] felt at least
 PULL_STEPS = 25  # control steps
-LISTENING = 20  # statuses before anything is judged
 LEVER = 0.1  # [m/rad] for which a turn counts where the nearest of several poses is looked for
 PATIENCE = 10.0  # [s] until an arm that was told to go on does
 
@@ -325,9 +325,10 @@ class RobotEnv(GuidedEnv):
             return
         fault = Fault(int(self._acting.get_fault_output_port().Eval(self._mine)[0]))
         self._go_on(FAULTS[fault])
-        # Nobody listened while the person thought: what is judged is a status of now, once statuses are believed again.
+        # Nobody listened while the person thought: what is judged is a status of now, once statuses are believed again,
+        # which those of an arm that was moved meanwhile are only after the settling time.
         self._pace.begin()
-        self._pass(self._steps)
+        self._pass(self._steps + math.ceil(self._acting.status_limits.settling / self._acting.period))
         self._keys.take_back()
         self._find_the_way()
         if self._acting is self._elsewhere:

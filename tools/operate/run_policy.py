@@ -29,7 +29,7 @@ from guiderail.models.units import DEGREE, MM
 from guiderail.systems.torque_guard import Phase
 from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.operate.checks import Check, check_robot, read_out
+from guiderail.tools.operate.checks import LISTENING, Check, check_robot, read_out
 from guiderail.tools.operate.crawl import CRAWL, crawl, distance, is_near
 from guiderail.tools.operate.keys import listening, no_pauses
 from guiderail.tools.operate.rehearsal import Other
@@ -37,7 +37,6 @@ from guiderail.tools.rollouts.ledger import ledger_file, table, write_ledger
 
 SIGNALS = {"wrench": 6, "saturation": 1, "holding": 1, "fallback": 1, "commanded_violation": 1, "fault": 1, "phase": 1}
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
-LISTENING = 20  # statuses before anything is judged
 WARM_UP = 0.1  # [s], less than a driver's hold-off
 
 Say = Callable[[str], None]

@@ -148,14 +148,10 @@ class _Tally(EnvObserver):
         trace = self.base.trace
         force = np.asarray(trace.force)
         seen = {"peak_force": force.max(initial=0.0), "mean_force": force.mean() if len(force) else 0.0, **self._worst}
-        if "ledger" not in self._last:
-            for name, signal in zip(self._worst, ("commanded_violation", "measured_violation"), strict=True):
-                if signal in trace.signals:  # of a decision that was cut short too, of which there is no `info`
-                    seen[name] = np.max(trace.signals[signal], initial=self._worst[name])
-            if trace.signals.keys() >= COUNTED:
-                from guiderail.systems.safety_ledger import SafetyLedger  # Drake takes a second
+        if "ledger" not in self._last and trace.signals.keys() >= COUNTED:
+            from guiderail.systems.safety_ledger import SafetyLedger  # Drake takes a second
 
-                seen |= SafetyLedger.counts(trace.signals)
+            seen |= SafetyLedger.counts(trace.signals)
         failed = "simulation_failure" in self._last
         return episode_row(
             Episode(

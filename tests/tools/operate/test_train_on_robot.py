@@ -255,8 +255,9 @@ def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch
     assert env._acting.get_phase_output_port().Eval(env._mine)[0] == Phase.RUNNING
 
 
-def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(env, monkeypatch):
+def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypatch):
     """Not at the greatest speed that its commands may have, and not into what it was pulled out of."""
+    env = make(monkeypatch, START)
     env.reset()
     env.step(np.zeros(2))
     env.keys.press()

@@ -77,20 +77,6 @@ def test_an_episode_whose_simulation_failed_has_a_row_too():
     assert (row["worst_violation"], row["peak_force"]) == (0.25, 1.0)
 
 
-def test_without_a_ledger_the_worst_is_that_of_every_control_step():
-    class Cut(gymnasium.Wrapper):
-        """Whose `info` knows nothing of the decision that was cut short."""
-
-        def step(self, action):
-            observation, reward, *_, info = super().step(action)
-            self.unwrapped.trace._signals["commanded_violation"][0] = 0.5
-            info = {k: v for k, v in info.items() if k != "ledger"} | {"termination": "stopped"}
-            return observation, reward, False, True, info | {"constraint_violation": -1.0}
-
-    env = make_environment("NarrowPassage", {"guidance": "kgrl"})
-    assert rollout(Cut(env), lambda observation: np.zeros(2), seed=0)["worst_violation"] == 0.5
-
-
 def acted(policy: NullPolicy, episodes: int) -> np.ndarray:
     actions = []
     for _ in range(episodes):
