@@ -24,18 +24,18 @@ lint: $(VENV)/.ready
 # Minutes each, the last one hours, and no part of `make test`: runs that are killed at random, the newest versions of
 # everything, inputs made at random, and the safety code changed place by place.
 kills: $(VENV)/.ready
-	$(BIN)/python tests/kills/kill.py --kills 40
+	$(BIN)/python tests/harness/kills/kill.py --kills 40
 
 fuzz: $(VENV)/.ready
-	$(BIN)/python tests/fuzz/fuzz.py
+	$(BIN)/python tests/harness/fuzz/fuzz.py
 
 mutants: $(VENV)/.ready
-	$(BIN)/python tests/mutation/mutate.py --results mutants.json
+	$(BIN)/python tests/harness/mutation/mutate.py --results mutants.json
 
 # Faults on a robot's bus, in turn and then with real processes that are killed: the robot's side is judged.
 injections: $(VENV)/.ready
-	$(BIN)/python tests/injections/inject.py --injections 500
-	$(BIN)/python tests/injections/processes.py
+	$(BIN)/python tests/harness/injections/inject.py --injections 500
+	$(BIN)/python tests/harness/injections/processes.py
 
 newest:
 	.ci/newest python3.12

@@ -4,7 +4,7 @@ Importing this package registers the environments of all tasks that are known: t
 installed packages. Gymnasium does it in one go: `gymnasium.make("guiderail.diagrams:guiderail/NarrowPassage-v0")`.
 """
 
-from guiderail.diagrams.register import register_envs
+from guiderail.diagrams.tasks.registry import register_envs
 
 __all__ = ["register_envs"]
 

@@ -23,15 +23,15 @@ from PIL import Image, ImageDraw, ImageFont
 from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.models.policy import Policy
-from guiderail.tools.learning.configure import run
-from guiderail.tools.onboard.onboard import onboard
-from guiderail.tools.rollouts.metrics import TOLERANCE
-from guiderail.tools.rollouts.null_policies import NullPolicy, still, white
-from guiderail.tools.rollouts.rollout import Act, rollout
-from guiderail.tools.studies.scripted import untrained
-from guiderail.tools.tasks import make_environment, task_named
-from guiderail.tools.viewing.film import path_in_picture
-from guiderail.tools.viewing.passage import draw_world
+from guiderail.tools.environments import make_environment, task_named
+from guiderail.tools.evaluation.baselines import NullPolicy, still, white
+from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.evaluation.rollout import Act, rollout
+from guiderail.tools.evaluation.scripted import untrained
+from guiderail.tools.learning.train import run
+from guiderail.tools.parts.create_task import onboard
+from guiderail.tools.visualization.curves import draw_world
+from guiderail.tools.visualization.film import path_in_picture
 
 HERE = Path(__file__).parent
 FOLDER = HERE / "pictures"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from guiderail.tools.rollouts.metrics import TOLERANCE
+from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.tables import read_table
 
 HERE = Path(__file__).parent

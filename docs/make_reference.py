@@ -224,9 +224,9 @@ def api() -> str:
     """The names that people import."""
     import guiderail
     from guiderail.diagrams import guidance
+    from guiderail.diagrams.envs.observation import CLOCKS
     from guiderail.diagrams.guidance import guidance as guidance_ports
     from guiderail.diagrams.guidance.registry import INGREDIENTS
-    from guiderail.diagrams.observation import CLOCKS
     from guiderail.diagrams.stations.station import OUTPUTS
     from guiderail.models import primitives
     from guiderail.systems.episode_monitor import TERMINATIONS
@@ -246,7 +246,7 @@ def api() -> str:
             page += f"### {name}\n\n" + exported(name, thing)
     page += "## Words\n\n"
     rows = [
-        ("guiderail.diagrams.observation.CLOCKS", CLOCKS, "signals that every observation can have"),
+        ("guiderail.diagrams.envs.observation.CLOCKS", CLOCKS, "signals that every observation can have"),
         (
             "guiderail.systems.episode_monitor.TERMINATIONS",
             TERMINATIONS,
@@ -290,7 +290,7 @@ def command() -> str:
     """The command with all its options."""
     import typer
 
-    from guiderail.tools.command import CHOICES, app
+    from guiderail.tools.cli.main import CHOICES, app
 
     group: Any = typer.main.get_command(app)
     functions = {
@@ -339,7 +339,7 @@ def _kinds(function: Any) -> dict[str, str]:
 
 def options() -> str:
     """Tasks, guidance, stations, robots and learners, and what each of them takes."""
-    from guiderail.tools.listing import everything
+    from guiderail.tools.cli.catalog import everything
 
     known = everything()
     page = (
@@ -440,7 +440,7 @@ def shipped_templates() -> str:
     """The files of guiderail's own templates, as they are."""
     from importlib import resources
 
-    folder = resources.files("guiderail.models.skills")
+    folder = resources.files("guiderail.models.templates")
     page = ""
     for file in sorted((one for one in folder.iterdir() if one.name.endswith(".yaml")), key=lambda one: one.name):
         name = file.name.removesuffix(".yaml")
@@ -451,8 +451,8 @@ def shipped_templates() -> str:
 
 def templates() -> str:
     """The YAML of shared control templates."""
-    from guiderail.models.skills import loader
-    from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+    from guiderail.models.templates import schema as loader
+    from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
 
     if set(SKILL_WORDS) != loader.SKILL_FIELDS:
         raise ValueError(f"a skill's fields changed: {set(SKILL_WORDS) ^ loader.SKILL_FIELDS} have no words here")
@@ -501,7 +501,7 @@ def worlds() -> str:
     """What stations work on, and the signals that they have."""
     from pydrake.systems.framework import PortDataType
 
-    from guiderail.diagrams.make import make_station, resolve
+    from guiderail.diagrams.envs.make import make_station, resolve
     from guiderail.diagrams.stations import station as station_ports
     from guiderail.diagrams.stations.registry import STATIONS, stations_for
     from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
@@ -547,7 +547,7 @@ def worlds() -> str:
 
 def studies() -> str:
     """The YAML of studies."""
-    from guiderail.tools.studies import declaration
+    from guiderail.tools.experiments import declaration
 
     page = (
         "# Study files\n\n`guiderail study FILE --out D` runs methods × seeds × marks × what is judged on. "
@@ -574,12 +574,12 @@ def _model_default(value: Any) -> str:
 
 def files() -> str:
     """What files there are, and what is in them."""
-    from guiderail.models.primitives import demonstration_files as limits
+    from guiderail.models.primitives import io as limits
     from guiderail.models.primitives.demonstrations import Demonstrations
-    from guiderail.tools.learning.presets import PRESETS, Preset
+    from guiderail.tools.evaluation.metrics import COLUMNS
+    from guiderail.tools.evaluation.step_log import MEANINGS
+    from guiderail.tools.learning.config import PRESETS, Preset
     from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-    from guiderail.tools.rollouts.ledger import MEANINGS
-    from guiderail.tools.rollouts.metrics import COLUMNS
 
     page = (
         f"# Files\n\n## A run\n\n{prose(inspect.getdoc(RunFolder) or '')}\n\n"
@@ -625,11 +625,11 @@ def _fields(kind: type) -> str:
 
 def metrics() -> str:
     """What each number means."""
-    from guiderail.tools.rollouts.metrics import COLUMNS, STATISTICS
+    from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS
 
     heads = ["name", "unit", "meaning"]
     page = (
-        "# Numbers\n\nEach is defined once, in `guiderail.tools.rollouts.metrics`, and comes from the trace and the "
+        "# Numbers\n\nEach is defined once, in `guiderail.tools.evaluation.metrics`, and comes from the trace and the "
         "safety ledger. `guiderail list metrics` prints them.\n\n## Of an episode\n\n"
     )
     page += table(heads, [(code(m.name), cell(m.unit), cell(m.words)) for m in COLUMNS])
@@ -639,7 +639,7 @@ def metrics() -> str:
 
 def errors() -> str:
     """What is raised, and what the command ends with."""
-    from guiderail.models.errors import InputError, RunsFailedError
+    from guiderail.models.common.errors import InputError, RunsFailedError
     from guiderail.models.primitives import UnsolvableError
     from guiderail.systems import DivergedError, PolicyError
 
@@ -675,9 +675,9 @@ def wiring() -> str:
     from pydrake.math import RigidTransform
 
     from guiderail.diagrams.guidance import GUIDANCE, Known, PrimitiveSkill, Template, build_guidance
-    from guiderail.models.keep_out import KeepOut
+    from guiderail.models.control.keep_out import KeepOut
     from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-    from guiderail.models.skills import load_skill
+    from guiderail.models.templates import load_skill
 
     period, box = 0.02, LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
     times = period * np.arange(20)

@@ -5,7 +5,7 @@ import multiprocessing
 import gymnasium
 
 if __name__ == "__main__":  # each process imports this file first
-    multiprocessing.set_forkserver_preload(["guiderail.diagrams.make"])  # once, and not by each of them
+    multiprocessing.set_forkserver_preload(["guiderail.diagrams.envs.make"])  # once, and not by each of them
     envs = gymnasium.make_vec(
         "guiderail.diagrams:guiderail/NarrowPassage-v0",  # so that each process registers it, too
         num_envs=2,

@@ -10,7 +10,7 @@ from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
 
 from guiderail import Known, Options, make_env, register_guidance
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.kgrl import KgrlGuidance
+from guiderail.diagrams.guidance.primitive import KgrlGuidance
 
 
 class AlongOptions(Options):

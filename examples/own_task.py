@@ -8,10 +8,10 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
 import guiderail as gr
-from guiderail.diagrams.register import register_envs
-from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.diagrams.tasks.registry import register_envs
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
-WORLD = NarrowPassage(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=(0.28, 0.42))
+WORLD = PassageGeometry(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=(0.28, 0.42))
 STEPS, PERIOD = 80, 0.02
 
 
@@ -21,7 +21,7 @@ class WideGap(gr.Task):
 
     world_kind, num_steps, clip = "plane", STEPS, 1.0
 
-    def world(self) -> NarrowPassage:
+    def world(self) -> PassageGeometry:
         return WORLD
 
     def reference(self) -> gr.ReferenceTrajectory:  # known: so kmp, residual, kgrl and skgrl can guide

@@ -4,7 +4,7 @@ import numpy as np
 
 from guiderail import LcNsKmp, ReferenceTrajectory
 from guiderail.models.primitives.gains import exploration_rms, rms_gains
-from guiderail.models.smoothness import log_dimensionless_jerk
+from research.smoothness import log_dimensionless_jerk
 
 HOLD, STEPS, PERIOD = 5, 150, 0.02
 times = PERIOD * np.arange(STEPS)

@@ -8,7 +8,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail import load_skill
 from guiderail.diagrams.guidance.sct import SctGuidance
-from guiderail.models.pose_coordinates import transform_to_pose
+from guiderail.models.common.poses import transform_to_pose
 
 PERIOD = 0.02
 skill = load_skill("pouring", mug_radius_m=0.05)  # a wider mug than the file's own

@@ -11,9 +11,8 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from guiderail.models.digest import digest
-from guiderail.models.errors import InputError
-from guiderail.models.reading import read_bytes
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.files import digest, read_bytes
 
 FORMAT = "guiderail policy 2"
 WITHOUT_DIGEST = "guiderail policy 1"  # what earlier versions wrote

@@ -15,9 +15,9 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
-from guiderail.models.skills.skill import INSIDE, Skill
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.templates.template import INSIDE, Skill
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.skill_frames import SkillFrames

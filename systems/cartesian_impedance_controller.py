@@ -7,9 +7,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.cartesian_impedance import JointTorques, impedance_torques
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
 from guiderail.systems.support.command_watch import CommandWatch
 

@@ -21,9 +21,9 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.damped_inverse import damped_joint_velocities, follows
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.control.damped_inverse import damped_joint_velocities, follows
 from guiderail.systems.support.caching import declare_plant_context
 from guiderail.systems.support.command_watch import CommandCheck
 from guiderail.systems.support.sampling import check_period

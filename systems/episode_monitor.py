@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.signal_ports import SignalPorts, check_takes

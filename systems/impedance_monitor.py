@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 
 class ImpedanceMonitor(LeafSystem):

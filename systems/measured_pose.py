@@ -5,7 +5,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.pose_coordinates import transform_to_pose
+from guiderail.models.common.poses import transform_to_pose
 
 
 class MeasuredPose(LeafSystem):

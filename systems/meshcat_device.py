@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem, OutputPort
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 DEAD_ZONE = 0.1

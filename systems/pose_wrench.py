@@ -2,7 +2,7 @@
 
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.pose_coordinates import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
+from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE, wrench_of_generalized_force
 
 
 class PoseWrench(LeafSystem):

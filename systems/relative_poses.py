@@ -7,7 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 
 class RelativePoses(LeafSystem):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 

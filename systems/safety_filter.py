@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.keep_out import KeepOut
+from guiderail.models.control.keep_out import KeepOut
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import declare_sample
 

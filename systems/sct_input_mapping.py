@@ -6,8 +6,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
-from guiderail.models.skills.skill import Skill
+from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.templates.template import Skill
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.skill_frames import SkillFrames
 

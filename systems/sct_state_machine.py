@@ -13,8 +13,8 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.skills.skill import Skill
+from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.templates.template import Skill
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.skill_frames import SkillFrames
 

@@ -11,7 +11,7 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 

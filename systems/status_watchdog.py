@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.joint_status import Fault, Heard, JointStatus, StatusLimits, judge_status
+from guiderail.models.control.joint_status import Fault, Heard, JointStatus, StatusLimits, judge_status
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 

@@ -16,8 +16,8 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.errors import InputError
-from guiderail.models.tool_wrench import external_wrench
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import external_wrench
 from guiderail.systems.support.sampling import check_period
 
 

@@ -15,15 +15,15 @@ settings.load_profile("quick")
 
 # What hears a robot's bus from Python while a simulator reads it, which a Drake of nanobind's bindings can not.
 ON_A_BUS = (
-    "stations/test_hardware.py", "stations/test_injections.py", "stations/test_pace.py", "operate/test_places.py",
-    "operate/test_rehearsal.py", "operate/test_run_policy.py", "operate/test_train_on_robot.py",
-    "benchmarks/test_loop.py",
+    "hardware/test_station.py", "stations/test_injections.py", "hardware/test_clock.py",
+    "hardware/test_part_randomization.py", "hardware/test_connection.py", "hardware/test_executor.py",
+    "hardware/test_train.py", "benchmarks/test_loop.py",
 )  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):
     """Where a handler would end the process, the tests that need one are skipped, and say so."""
-    from guiderail.diagrams.stations.pace import handlers_are_safe
+    from guiderail.diagrams.hardware.clock import handlers_are_safe
 
     if not handlers_are_safe():
         for item in items:

@@ -13,19 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.diagrams.make import known, resolve
+from guiderail.diagrams.envs.make import known, resolve
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import QUANTITIES, Adversary
 from guiderail.models.certificate.bounds import Certified, certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files
+from guiderail.models.certificate.lagrange_bounds import Budget
 from guiderail.models.certificate.loop import Bounds, Skill
-from guiderail.models.certificate.prices import Budget
-from guiderail.models.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief
+from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
-from guiderail.tools.tasks import changed_environment, check_environment
 
 CERTIFIED = ("kmp", "kgrl", "skgrl")  # guidance whose law this is
 SEARCH = 100_000  # steps of the adversary whose worst corrections make the budgets

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from guiderail.models.errors import InputError
-from guiderail.models.writing import write_atomically as write_atomically
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.files import write_atomically as write_atomically
 
 PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 PAGES = (".html", ".htm")

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.tools.files import write_atomically
 
 _WHOLE = re.compile(r"-?[0-9]{1,18}")

@@ -1,9 +1,9 @@
+from .function import LawGuidance as LawGuidance
 from .guidance import Guidance as Guidance
-from .known import Approach as Approach
-from .known import Known as Known
-from .known import Template as Template
-from .law import LawGuidance as LawGuidance
-from .primitive_skill import PrimitiveSkill as PrimitiveSkill
+from .primitive_config import PrimitiveSkill as PrimitiveSkill
+from .prior import Approach as Approach
+from .prior import Known as Known
+from .prior import Template as Template
 from .registry import GUIDANCE as GUIDANCE
 from .registry import GuidanceKind as GuidanceKind
 from .registry import build_guidance as build_guidance

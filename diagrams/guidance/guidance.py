@@ -27,7 +27,7 @@ from collections.abc import Mapping
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, InputPort, OutputPort
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 INPUTS = ("action", "pose", "wrench")
 OUTPUTS = ("desired_pose", "held_action", "constraint_violation", "fallback")

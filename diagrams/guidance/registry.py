@@ -6,14 +6,14 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from guiderail.models.errors import InputError
-from guiderail.models.registry import Registry
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import Registry
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import Diagram
 
-    from guiderail.diagrams.guidance.known import Known
-    from guiderail.diagrams.options import Options
+    from guiderail.diagrams.envs.config import Options
+    from guiderail.diagrams.guidance.prior import Known
 
 INGREDIENTS = {
     "demonstrations": "demonstrations",

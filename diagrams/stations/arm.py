@@ -26,10 +26,10 @@ from guiderail.diagrams.stations.station import (
     export_simulation_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.robots.assembly import add_drives, add_end_effector, add_robot, lighten_rotors
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
 from guiderail.models.robots.robot import (
     DEFAULT_END_EFFECTOR,
     DEFAULT_ROBOT,

@@ -3,22 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.geometry import (
-    Box,
-    Cylinder,
-    ProximityProperties,
-    Sphere,
-)
+from pydrake.geometry import Box, Cylinder, ProximityProperties, Sphere
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
 
+from guiderail.diagrams.envs.task_diagram import exact_period
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import Station, checked_pose, export_station_ports
-from guiderail.diagrams.task import exact_period
-from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
 
@@ -87,7 +82,7 @@ class PlaneStation(Station):
     `zone_x` or at a disc: a task's constraints, conditions and rewards do, and a task puts the robot to its `start`.
     """
 
-    def __init__(self, world: NarrowPassage, config: PlaneConfig = PlaneConfig()):
+    def __init__(self, world: PassageGeometry, config: PlaneConfig = PlaneConfig()):
         """
         Args:
             world: what is where.
@@ -167,7 +162,7 @@ class PlaneStation(Station):
             place.SetPoseInParentFrame(plant_context, RigidTransform([x, y, OBSTACLE_Z]))
 
 
-def _add_robot(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig) -> ModelInstanceIndex:
+def _add_robot(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfig) -> ModelInstanceIndex:
     robot = plant.AddModelInstance("robot")
     # The carriage between the rails is nearly massless: both axes move the same mass.
     carriage = plant.AddRigidBody("carriage", robot, SpatialInertia.SolidSphereWithMass(1e-3 * config.mass, 0.01))
@@ -182,7 +177,7 @@ def _add_robot(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig)
     return robot
 
 
-def _add_walls(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig) -> None:
+def _add_walls(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfig) -> None:
     # The centre's walls, less the robot's radius.
     for name, lower, upper in zip(("left_wall", "right_wall"), *world.walls, strict=True):
         size = upper - lower - 2 * world.robot_radius
@@ -192,7 +187,7 @@ def _add_walls(plant: MultibodyPlant, world: NarrowPassage, config: PlaneConfig)
         plant.RegisterVisualGeometry(plant.world_body(), X_WG, shape, f"{name}_visual", np.array([0.4, 0.4, 0.42, 1.0]))
 
 
-def _add_markings(plant: MultibodyPlant, world: NarrowPassage) -> None:
+def _add_markings(plant: MultibodyPlant, world: PassageGeometry) -> None:
     """What is only there to be seen: the floor, the restricted zone, the obstacle and the goal."""
     body = plant.world_body()
 
@@ -206,7 +201,7 @@ def _add_markings(plant: MultibodyPlant, world: NarrowPassage) -> None:
         mark("obstacle", _obstacle_shape(world), *world.obstacle, OBSTACLE_Z, OBSTACLE_COLOR)
 
 
-def _add_moving_obstacles(plant: MultibodyPlant, world: NarrowPassage) -> list[FixedOffsetFrame]:
+def _add_moving_obstacles(plant: MultibodyPlant, world: PassageGeometry) -> list[FixedOffsetFrame]:
     """Obstacles to be seen, each on a frame that a reset can move."""
     model, places = plant.AddModelInstance("obstacles"), []
     for number, (x, y) in enumerate(world.obstacles):
@@ -218,7 +213,7 @@ def _add_moving_obstacles(plant: MultibodyPlant, world: NarrowPassage) -> list[F
     return places
 
 
-def _obstacle_shape(world: NarrowPassage) -> Cylinder:
+def _obstacle_shape(world: PassageGeometry) -> Cylinder:
     return Cylinder(world.obstacle_radius, 0.03)
 
 

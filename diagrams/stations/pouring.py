@@ -11,17 +11,17 @@ from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, 
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
+from guiderail.diagrams.envs.task_diagram import exact_period
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import POSE_SIZE, Station, checked_pose, export_station_ports
-from guiderail.diagrams.task import exact_period
-from guiderail.models.errors import InputError
-from guiderail.models.objects.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
-from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.robots.assembly import add_drives, add_robot
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import DEFAULT_ROBOT, Robot, find_robot
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
-from guiderail.systems.contact_watch import ContactWatch
+from guiderail.systems.contact_detector import ContactWatch
 from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from guiderail.models.registry import Registry
+from guiderail.models.common.registry import Registry
 
 if TYPE_CHECKING:
-    from guiderail.diagrams.options import Options
+    from guiderail.diagrams.envs.config import Options
     from guiderail.diagrams.stations.station import Station
 
 

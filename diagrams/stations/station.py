@@ -42,10 +42,10 @@ from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, Multibod
 from pydrake.multibody.tree import Frame, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
-from guiderail.diagrams.options import Number, Options
+from guiderail.diagrams.envs.config import Number, Options
+from guiderail.diagrams.envs.task_diagram import exact_period
 from guiderail.diagrams.stations.workcell import Workcell
-from guiderail.diagrams.task import exact_period
-from guiderail.models.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 Robot = TypeVar("Robot")

@@ -3,9 +3,75 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field, field_validator
+
+from guiderail.diagrams.envs.config import Numbers, Options
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.units import MM
+from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
+
+LARGEST_OFFSET = 4.0 * MM  # farther away a plug no longer stands on the rim of what it belongs in
+
+
+class HiddenPlace(Options):
+    """Of a task whose fixed part is not where it should be."""
+
+    uncertainty: Literal["calibration", "disc", "known"] = Field(
+        "calibration", description="where the fixed part may be: one place for a run, one for each episode, or known"
+    )
+    offset_range: Numbers | None = Field(
+        None,
+        min_length=2,
+        max_length=2,
+        description="least and greatest distance of the fixed part from where it should be [m], the uncertainty's own",
+    )
+
+    @field_validator("offset_range")
+    @classmethod
+    def _is_a_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and not 0.0 <= value[0] <= value[1] <= LARGEST_OFFSET:
+            raise ValueError(f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first")
+        return value
+
+
+def reference_of_file(path: Path, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
+    """What a file's demonstrations have in common, as long as they last on average.
+
+    Args:
+        path: .npz or .csv, poses (N, 6) in the target frame.
+        components: of their mixture; by information criterion unless given.
+        floor: standard deviation (6,) that a hand has anyway.
+
+    Raises:
+        InputError: if there is no such file, or it holds no demonstrations of a pose.
+    """
+    if not path.is_file():
+        raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teach makes")
+    return _fitted(path, path.stat().st_mtime_ns, components, floor)
+
+
+@cache
+def _fitted(path: Path, changed: int, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
+    """Fitted once a process and version."""
+    demonstrations = Demonstrations.load(path)
+    if demonstrations.num_outputs != POSE_SIZE:
+        raise InputError(
+            f"{path} has {demonstrations.num_outputs} outputs: an insertion needs the six of a pose, "
+            "[x y z Rz Ry Rx] in the target frame"
+        )
+    duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
+    num_steps = round(duration / CONTROL_PERIOD) + 1
+    fitted = ReferenceTrajectory.from_demonstrations(
+        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor)
+    )
+    return ReferenceTrajectory(CONTROL_PERIOD * np.arange(num_steps), fitted.means, fitted.covariances)
 
 
 class HiddenOffsets(ABC):

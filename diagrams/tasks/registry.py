@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from guiderail.diagrams.options import STANDARD, Options, ResetOptions
-from guiderail.models.errors import InputError, brief
-from guiderail.models.registry import Registry
+from guiderail.diagrams.envs.config import STANDARD, Options, ResetOptions
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import Registry
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.task import Task
 
     AnyTask = TypeVar("AnyTask", bound=type[Task])
+
+import gymnasium
 
 TASKS: Registry[type[Task]] = Registry(
     "task", package="guiderail.diagrams.tasks", decorator="register_task", entry_points="guiderail.tasks"
@@ -81,7 +83,7 @@ def register_task_folder(folder: str | Path) -> str:
     Raises:
         InputError: if something in it makes no sense, or another task has its name.
     """
-    from guiderail.diagrams.tasks.part_insertion import load_task_folder  # Drake takes a second
+    from guiderail.diagrams.tasks.part.task import load_task_folder  # Drake takes a second
 
     task = load_task_folder(Path(folder))
     register_task(task.file.name)(task)
@@ -91,3 +93,12 @@ def register_task_folder(folder: str | Path) -> str:
 def environment_id(name: str) -> str:
     """What `gymnasium.make` calls a task."""
     return f"{name if '/' in name else f'guiderail/{name}'}-v0"
+
+
+def register_envs() -> None:
+    """Registers `guiderail/<Task>-v0`, or `<namespace>/<Task>-v0`, for every task; calling it again adds new ones."""
+    for name in TASKS.names():
+        if environment_id(name) not in gymnasium.registry:
+            gymnasium.register(
+                id=environment_id(name), entry_point="guiderail.diagrams.envs.make:make_env", kwargs={"task": name}
+            )

@@ -9,19 +9,37 @@ from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import ConstantVectorSource
 
-from guiderail.diagrams import options as declared
-from guiderail.diagrams.cameras import Camera
-from guiderail.diagrams.guidance.known import Approach, Template
-from guiderail.diagrams.observation import Observed
-from guiderail.diagrams.scene import Scene, in_plane
+from guiderail.diagrams.envs import config as declared
+from guiderail.diagrams.envs.cameras import Camera
+from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.scene import Scene, in_plane
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.diagrams.guidance.prior import Approach, Template
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.task import Symmetry
-from guiderail.diagrams.tasks.drawn import Drawn
-from guiderail.models.keep_out import KeepOut
+from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
+
+
+class Drawn:
+    """Numbers that are constant during an episode, for whoever observes, rewards or ends it."""
+
+    def __init__(self, builder: DiagramBuilder, name: str, size: int):
+        """Adds their source to the builder; they are zero until a reset sets them."""
+        self._source = builder.AddNamedSystem(name, ConstantVectorSource(np.zeros(size)))
+
+    @property
+    def port(self) -> OutputPort:
+        """Where they come out, (size,)."""
+        return self._source.get_output_port()
+
+    def set(self, root_context: Context, values: np.ndarray) -> None:
+        """Sets them, (size,); the context is the root diagram's."""
+        context = self._source.GetMyMutableContextFromRoot(root_context)
+        self._source.get_mutable_source_value(context).SetFromVector(values)
 
 
 @dataclass(frozen=True)

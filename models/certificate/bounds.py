@@ -26,9 +26,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from guiderail.models.certificate.lagrange_bounds import Budget, Budgeted, budgeted
 from guiderail.models.certificate.loop import Bounds, Skill, caps, reach
-from guiderail.models.certificate.prices import Budget, Budgeted, budgeted
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 CELLS = {1: 16, 2: 24, 3: 3}  # along each action, by how many actions there are; one for more

@@ -12,7 +12,7 @@ import numpy as np
 
 from guiderail.models.certificate.bounds import Certified
 from guiderail.models.certificate.loop import Bounds, Skill
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import SquaredExponential
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from guiderail.models.units import MM
+from guiderail.models.common.units import MM
 
 # Convex pieces that only meet catch what slides over their seam: there the nearest way out of a piece is sideways. So
 # each goes on for SHOULDER into its neighbours, and is BELOW their surface at its end: a way out at nine degrees.

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief
 
 ENDINGS = (".stl", ".obj", ".glb", ".step", ".stp")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}

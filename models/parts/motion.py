@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from guiderail.models.demonstrations.bnc_connector import correlated
-from guiderail.models.pose_coordinates import POSE_SIZE
-from guiderail.models.units import DEGREE, MM
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.objects.bnc_connector.demonstrations import correlated
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]
 INSERTION_SPEED = 12.0 * MM

@@ -5,8 +5,8 @@ from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel, Matern52, SquaredExponential
 from guiderail.models.primitives.kmp import Kmp
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp, Modification, Prediction
-from guiderail.models.primitives.least_norm import UnsolvableError
 from guiderail.models.primitives.poses import pose_demonstrations, pose_outputs, pose_rotation
+from guiderail.models.primitives.qp import UnsolvableError
 from guiderail.models.primitives.reference import ReferenceTrajectory
 
 __all__ = [

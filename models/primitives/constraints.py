@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.errors import InputError
-from guiderail.models.primitives.arrays import numbers
-from guiderail.models.primitives.least_norm import UnsolvableError, solve_least_norm
+from guiderail.models.common.arrays import numbers
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 
 TOLERANCE = 1e-9
 """The bound that every command keeps, in the unit of a constraint's c (a thousandth of a micrometre for metres)."""

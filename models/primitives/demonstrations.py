@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.errors import InputError, brief
-from guiderail.models.primitives import demonstration_files
-from guiderail.models.primitives.arrays import numbers
+from guiderail.models.common.arrays import numbers
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.primitives import io as demonstration_files
 
 
 class Demonstrations:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import Kernel
 
 # The history is known to √ρ, the kernel to 1: their ratio is what a double loses digits to. Extended precision costs

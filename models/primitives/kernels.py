@@ -4,7 +4,7 @@ from typing import Protocol
 
 import numpy as np
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 
 class Kernel(Protocol):

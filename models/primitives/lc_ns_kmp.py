@@ -7,20 +7,25 @@ other members: without constraints NS-KMP (equation 4.4), with β = 0 LC-KMP (4.
 history sKGRL's primitive (5.1-5.3).
 """
 
+from __future__ import annotations
+
+import hashlib
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.errors import InputError, brief
-from guiderail.models.primitives.arrays import numbers
+from guiderail.models.common.arrays import numbers
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
-from guiderail.models.primitives.least_norm import UnsolvableError, find_solver
+from guiderail.models.primitives.qp import UnsolvableError, find_solver
 from guiderail.models.primitives.reference import ReferenceTrajectory
-from guiderail.models.primitives.step import StepFactor, Window
+from guiderail.models.primitives.window import StepFactor, Window
 
 
 class Prediction:
@@ -415,3 +420,36 @@ class LcNsKmp:
         if alike:
             self._shared_features = features
         return features
+
+
+# Only while somebody uses one: a primitive's factored steps take megabytes.
+_USED: WeakValueDictionary[tuple[Any, ...], LcNsKmp] = WeakValueDictionary()
+
+
+def shared_primitive(
+    reference: ReferenceTrajectory, constraints: LinearConstraints, inverse_length: float, **arguments: Any
+) -> LcNsKmp:
+    """The primitive of these numbers: the one that is in use, or a new one.
+
+    A primitive answers the same whatever it was asked before; what it remembers are factored steps. Nobody who gets
+    one from here may change it.
+
+    Args:
+        reference, constraints: of `LcNsKmp`.
+        inverse_length: of its squared exponential kernel.
+        arguments: numbers and names, of `LcNsKmp`.
+
+    Raises:
+        InputError: as `LcNsKmp` does.
+    """
+    arrays = (reference.times, reference.means, reference.covariances, constraints.G, constraints.c)
+    digest = hashlib.blake2b(digest_size=16)
+    for array in arrays:
+        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array, dtype=float).tobytes())
+    key = (digest.digest(), float(inverse_length), *sorted(arguments.items()))
+    found = _USED.get(key)
+    if found is None:
+        kernel = SquaredExponential(inverse_length=inverse_length)
+        found = LcNsKmp(reference, kernel=kernel, constraints=constraints, **arguments)
+        _USED[key] = found
+    return found

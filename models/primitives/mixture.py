@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 # Importing it takes over a second, which who only reads a file need not wait for.
 if TYPE_CHECKING:

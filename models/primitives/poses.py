@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 
 Orientation = Literal["euler_zyx", "rotation_vector"]

@@ -1,10 +1,15 @@
 """The reference trajectory: what demonstrations have in common, and how sure they are of it (thesis, 2.2.3-2.2.5)."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import numpy as np
 
-from guiderail.models.errors import InputError
-from guiderail.models.primitives.arrays import numbers
+from guiderail.models.common.arrays import numbers
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
+from guiderail.models.primitives.kernels import SquaredExponential
 from guiderail.models.primitives.mixture import fit_mixture, regress
 
 # Below this, relative to a covariance's own largest variance, a direction is singular in double precision.
@@ -62,7 +67,7 @@ class ReferenceTrajectory:
         seed: int = 0,
         num_steps: int | None = None,
         floor: float | np.ndarray = 0.0,
-    ) -> "ReferenceTrajectory":
+    ) -> ReferenceTrajectory:
         """A Gaussian mixture of (time, output), regressed on time (equation 2.12 and GMR).
 
         Args:
@@ -125,3 +130,35 @@ class ReferenceTrajectory:
                 f"the covariance at step {int(np.argmax(bad))} is singular or not positive definite; add a small "
                 "variance to its diagonal (from_demonstrations has floor= for that)"
             )
+
+
+EXACTNESS = 1e-4  # variance of a via-point, as a part of the kernel's own: how far several that disagree are averaged
+
+
+def through(reference: ReferenceTrajectory, points: Sequence[float], inverse_length: float) -> ReferenceTrajectory:
+    """The reference with a mean that passes through via-points; its covariances stay.
+
+    The displacement between via-points is the mean of a Gaussian process that is zero far from all of them.
+
+    Args:
+        reference: what was demonstrated.
+        points: for each via-point its step and its output, 1 + O numbers, one after another.
+        inverse_length: of the squared exponential kernel [1/input²].
+
+    Raises:
+        InputError: if these are not rows of a step and O finite numbers, or there is no such step.
+    """
+    size = 1 + reference.num_outputs
+    if len(points) % size or not np.isfinite(points).all():
+        raise InputError(f"via-points are rows of a step and {size - 1} finite numbers, not {len(points)} numbers")
+    rows = np.array(points, dtype=float).reshape(-1, size)
+    if not len(rows):
+        return reference
+    steps = rows[:, 0]
+    if (steps % 1 != 0).any() or steps.min() < 0 or steps.max() >= reference.num_steps:
+        raise InputError(f"a via-point's step is a whole number from 0 to {reference.num_steps - 1}")
+    at = steps.astype(int)
+    kernel, times = SquaredExponential(inverse_length), reference.times
+    K = kernel(times[at], times[at]) + EXACTNESS * np.eye(len(at))
+    displacement = kernel(times, times[at]) @ np.linalg.solve(K, rows[:, 1:] - reference.means[at])
+    return ReferenceTrajectory(times, reference.means + displacement, reference.covariances)

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.solvers import Solve
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 STARTS = 10
 """From how many postures a search starts before a pose counts as out of reach: the given one, and others around it."""

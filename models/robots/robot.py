@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.models.errors import InputError
-from guiderail.models.registry import Registry
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import Registry
 
 DEFAULT_ROBOT = "iiwa14"
 DEFAULT_END_EFFECTOR = "connector_tool"

@@ -13,7 +13,7 @@ from pydrake.systems.framework import (
     LeafSystem,
 )
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 # [s]. Far above the rounding of a time of days, far below any period.

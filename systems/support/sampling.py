@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, EventStatus, InputPort, LeafSystem
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 
 def check_period(period: float) -> None:

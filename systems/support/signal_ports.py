@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DependencyTicket, InputPort, LeafSystem
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 
 class SignalPorts:

@@ -6,9 +6,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
 
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
-from guiderail.models.skills.skill import Skill
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.templates.template import Skill
 from guiderail.systems.support.caching import declare_cache
 
 

@@ -32,7 +32,7 @@ def steps(page: Path) -> list[tuple[str, str]]:
 
 def command(line: str) -> None:
     """What a shell does with a line that begins with guiderail."""
-    from guiderail.tools.command import main
+    from guiderail.tools.cli.main import main
 
     words = shlex.split(line)
     if words[0] != "guiderail":

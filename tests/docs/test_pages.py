@@ -70,9 +70,9 @@ def test_every_command_task_and_kind_is_there(reference):
     import typer
 
     from guiderail.diagrams.tasks.registry import TASKS
-    from guiderail.models.skills.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
-    from guiderail.tools.command import app
-    from guiderail.tools.rollouts.metrics import COLUMNS, STATISTICS
+    from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+    from guiderail.tools.cli.main import app
+    from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS
 
     for name, command in typer.main.get_command(app).commands.items():
         part = reference["command"].partition(f"\n## guiderail {name}\n")[2].partition("\n## ")[0]
@@ -92,7 +92,7 @@ def test_every_field_of_a_template_says_what_it_is(reference):
 
 def test_whatever_a_task_can_declare_and_every_shipped_template_is_there(reference):
     from guiderail.diagrams.tasks.task import Task
-    from guiderail.models import skills
+    from guiderail.models import templates as skills
 
     part = reference["names"].partition("\n### Task\n")[2].partition("\n### ")[0]
     declared = [name for name in Task.__annotations__ if not name.startswith("_")]
@@ -113,12 +113,12 @@ def test_the_limits_of_a_robot_are_those_that_the_page_names():
     import numpy as np
     from pydrake.lcm import DrakeLcm
 
-    from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
-    from guiderail.diagrams.stations.hardware import EXTERNAL_SHARE, TORQUE_SHARE, VELOCITY_SHARE, HardwareStation
-    from guiderail.models.insertion import COLLISION_FORCE
-    from guiderail.models.joint_status import MISSED
-    from guiderail.models.units import MM
-    from guiderail.tools.operate.serve_iiwa import START
+    from guiderail.diagrams.hardware.station import EXTERNAL_SHARE, TORQUE_SHARE, VELOCITY_SHARE, HardwareStation
+    from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+    from guiderail.models.common.units import MM
+    from guiderail.models.control.joint_status import MISSED
+    from guiderail.models.objects.insertion import COLLISION_FORCE
+    from guiderail.tools.hardware.sim_driver import START
 
     page = (DOCS / "robot.md").read_text(encoding="utf-8").partition("## What each limit is for")[2]
     rows = dict(re.findall(r"^\| ([^|]+) \| (.+) \|$", page.partition("\n## ")[0], re.MULTILINE))

@@ -32,7 +32,7 @@ def test_the_table_is_of_today(maker):
 
 
 def test_every_study_and_method_that_it_asks_for_is_shipped(maker):
-    from guiderail.tools.studies.declaration import load_study
+    from guiderail.tools.experiments.declaration import load_study
 
     for row in (row for task in maker.TASKS.values() for row in task):
         study = load_study(row.study)

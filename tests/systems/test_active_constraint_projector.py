@@ -5,9 +5,9 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.skills import parse_skill
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.templates import parse_skill
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 
 PERIOD = 2.0**-7

@@ -18,10 +18,10 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.stations.arm import add_arm, controller_model
-from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
-from guiderail.models.cartesian_impedance import damping_matrix, spring_wrench
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.models.control.cartesian_impedance import damping_matrix, spring_wrench
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 
 STIFFNESS = np.diag([1500.0, 1000.0, 800.0, 40.0, 30.0, 30.0])

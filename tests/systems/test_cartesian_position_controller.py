@@ -3,9 +3,9 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import KnownArm, controller_model
-from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems import cartesian_position_controller

@@ -1,7 +1,7 @@
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, Condition, EpisodeMonitor
 
 PERIOD = 0.1

@@ -18,12 +18,12 @@ from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort,
 import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
-from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
-from guiderail.diagrams.stations.mujoco_rails import MujocoStation
-from guiderail.models.joint_status import StatusLimits
-from guiderail.models.keep_out import KeepOut
+from guiderail.diagrams.stations.mujoco import MujocoStation
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.control.joint_status import StatusLimits
+from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
-from guiderail.models.skills import load_skill
+from guiderail.models.templates import load_skill
 
 FOLDER = Path(guiderail.systems.__file__).parent
 TESTS = Path(__file__).parent

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 
 LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])

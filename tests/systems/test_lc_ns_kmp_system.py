@@ -4,7 +4,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, VectorLogSink, ZeroOrderHold
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
 from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem

@@ -3,7 +3,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
-from guiderail.models.pose_coordinates import pose_to_transform
+from guiderail.models.common.poses import pose_to_transform
 from guiderail.systems.measured_pose import MeasuredPose
 
 X_WT = RigidTransform(RotationMatrix.MakeYRotation(0.2), [0.1, 0.2, 0.3])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.meshcat_device import MeshcatDevice
 
 AXES = [(0, 1.0), (1, -1.0)]

@@ -8,8 +8,8 @@ from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource, ZeroOrderHold
 from pydrake.systems.sensors import ImageRgba8U
 
-from guiderail.diagrams.make import make_env
-from guiderail.models.errors import InputError
+from guiderail.diagrams.envs.make import make_env
+from guiderail.models.common.errors import InputError
 from guiderail.systems.policy_system import PolicyError, PolicySystem
 
 PERIOD = 2.0**-5

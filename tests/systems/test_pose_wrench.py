@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.pose_coordinates import pose_to_transform
+from guiderail.models.common.poses import pose_to_transform
 from guiderail.systems import PoseWrench
 
 STEP = 1e-6

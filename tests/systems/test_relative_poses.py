@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.relative_poses import RelativePoses
 
 X_WA = RigidTransform(RotationMatrix.MakeZRotation(0.5), [1.0, 0.0, 0.2])

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.errors import InputError
-from guiderail.models.keep_out import KeepOut
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.safety_filter import SafetyFilter
 

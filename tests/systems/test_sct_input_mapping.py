@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
-from guiderail.models.skills import load_skill
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.models.templates import load_skill
 from guiderail.systems.sct_input_mapping import SctInputMapping
 
 PERIOD = 0.01

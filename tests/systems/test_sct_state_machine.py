@@ -3,9 +3,9 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import transform_to_pose
-from guiderail.models.skills import load_skill
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import transform_to_pose
+from guiderail.models.templates import load_skill
 from guiderail.systems.sct_state_machine import SctStateMachine
 
 PERIOD = 2.0**-7

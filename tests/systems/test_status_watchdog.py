@@ -5,8 +5,8 @@ import pytest
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.errors import InputError
-from guiderail.models.joint_status import FAULTS, UNREADABLE, Fault, JointStatus, StatusLimits
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import FAULTS, UNREADABLE, Fault, JointStatus, StatusLimits
 from guiderail.systems.status_watchdog import StatusWatchdog
 
 PERIOD = 1.0 / 256.0

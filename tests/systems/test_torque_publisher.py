@@ -5,7 +5,7 @@ import pytest
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.torque_publisher import TorquePublisher
 
 PERIOD = 0.125

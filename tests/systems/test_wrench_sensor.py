@@ -10,7 +10,7 @@ from pydrake.multibody.tree import FixedOffsetFrame, RevoluteJoint, SpatialInert
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 PERIOD = 0.001

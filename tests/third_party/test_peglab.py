@@ -51,7 +51,7 @@ def lab(tmp_path_factory):
 
 def guiderail(lab, *arguments, code=0):
     """The command, as it is installed."""
-    return lab("-c", "from guiderail.tools.command import main; main()", *arguments, code=code)
+    return lab("-c", "from guiderail.tools.cli.main import main; main()", *arguments, code=code)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_what_it_learned_is_a_plain_diagram(lab, trained):
 
 def test_a_file_that_is_not_installed_serves_too(lab):
     (lab.folder / "mine.py").write_text(
-        "from guiderail import register_task\nfrom guiderail.diagrams.tasks.narrow_passage import NarrowPassage\n\n"
+        "from guiderail import register_task\nfrom guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n\n"
         "@register_task('mine/Passage')\nclass Mine(NarrowPassage):\n    num_steps = 40\n"
     )
     guiderail(

@@ -6,8 +6,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from guiderail.diagrams.trace import Trace
-from guiderail.models.errors import InputError
+from guiderail.diagrams.envs.trace import Trace
+from guiderail.models.common.errors import InputError
 
 
 class Bead(gymnasium.Env):

@@ -13,7 +13,7 @@ bead.register()
 @pytest.fixture(autouse=True, scope="session")
 def plain_pictures():
     """Labels get no room of their own: nobody looks, and it is half of what a picture takes."""
-    from guiderail.tools.viewing import style
+    from guiderail.tools.visualization import style
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "LAYOUT", None)
@@ -23,7 +23,7 @@ def plain_pictures():
 @pytest.fixture(scope="session")
 def bead_config():
     """A run of a second: tiny networks that learn from the second episode on."""
-    from guiderail.tools.learning.configure import configure
+    from guiderail.tools.learning.train import configure
 
     settings = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
     return configure("Bead", {}, settings=settings, episodes=8, seed=5)
@@ -32,7 +32,7 @@ def bead_config():
 @pytest.fixture(scope="session")
 def _bead_run(bead_config, tmp_path_factory):
     from guiderail.tools.learning.run_folder import RunFolder
-    from guiderail.tools.learning.train import train
+    from guiderail.tools.learning.trainer import train
 
     train(RunFolder(folder := tmp_path_factory.mktemp("bead") / "run"), bead_config)
     return folder

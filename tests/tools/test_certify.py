@@ -3,11 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import make_env, resolve
-from guiderail.diagrams.tasks.narrow_passage import NarrowPassage, reference_trajectory
-from guiderail.models.errors import InputError
+from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
+from guiderail.models.common.errors import InputError
 from guiderail.tools.certify import _declared_start, certify_skill
-from guiderail.tools.tasks import check_environment
+from guiderail.tools.environments import check_environment
 
 
 def test_a_tasks_certificate_is_written_and_accepted_and_an_attack_says_how_tight_it_is(tmp_path):

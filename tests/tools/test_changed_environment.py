@@ -3,19 +3,19 @@
 import numpy as np
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.certify import _what
-from guiderail.tools.learning.configure import configure
+from guiderail.tools.environments import changed_environment, check_environment, make_environment
+from guiderail.tools.evaluation import evaluate
+from guiderail.tools.evaluation.robustness import robustness
+from guiderail.tools.evaluation.rollout import as_learned
+from guiderail.tools.experiments.declaration import Study
+from guiderail.tools.experiments.study import Job, run_job
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.report.gather import command
-from guiderail.tools.robustness.robustness import robustness
-from guiderail.tools.rollouts import evaluate
-from guiderail.tools.rollouts.suited import as_learned
-from guiderail.tools.studies.declaration import Study
-from guiderail.tools.studies.study import Job, run_job
-from guiderail.tools.tasks import changed_environment, check_environment, make_environment
-from guiderail.tools.viewing.shown import Shown
+from guiderail.tools.learning.train import configure
+from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.report_data import command
 
 HARD = {"difficulty": "hard"}
 

@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.datasets.record import record
+from guiderail.tools.evaluation.rollout import check_seed
 from guiderail.tools.files import LOCK, check_page, check_picture, check_writable, remove_parts
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.recording.record import record
-from guiderail.tools.rollouts.rollout import check_seed
-from guiderail.tools.viewing.shown import Shown
+from guiderail.tools.visualization.episode_spec import Shown
 
 
 def test_a_file_below_a_file_cannot_be_written(tmp_path):

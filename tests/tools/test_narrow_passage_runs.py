@@ -8,19 +8,19 @@ import pytest
 from matplotlib.image import imread
 from safetensors.numpy import load_file
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.check import check
-from guiderail.tools.learning.configure import configure
+from guiderail.tools.datasets.record import record
+from guiderail.tools.datasets.validate import check
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.evaluate import evaluate
+from guiderail.tools.evaluation.rollout import reset_held_out
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import train
-from guiderail.tools.recording.record import record
-from guiderail.tools.rollouts.evaluate import evaluate
-from guiderail.tools.rollouts.rollout import reset_held_out
-from guiderail.tools.tasks import make_environment
-from guiderail.tools.viewing import film
-from guiderail.tools.viewing.replay import default_page, tube, write_page
-from guiderail.tools.viewing.shown import Shown
+from guiderail.tools.learning.train import configure
+from guiderail.tools.learning.trainer import train
+from guiderail.tools.visualization import film
+from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.replay import default_page, tube, write_page
 
 SETTINGS = {"units": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}
 

@@ -7,21 +7,21 @@ import gymnasium
 import numpy as np
 import pytest
 
-from guiderail.diagrams.env import RECORDED, SAID
-from guiderail.diagrams.make import make_env, resolve
-from guiderail.diagrams.observation import Observed, affine
+from guiderail.diagrams.envs.env import RECORDED, SAID
+from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.envs.observation import Observed, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
-from guiderail.models.errors import InputError
-from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.models.common.errors import InputError
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.episode_monitor import Condition
 from guiderail.systems.reward_system import RewardTerm
-from guiderail.tools.check import check
-from guiderail.tools.listing import options_in_words
-from guiderail.tools.rollouts.evaluate import _counts_collisions, claim
-from guiderail.tools.stress.campaign import stress
-from guiderail.tools.tasks import import_modules
+from guiderail.tools.cli.catalog import options_in_words
+from guiderail.tools.datasets.validate import check
+from guiderail.tools.environments import import_modules
+from guiderail.tools.evaluation.evaluate import _counts_collisions, claim
+from research.action_fuzzing.campaign import stress
 
 NUM_STEPS = 10
 
@@ -34,7 +34,7 @@ class Own(Task):
     reward = staticmethod(lambda pose: -float(pose[1]))
 
     def world(self):
-        return NarrowPassage(start=(0.35, 0.1), goal=(0.35, 0.9), goal_radius=0.05, gap_x=(0.2, 0.5))
+        return PassageGeometry(start=(0.35, 0.1), goal=(0.35, 0.9), goal_radius=0.05, gap_x=(0.2, 0.5))
 
     def reference(self):
         means = np.column_stack([np.full(NUM_STEPS, 0.35), np.linspace(0.1, 0.2, NUM_STEPS)])
@@ -263,7 +263,7 @@ def test_a_file_finds_those_beside_it_and_what_fails_in_it_is_said(tmp_path):
 
 
 def test_a_shipped_skill_is_checked_by_its_name_and_says_where_the_way_back_is(monkeypatch):
-    monkeypatch.setattr("guiderail.models.skills.validate.validate", lambda skill: [])
+    monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda skill: [])
     back, none = check(Path("pouring"))["transitions"]
     assert back == "translational → tilt below 0.25 m, back above 0.27 m"
     assert none == "tilt → pour below 0.075 m, no way back"

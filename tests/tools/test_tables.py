@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.tools.tables import read_table, table_text, write_table
 
 

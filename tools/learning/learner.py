@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import Registry
 from guiderail.models.policy import Policy
-from guiderail.models.registry import Registry
-from guiderail.tools.rollouts.rollout import Observer
+from guiderail.tools.evaluation.rollout import Observer
 
 
 class Learner(Observer, ABC):

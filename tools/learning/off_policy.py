@@ -23,15 +23,15 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch.nn.utils import parameters_to_vector
 
-from guiderail.diagrams.task import Symmetry
-from guiderail.models.errors import InputError
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
+from guiderail.tools.evaluation.rollout import Decision
 from guiderail.tools.learning import older
-from guiderail.tools.learning.checkpoint_selection import CheckpointSelection
-from guiderail.tools.learning.ensemble import EnsembleSac, EnsembleTqc
+from guiderail.tools.learning.checkpoint import CheckpointSelection
+from guiderail.tools.learning.config import Preset, decision_discount
+from guiderail.tools.learning.fast_sb3.ensemble import EnsembleSac, EnsembleTqc
 from guiderail.tools.learning.learner import Learner, diverged
-from guiderail.tools.learning.presets import Preset, decision_discount
-from guiderail.tools.rollouts.rollout import Decision
 
 IMAGE_POOL = 5  # pixels; 110×144×3 becomes 22×28×3
 

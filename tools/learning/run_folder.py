@@ -15,14 +15,14 @@ import yaml
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from guiderail.models.errors import InputError, brief
-from guiderail.models.yaml_files import load_yaml
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.yaml import load_yaml
+from guiderail.tools.environments import check_environment, import_modules, task_content
+from guiderail.tools.evaluation.metrics import checked_rows
 from guiderail.tools.files import LOCK, remove_parts, write_atomically
 from guiderail.tools.learning import older
-from guiderail.tools.learning.presets import Preset
-from guiderail.tools.rollouts.metrics import checked_rows
+from guiderail.tools.learning.config import Preset
 from guiderail.tools.tables import read_table, table_text
-from guiderail.tools.tasks import check_environment, import_modules, task_content
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
 
@@ -90,7 +90,7 @@ class RunFolder:
 
     @property
     def ledger(self) -> Path:
-        """The folder with every control step; see `guiderail.tools.rollouts.ledger`."""
+        """The folder with every control step; see `guiderail.tools.evaluation.step_log`."""
         return self.path / "ledger"
 
     @contextmanager

@@ -1,203 +1,179 @@
-"""Training: one page, from a configuration to a run folder. Everything else that `guiderail train` does is a call."""
+"""`guiderail train`: what was typed becomes a checked configuration, and a run becomes a folder with its pictures."""
 
-import time
-from collections.abc import Callable
-from typing import Any, cast
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 import gymnasium
-import torch
+import pandas as pd
 
-from guiderail.models.errors import InputError
-from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.learner import LEARNERS, Learner, arguments_of, diverged
-from guiderail.tools.learning.person import Person, Watched
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.learning.student import Spaces, Student
-from guiderail.tools.rollouts.ledger import Ledger
-from guiderail.tools.rollouts.rollout import Act, Observer, rollout
-from guiderail.tools.rollouts.suited import suits
-from guiderail.tools.tables import table_text
-from guiderail.tools.tasks import make_environment
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import check_environment, import_modules, task_content
+from guiderail.tools.evaluation.metrics import summary
+from guiderail.tools.evaluation.progress import EpisodeProgress
+from guiderail.tools.evaluation.rollout import Act, check_seed
+from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.interventions import Person
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
-# Ledger and checkpoints cost at most this part of the time: a small checkpoint is written after every episode, a large
-# one now and then. (The first and the last are written in any case.)
-SAVING_SHARE = 0.03
+DEFAULTS: dict[str, Any] = {"algorithm": "tqc", "preset": "robust", "episodes": 60, "seed": 0}
 
 
-def train(
-    folder: RunFolder,
-    config: RunConfig,
+def own_defaults(task: str) -> dict[str, Any]:
+    """The learner that a task declares, taken where neither algorithm nor preset is asked for."""
+    return dict(TASKS.get(task).learner) if task in TASKS.names() else {}
+
+
+# What a finished run says about itself.
+SUMMARY = (
+    "episodes", "converged_after", "success_rate", "success_rate_last_10", "mean_return_last_10",
+    "worst_violation", "peak_force", "collisions", "wall_time",
+)  # fmt: skip
+
+
+def configure(
+    task: str,
+    environment: Mapping[str, Any],
     *,
-    resume: bool = False,
-    report: Callable[[dict[str, Any]], None] | None = None,
-    demonstrator: Callable[[gymnasium.Env], Act] | None = None,
-    person: Person | None = None,
-) -> list[dict[str, Any]]:
-    """Trains a run to its last episode and writes its folder.
-
-    A run that was killed and resumed gives bit for bit what it would have given undisturbed: a checkpoint is taken at
-    an episode's end and holds every number and every random generator that the rest depends on. The ledger is written
-    before it, and what is beyond it is written again.
-
-    Args:
-        folder: where it is written; with `resume`, where it goes on.
-        config: the run. The folder's own configuration must agree with it when it goes on.
-        report: called with each episode's row.
-        demonstrator: who acts, in an environment, in the learner's `demonstration_episodes`: a policy without a memory
-            of earlier episodes. Off-policy learners are taught by what others did (Vecerik et al., 2017).
-        person: who watches a run that is configured so, pushes, and says what was a success.
-
-    Returns:
-        The rows of `episodes.csv`.
+    algorithm: str = DEFAULTS["algorithm"],
+    preset: str = DEFAULTS["preset"],
+    settings: Mapping[str, Any] | None = None,
+    episodes: int = DEFAULTS["episodes"],
+    seed: int = DEFAULTS["seed"],
+    imports: Sequence[str] = (),
+    ledger: bool = True,
+    with_person: bool = False,
+) -> RunConfig:
+    """A checked configuration with everything resolved.
 
     Raises:
-        InputError: if the folder holds another run, another process writes into it, or nobody demonstrates or watches;
-            or of whatever was wrong in an episode: if that was the first one, no folder is left that wasn't there.
+        InputError: for an unknown name or a number out of range.
     """
-    if config.with_person and person is None:
-        raise InputError("a person watches this run: give --with-person")
-    if config.learner.demonstration_episodes and demonstrator is None:
-        raise InputError(
-            f"nobody demonstrates {config.task}: it has no rule, so leave the setting demonstration_episodes out"
-        )
-    torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
-    env = make_environment(config.task, config.environment)
-    if config.learner.demonstration_episodes and demonstrator is not None and not suits(demonstrator, env):
-        env.close()
-        raise InputError(
-            f"who demonstrates {config.task} sees or moves other things than this environment: leave the setting "
-            "demonstration_episodes out"
-        )
-    task = cast(Any, env.unwrapped).task
-    make_learner = LEARNERS.get(config.learner.algorithm)
-    named = arguments_of(config, task)
-    try:
-        learner: Learner = make_learner(config.learner, env, **named)
-    except MemoryError as error:
-        env.close()
-        raise InputError(
-            f"so many decisions are more than fits into memory ({error}): give a smaller --set buffer_size=..."
-        ) from error
-    env.reset(seed=config.seed)  # what is hidden and constant in a run is sampled here
-    if not resume:
-        folder.refuse_existing()
-    made = not folder.path.exists()
-    try:
-        with folder.locked():
-            if config.learner.pipelined:
-                given = (config.learner, Spaces(env)), named
-                learner = Student(learner, given, waits=True, imports=config.imports)
-            if not resume:
-                folder.create(config)
-            try:
-                return _train(folder, config, env, learner, resume, report, demonstrator, person)
-            except InputError:
-                # What was wrong is to be put right and tried again, and a configuration alone is in the way of that.
-                # What a learner diverged with is kept.
-                if not resume and not learner.has_diverged():
-                    folder.remove_unbegun(made=made)
-                raise
-    finally:
-        learner.close()
-        env.close()
+    if episodes < 1:
+        raise InputError(f"a run needs at least one episode, not {episodes}")
+    check_seed(seed)
+    learner = resolve_preset(preset, algorithm, settings)
+    resolved = check_environment(task, environment)
+    return RunConfig(
+        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger,
+        task_content(task, resolved, imports), with_person,
+    )  # fmt: skip
 
 
-def _train(
-    folder: RunFolder,
-    config: RunConfig,
-    env: Any,
-    learner: Learner,
-    resume: bool,
-    report: Callable[[dict[str, Any]], None] | None,
-    demonstrator: Callable[[gymnasium.Env], Act] | None,
-    person: Person | None,
-) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
+def run(
+    task: str | None,
+    out: Path | None,
+    *,
+    environment: Mapping[str, Any],
+    algorithm: str | None = None,
+    preset: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    resume: bool = False,
+    imports: Sequence[str] = (),
+    ledger: bool | None = None,
+    person: Callable[[], Person] | None = None,
+    demonstrator: Callable[[str], Callable[[gymnasium.Env], Act]] | None = None,
+) -> dict[str, Any]:
+    """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
+
+    A run that goes on keeps its configuration; only more episodes may be asked for. `person` makes who watches, pushes
+    and speaks, where somebody does. `demonstrator` finds who acts in
+    the learner's `demonstration_episodes` by the task's name, and raises an InputError where nobody does.
+
+    Returns:
+        What happened, in a few numbers.
+    """
+    if out is None:
+        raise InputError("where should the run go? name a folder with --out RUN")
+    folder = RunFolder(out)
+    imports = import_modules(imports)
+    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
+    choices["with_person"] = None if person is None else True
+    given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
     if resume:
-        rows, written = _resume(folder, learner, env)
-        if written < len(rows):
-            folder.write_episodes(rows)  # a run that is complete writes no table any more
-        if len(rows) < config.episodes:
-            folder.remove_policy()  # killed from here on, it has one of fewer episodes than its table
-    watched = None
-    if config.with_person and person is not None:
-        watched = Watched(config, person, load_checkpoint(folder.checkpoint)[1] if rows else {})
-        watched.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
-        env, config = watched.env, watched.config
-    folder.write_config(config)
+        config = _continued(folder, task, environment, given, settings)
+    elif task is None:
+        raise InputError("what should be learned? name a task, such as guiderail train NarrowPassage --out RUN")
+    else:
+        folder.refuse_existing()
+        given["settings"] = settings
+        config = configure(task, environment, imports=imports, **with_defaults(task, given))
+    from guiderail.tools.learning.trainer import train  # PyTorch takes seconds: what is wrong was refused by now
 
-    ledger = Ledger(env, folder.ledger)
-    watching: list[Observer] = [ledger] if config.ledger else []
-    shown = 0 if demonstrator is None else config.learner.demonstration_episodes
-    spent_training, spent_saving, last_saving = 0.0, 0.0, 0.0
-    for episode in range(len(rows), config.episodes):
-        started = time.perf_counter()
-        act = demonstrator(env) if demonstrator is not None and episode < shown else learner.act
-        if watched is None:
-            row = rollout(env, act, learner, *watching, index=episode)
-        else:
-            row = watched.rollout(act, learner, *watching, index=episode)
-            env = watched.env
-        if learner.has_diverged():
-            raise diverged()
-        if shown:
-            row["demonstrated"] = int(episode < shown)
-        row["wall_time"] = time.perf_counter() - started
-        if rows and rows[0].keys() != row.keys():
-            raise InputError(
-                f"the run in {folder.path} was begun by another version of guiderail, whose episodes have other "
-                "numbers: go on with that one, or train anew"
-            )
-        rows.append(row)
-        spent_training += time.perf_counter() - started
-        if report is not None:
-            report(rows[-1])
-        with_another = ledger.seconds + spent_saving + last_saving
-        if with_another <= SAVING_SHARE * spent_training or episode + 1 in (1, config.episodes):
-            started = time.perf_counter()
-            _save(folder, rows, learner, env, watched)
-            last_saving = time.perf_counter() - started
-            spent_saving += last_saving
-        learner.hand_over()
-    learner.finish()
-    policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
-    policy.save(folder.path, write=write_atomically)
-    return rows
+    shows = demonstrator(config.task) if demonstrator and config.learner.demonstration_episodes else None
+    watching = person() if config.with_person and person is not None else None
+    with EpisodeProgress(config.episodes, name=config.task) as progress:
+        rows = train(folder, config, resume=resume, report=progress.update, demonstrator=shows, person=watching)
+    print(f"learned; now the learning curve and a replay page are drawn into {out}", file=sys.stderr, flush=True)
+    return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
 
 
-def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, watched: Watched | None) -> None:
-    """The checkpoint first: it holds the table too, and whoever is killed between the two loses nothing."""
-    arrays, values = learner.state()
-    generator = env.unwrapped.np_random.bit_generator.state
-    held = {"rows": rows, "learner": values, "environment": generator}
-    save_checkpoint(folder.checkpoint, arrays, held | ({} if watched is None else watched.state()))
-    if watched is not None:
-        folder.write_config(watched.config)
-    folder.write_episodes(rows)
+def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """What was asked for, and for the rest the learner that this task was measured with.
 
-
-def _resume(folder: RunFolder, learner: Learner, env: Any) -> tuple[list[dict[str, Any]], int]:
-    """Puts learner and environment back to the last checkpoint; returns the rows up to it, and how many of them the
-    table has: fewer where the run was killed between the two.
+    Args:
+        task: its name.
+        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them, with
+            single settings of it replaced.
     """
-    table = folder.path / "episodes.csv"
-    if not folder.checkpoint.exists() and not table.exists():
-        return [], 0  # it was killed in its first episode
-    arrays, values = load_checkpoint(folder.checkpoint)
+    learner = {} if given.keys() & {"algorithm", "preset"} else own_defaults(task)
+    settings = {**learner.get("settings", {}), **(given.get("settings") or {})}
+    return {**learner, **given} | ({"settings": settings} if settings else {})
+
+
+def finish(out: Path) -> dict[str, str]:
+    """Adds the pictures to a run that has its numbers; what cannot be drawn on this machine is said, not raised."""
+    from guiderail.tools.visualization.curves import plot_run
+    from guiderail.tools.visualization.episode_spec import Shown
+    from guiderail.tools.visualization.replay import default_page, write_page
+
+    curve = str(plot_run(out))
     try:
-        rows = values["rows"]
-        written = folder.episodes() if table.exists() else []
-        if table_text(written) != table_text(rows[: len(written)]):
+        write_page(page := default_page(out, {}), Shown.of_run(out))
+        return {"curve": curve, "replay": str(page)}
+    except InputError as error:
+        return {"curve": curve, "replay": f"none: {error}"}
+
+
+def _continued(
+    folder: RunFolder,
+    task: str | None,
+    environment: Mapping[str, Any],
+    given: Mapping[str, Any],
+    settings: Mapping[str, Any] | None,
+) -> RunConfig:
+    """The configuration of the run that goes on; refuses what would make it another run."""
+    config = folder.config()
+    config.refuse_changed_task(folder.path)
+    stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
+    stored |= {"ledger": config.ledger, "with_person": config.with_person} | config.environment
+    environment = {key: check_environment(config.task, environment).get(key, environment[key]) for key in environment}
+    wanted = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
+    for key, value in wanted.items():
+        if key == "episodes" and value < config.episodes:
+            raise InputError(f"the run in {folder.path} has {config.episodes} episodes: it can only be given more")
+        if key != "episodes" and stored.get(key) != value:
             raise InputError(
-                f"{table} is not the table of its checkpoint: restore it, or remove it to have it rewritten"
+                f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train anew"
             )
-        learner.restore(arrays, values["learner"])
-        env.unwrapped.np_random.bit_generator.state = values["environment"]
-    except InputError:
-        raise
-    except Exception as error:  # its digest says that it was written so, and not what was written
-        raise InputError(
-            f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
-        ) from error
-    return rows, len(written)
+    stored_learner = {key: value for key, value in asdict(config.learner).items() if key != "algorithm"}
+    learner = resolve_preset(config.preset, config.learner.algorithm, stored_learner | dict(settings or {}))
+    if learner != config.learner:
+        raise InputError(f"the run in {folder.path} has other learner settings: leave --set out, or train anew")
+    return replace(config, episodes=given.get("episodes", config.episodes), versions=_versions(folder, config))
+
+
+def _versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:
+    """Of the run so far and from now on; where they differ it is said, as the result may then be another one."""
+    told = {}
+    for name, now in installed_versions().items():
+        before = config.versions.get(name, now)
+        told[name] = before if before.split(", then ")[-1] == now else f"{before}, then {now}"
+    if changed := [f"{name} {words}" for name, words in told.items() if words != config.versions.get(name, words)]:
+        print(f"the run in {folder.path} goes on with other versions: {'; '.join(changed)}", file=sys.stderr)
+    return config.versions | told

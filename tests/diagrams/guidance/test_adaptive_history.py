@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.guidance.known import Known
-from guiderail.diagrams.guidance.primitive_skill import PrimitiveSkill
+from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
+from guiderail.diagrams.guidance.prior import Known
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 

@@ -5,11 +5,11 @@ import pytest
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.guidance.function import LawGuidance
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.law import LawGuidance
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
-from guiderail.diagrams.make import make_env
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 
 @pytest.mark.parametrize("size", [2, 3])

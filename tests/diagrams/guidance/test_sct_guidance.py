@@ -7,11 +7,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
 
-from guiderail.diagrams.guidance.active_constraint_filter import ActiveConstraintFilter
+from guiderail.diagrams.envs.task_diagram import exact_period
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.sct import SctGuidance
-from guiderail.diagrams.task import exact_period
-from guiderail.models.skills import load_skill
+from guiderail.diagrams.guidance.sct import ActiveConstraintFilter, SctGuidance
+from guiderail.models.templates import load_skill
 
 PERIOD = exact_period(0.01)
 MUG = {"mug_tip": RigidTransform()}

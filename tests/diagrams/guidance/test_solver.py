@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import make_env
-from guiderail.models.errors import InputError
-from guiderail.tools.command import _environment
-from guiderail.tools.tasks import check_environment
+from guiderail.diagrams.envs.make import make_env
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli.main import _environment
+from guiderail.tools.environments import check_environment
 
 
 def commands(**options):

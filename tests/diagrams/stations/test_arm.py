@@ -12,14 +12,14 @@ from pydrake.multibody.plant import CoulombFriction, ExternallyAppliedSpatialFor
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.recording import drive_along
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.arm import MIDDLE_OF_TURN, ArmStation, KnownArm
-from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.models.errors import InputError
-from guiderail.models.objects.bnc_motion import MM, insert_and_lock
-from guiderail.models.pose_coordinates import pose_to_transform
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.objects.bnc_connector.motion import MM, insert_and_lock
 from guiderail.models.robots.robot import find_robot
 
 WORKCELL = BncWorkcell()

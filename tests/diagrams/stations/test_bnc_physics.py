@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.recording import drive_along
-from guiderail.diagrams.stations.bnc_workcell import BncWorkcell
-from guiderail.diagrams.stations.rails import RailsStation
+from guiderail.diagrams.envs.recording import drive_along
+from guiderail.diagrams.stations.gantry import RailsStation
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.models.objects.bnc_motion import CLEAR, MM, insert_and_lock, poses
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.objects.bnc_connector.motion import CLEAR, MM, insert_and_lock, poses
 
 STIFFNESS = 1500.0
 WORKCELL = BncWorkcell()

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import resolve
-from guiderail.diagrams.recording import drive_along
-from guiderail.diagrams.stations.rails import RailsStation
+from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.envs.recording import drive_along
+from guiderail.diagrams.stations.gantry import RailsStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
-from guiderail.models.objects.bnc_connector import BncDimensions
-from guiderail.models.objects.bnc_motion import CLEAR, insert_and_lock, poses
-from guiderail.models.units import MM
+from guiderail.models.common.units import MM
+from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from guiderail.models.objects.bnc_connector.motion import CLEAR, insert_and_lock, poses
 
 FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
 HARD = resolve("BncConnector", {"difficulty": "hard"}).task

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.recording import drive_along
+from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.arm import ArmStation
-from guiderail.diagrams.stations.grid_clamp_workcell import GridClampWorkcell
-from guiderail.diagrams.stations.rails import RailsStation
+from guiderail.diagrams.stations.gantry import RailsStation
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.models.objects.grid_clamp import MM
+from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+from guiderail.models.objects.grid_clamp.geometry import MM
 
 WORKCELL = GridClampWorkcell()
 SURFACE = WORKCELL.dimensions.peg_length  # height of the tips in T when they stand on the table

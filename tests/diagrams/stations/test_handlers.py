@@ -1,8 +1,8 @@
 import pytest
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.stations import pace
-from guiderail.models.errors import InputError
+from guiderail.diagrams.hardware import clock as pace
+from guiderail.models.common.errors import InputError
 
 
 def test_where_a_handler_would_end_the_process_nobody_listens(monkeypatch):

@@ -7,9 +7,9 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
-from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
-WORLD, CONFIG = NarrowPassage(), PlaneConfig()
+WORLD, CONFIG = PassageGeometry(), PlaneConfig()
 
 
 class Run:

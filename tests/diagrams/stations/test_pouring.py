@@ -5,7 +5,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.pouring import MIDDLE_OF_POURING, PouringConfig, PouringStation
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 
 UPRIGHT = np.array([-0.15, -0.20, 0.15, 0.0, 0.0, 0.0])
 TILTED = MIDDLE_OF_POURING + [0.0, 0.0, 0.0, 0.0, 0.0, -1.2]

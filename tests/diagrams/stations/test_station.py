@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import make_station, resolve
-from guiderail.models.errors import InputError
+from guiderail.diagrams.envs.make import make_station, resolve
+from guiderail.models.common.errors import InputError
 
 PLACES = [
     ("NarrowPassage", "plane"),

@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 
 import guiderail.diagrams  # noqa: F401 (registers)
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, reference_trajectory
-from guiderail.diagrams.tasks.bnc_options import ALIGNMENT
-from guiderail.diagrams.tasks.bnc_rewards import ALIGNMENT_REWARD, DEPTH_REWARD
-from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.rewards import ALIGNMENT_REWARD, DEPTH_REWARD
+from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, reference_trajectory
 from guiderail.diagrams.tasks.insertion import InsertionReset
-from guiderail.models.errors import InputError
-from guiderail.models.insertion import COLLISION_FORCE
-from guiderail.models.units import MM
-from guiderail.tools.rollouts.evaluate import evaluate_policy
-from guiderail.tools.rollouts.null_policies import still
-from guiderail.tools.studies.scripted import reactive_rule
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.units import MM
+from guiderail.models.objects.insertion import COLLISION_FORCE
+from guiderail.tools.evaluation.baselines import still
+from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.scripted import reactive_rule
 
 NEW_RUN = {"new_run": True}  # every episode is a run of its own
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.bnc_uncertainty import LARGEST_GRASP_ANGLE, BncUncertainty
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.bnc_connector.options import LARGEST_GRASP_ANGLE, BncUncertainty
 from guiderail.diagrams.tasks.insertion import InsertionReset
-from guiderail.models.errors import InputError
-from guiderail.tools.rollouts.evaluate import evaluate_policy
-from guiderail.tools.studies.scripted import reactive_rule
+from guiderail.models.common.errors import InputError
+from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.scripted import reactive_rule
 
 
 def drawn(uncertain, count, seed=0):

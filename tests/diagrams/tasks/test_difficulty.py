@@ -3,19 +3,20 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import make_env, resolve
-from guiderail.diagrams.tasks import bnc_options, grid_clamp_options
-from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
-from guiderail.diagrams.tasks.bnc_uncertainty import BncUncertainty
+from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.tasks.bnc_connector import options as bnc_options
+from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.scripted import lever_rule
+from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.grid_clamp import task as grid_clamp_options
 from guiderail.diagrams.tasks.insertion import InsertionReset
-from guiderail.models.errors import InputError
-from guiderail.models.objects.bnc_connector import BncDimensions
-from guiderail.models.objects.grid_clamp import GridClampDimensions
-from guiderail.models.units import MM
-from guiderail.tools.rollouts.evaluate import evaluate_policy
-from guiderail.tools.rollouts.null_policies import still
-from guiderail.tools.studies.lever_rule import lever_rule
-from guiderail.tools.studies.scripted import gentle_rule, straight_descent
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.units import MM
+from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
+from guiderail.tools.evaluation.baselines import still
+from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.scripted import gentle_rule, straight_descent
 
 HARD = {"BncConnector": bnc_options.HARD, "GridClamp": grid_clamp_options.HARD}
 FRESH = {"options": {"new_run": True}, "seed": 300_000}

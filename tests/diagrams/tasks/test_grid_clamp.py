@@ -7,15 +7,20 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import guiderail.diagrams  # noqa: F401 (registers)
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.grid_clamp import CENTRE, LEASH, SCALE, make_skill
-from guiderail.diagrams.tasks.grid_clamp_options import COLLISION_FORCE
-from guiderail.diagrams.tasks.grid_clamp_uncertainty import GridClampUncertainty
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.grid_clamp.task import (
+    CENTRE,
+    COLLISION_FORCE,
+    LEASH,
+    SCALE,
+    GridClampUncertainty,
+    make_skill,
+)
 from guiderail.diagrams.tasks.insertion import InsertionReset
-from guiderail.models.errors import InputError
-from guiderail.models.units import MM
-from guiderail.tools.rollouts.evaluate import evaluate_policy
-from guiderail.tools.studies.scripted import STIFFNESS, searching_rule, straight_descent
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.units import MM
+from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.scripted import STIFFNESS, searching_rule, straight_descent
 
 NEW_RUN = {"new_run": True}  # every episode is a run of its own
 

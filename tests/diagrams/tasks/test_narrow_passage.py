@@ -11,13 +11,13 @@ from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import guiderail.diagrams  # registers the environments
-from guiderail.diagrams import cameras
+from guiderail.diagrams.envs import cameras
 from guiderail.diagrams.guidance.registry import possible_guidance
-from guiderail.diagrams.tasks.narrow_passage import NarrowPassage as Task
-from guiderail.models.errors import InputError
-from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage as Task
+from guiderail.models.common.errors import InputError
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
-WORLD = NarrowPassage()
+WORLD = PassageGeometry()
 GUIDANCE = possible_guidance(Task.knows())
 NULL_SPACE = ("kgrl", "skgrl")
 
@@ -185,7 +185,7 @@ def test_smooth_guidance_jerks_far_less():
     for guidance in NULL_SPACE:
         env = make(guidance)
         play(env, lambda k: actions[k])
-        jerk[guidance] = guiderail.diagrams.trace.mean_jerk(env.trace.measured, env.trace.period)
+        jerk[guidance] = guiderail.diagrams.envs.trace.mean_jerk(env.trace.measured, env.trace.period)
     assert jerk["skgrl"] < jerk["kgrl"] / 10
 
 
@@ -330,7 +330,7 @@ def test_a_forbidden_browser_view_is_one_clear_sentence(monkeypatch):
 
 def test_the_browser_view_is_local(monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")
-    monkeypatch.setattr("guiderail.diagrams.env.Simulator.set_target_realtime_rate", lambda *_: None)
+    monkeypatch.setattr("guiderail.diagrams.envs.env.Simulator.set_target_realtime_rate", lambda *_: None)
     env = make("kmp", render_mode="human")
     assert "localhost" in env.task.meshcat.web_url()
     env.reset()

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.narrow_passage_options import HARD, NarrowPassageOptions
-from guiderail.models.errors import InputError
-from guiderail.models.objects.narrow_passage import NarrowPassage
-from guiderail.tools.rollouts.null_policies import NULL_POLICIES, always, still
-from guiderail.tools.rollouts.rollout import rollout
-from guiderail.tools.studies.slalom import slalom
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.narrow_passage.task import HARD, NarrowPassageOptions, slalom
+from guiderail.models.common.errors import InputError
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.tools.evaluation.baselines import NULL_POLICIES, always, still
+from guiderail.tools.evaluation.rollout import rollout
 
 
 @pytest.fixture(scope="module", params=["skgrl", "kgrl"])
@@ -63,7 +62,7 @@ def test_the_obstacles_are_drawn_where_they_are(env):
 
 
 def test_the_standard_world_is_what_it_was():
-    assert NarrowPassageOptions().world() == NarrowPassage()
+    assert NarrowPassageOptions().world() == PassageGeometry()
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)
     _, drawn = standard.reset(seed=3)

@@ -6,12 +6,12 @@ import pytest
 import yaml
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.make import make_env, resolve
-from guiderail.diagrams.options import validated
-from guiderail.diagrams.tasks.part_file import Bounds
-from guiderail.diagrams.tasks.part_insertion import load_task_folder
+from guiderail.diagrams.envs.config import validated
+from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.tasks.part.file import Bounds
+from guiderail.diagrams.tasks.part.task import load_task_folder
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.objects.triangle_mesh import lathe
 from guiderail.models.primitives import Demonstrations
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.pouring import START_HEIGHT, START_RADIUS
-from guiderail.diagrams.tasks.pouring_inputs import ADVERSARIES, person
-from guiderail.models.errors import InputError
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.pouring.scripted import ADVERSARIES, person
+from guiderail.diagrams.tasks.pouring.task import START_HEIGHT, START_RADIUS
+from guiderail.models.common.errors import InputError
 
 
 @pytest.fixture(scope="module")

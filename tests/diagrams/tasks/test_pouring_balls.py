@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.make import make_env, resolve
+from guiderail.diagrams.envs.make import make_env, resolve
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring_conditions import conditions
-from guiderail.models.errors import InputError
-from guiderail.models.objects.vessels import Ball
-from guiderail.tools.studies.aiming_person import aiming_person
+from guiderail.diagrams.tasks.pouring.scripted import aiming_person
+from guiderail.diagrams.tasks.pouring.task import conditions
+from guiderail.models.common.errors import InputError
+from guiderail.models.objects.pouring.vessels import Ball
 
 CONFIG = PouringConfig(ball=Ball(diameter=0.026), num_balls=6)
 IN, FALLEN, KEPT = [0.0, 0.0, -0.05], [0.3, 0.0, -0.2], [0.3, 0.0, 0.1]  # in the frame of the mug's tip

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.make import make_env
-from guiderail.diagrams.tasks.pouring_options import HARD, MAX_MUG_ERROR
-from guiderail.diagrams.tasks.pouring_template import frames_of, make_aimed_skill
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform, transform_to_pose
-from guiderail.tools.rollouts.null_policies import NULL_POLICIES, NullPolicy
-from guiderail.tools.studies.aiming_person import aiming_person, blind_person
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.pouring.options import HARD, MAX_MUG_ERROR, frames_of, make_aimed_skill
+from guiderail.diagrams.tasks.pouring.scripted import aiming_person, blind_person
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform, transform_to_pose
+from guiderail.tools.evaluation.baselines import NULL_POLICIES, NullPolicy
 
 PERIOD = 0.01  # [s] between control steps
 # Where seed 3 started before there were difficulties.

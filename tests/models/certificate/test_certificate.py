@@ -17,8 +17,8 @@ from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.certificate.bounds import certify
 from guiderail.models.certificate.files import BUDGET, CERTIFICATE, OTHER_CLOCK, certificate_files, digest
+from guiderail.models.certificate.lagrange_bounds import Budget, _Market, _of_residue
 from guiderail.models.certificate.loop import Skill, reach
-from guiderail.models.certificate.prices import Budget, _Market, _of_residue
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.parts.mesh_file import load_part
 
 trimesh = pytest.importorskip("trimesh")

@@ -8,7 +8,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
-from guiderail.models.primitives.selection import fit, motion_without_actions, share_within_spread
+from guiderail.models.primitives.fit import fit, motion_without_actions, share_within_spread
 from oracles.handwriting import LETTERS, write
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority, authority_gains, exploration_rms, rms_gains
 

@@ -8,7 +8,7 @@ import numpy as np
 import piqp
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import (
     Demonstrations,
     LcNsKmp,

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import (
     LcNsKmp,
     LinearConstraints,
@@ -13,7 +13,7 @@ from guiderail.models.primitives import (
     SquaredExponential,
     UnsolvableError,
 )
-from guiderail.models.primitives.least_norm import SOLVERS
+from guiderail.models.primitives.qp import SOLVERS
 from oracles.dense import DenseWindow, squared_exponential
 from oracles.problems import random_problem
 

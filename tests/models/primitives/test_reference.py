@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 from guiderail.models.primitives.mixture import Mixture, fit_mixture, regress
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import (
     LcNsKmp,
     LinearConstraints,
@@ -14,7 +14,7 @@ from guiderail.models.primitives import (
     SquaredExponential,
     UnsolvableError,
 )
-from guiderail.models.primitives.least_norm import SOLVERS
+from guiderail.models.primitives.qp import SOLVERS
 from oracles.problems import random_problem
 
 SEEDS = st.integers(0, 2**32 - 1)

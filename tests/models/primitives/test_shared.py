@@ -3,9 +3,9 @@ import gc
 import numpy as np
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
-from guiderail.models.primitives.shared import shared_primitive
+from guiderail.models.primitives.lc_ns_kmp import shared_primitive
 
 STEPS = 30
 
@@ -48,7 +48,7 @@ def test_it_answers_as_one_that_nobody_else_uses():
 
 
 def test_what_nobody_uses_is_not_kept():
-    from guiderail.models.primitives.shared import _USED
+    from guiderail.models.primitives.lc_ns_kmp import _USED
 
     shared_primitive(reference(1.7), box(), 2.0)
     gc.collect()

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.models.parsing import add_model
-from guiderail.models.robots.assembly import add_end_effector, add_robot
+from guiderail.models.common.parsing import add_model
+from guiderail.models.control.wrench import external_wrench
 from guiderail.models.robots.connector_tool import CONNECTOR_TOOL
 from guiderail.models.robots.iiwa import IIWA14
-from guiderail.models.tool_wrench import external_wrench
+from guiderail.models.robots.mounting import add_end_effector, add_robot
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,10 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import JacobianWrtVariable
 
-from guiderail.models.errors import InputError
-from guiderail.models.pose_coordinates import pose_to_transform
-from guiderail.models.robots.assembly import add_robot
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
+from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import find_robot
 
 

@@ -8,9 +8,9 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.models.errors import InputError
-from guiderail.models.registry import Registry
-from guiderail.models.robots.assembly import add_robot
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import Registry
+from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import (
     JointDrives,
     end_effector_names,

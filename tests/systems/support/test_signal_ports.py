@@ -1,7 +1,7 @@
 import pytest
 from pydrake.systems.framework import LeafSystem
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.systems.support.signal_ports import SignalPorts
 
 

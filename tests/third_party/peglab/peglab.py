@@ -22,10 +22,10 @@ from guiderail import (
     register_guidance,
     register_task,
 )
-from guiderail.models.objects.narrow_passage import NarrowPassage
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.rollout import Decision
 from guiderail.tools.learning.learner import Learner, register_learner
-from guiderail.tools.rollouts.rollout import Decision
 
 NUM_STEPS, PERIOD = 80, 0.02
 
@@ -48,10 +48,10 @@ class Slot(Task):
     clip = 1.0
     draws_held_out = True
 
-    def world(self) -> NarrowPassage:
+    def world(self) -> PassageGeometry:
         middle = 0.35
         gap = (middle - self.options.width / 2, middle + self.options.width / 2)
-        return NarrowPassage(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=gap)
+        return PassageGeometry(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=gap)
 
     def reference(self) -> ReferenceTrajectory:
         phase = np.linspace(0.0, 1.0, NUM_STEPS)

@@ -2,7 +2,7 @@
 
 import torch
 
-from guiderail.tools.learning.checkpoint_selection import CheckpointSelection
+from guiderail.tools.learning.checkpoint import CheckpointSelection
 
 
 def lived(selection, outcomes, first=0, row=0):

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import train
+from guiderail.tools.learning.trainer import train
 from oracles.disks import bound_by_permissions, full_disk
 from oracles.same_runs import differences
 
@@ -22,7 +22,7 @@ def whole(module_config, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def module_config():
-    from guiderail.tools.learning.configure import configure
+    from guiderail.tools.learning.train import configure
 
     settings = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
     return configure("Bead", {}, settings=settings, episodes=6, seed=5)

@@ -8,12 +8,12 @@ import torch
 from gymnasium import spaces
 from stable_baselines3 import TD3
 
-from guiderail.diagrams.task import Symmetry
-from guiderail.models.errors import InputError
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.models.common.errors import InputError
+from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, arguments_of, register_learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, policy_of
-from guiderail.tools.learning.presets import PRESETS, resolve_preset
-from guiderail.tools.rollouts.rollout import Decision
 
 
 class Spaces(gymnasium.Env):

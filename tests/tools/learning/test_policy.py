@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from guiderail.models.errors import InputError
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import WITHOUT_DIGEST, Policy
+from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import policy_of
-from guiderail.tools.learning.presets import resolve_preset
 
 
 class Spaces(gymnasium.Env):

@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from guiderail.models.errors import InputError
-from guiderail.tools.learning.presets import PRESETS
+from guiderail.models.common.errors import InputError
+from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 
 

@@ -8,15 +8,15 @@ import gymnasium
 import pytest
 import yaml
 
-import guiderail.models.demonstrations
+import guiderail.models.objects.bnc_connector
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
-from guiderail.models.errors import InputError
-from guiderail.tools.learning.configure import configure, run
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import import_modules, task_content
+from guiderail.tools.evaluation.evaluate import kept_file
+from guiderail.tools.experiments.declaration import Study
+from guiderail.tools.experiments.study import Job, _digest
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.rollouts.evaluate import kept_file
-from guiderail.tools.studies.declaration import Study
-from guiderail.tools.studies.study import Job, _digest
-from guiderail.tools.tasks import import_modules, task_content
+from guiderail.tools.learning.train import configure, run
 
 PART = {"visual": "part.obj", "mass": 0.1, "centre": [0, 0, 0], "gyration": 0.01, "pieces": [{"file": "part.obj"}]}
 TASK = {
@@ -27,7 +27,7 @@ TASK = {
     "motion": {"travel": 0.02, "rim": 0.01},
     "demonstrations": {"components": 1},
 }
-SHIPPED = Path(guiderail.models.demonstrations.__file__).parent
+SHIPPED = Path(guiderail.models.objects.bnc_connector.__file__).parent
 
 
 @pytest.fixture

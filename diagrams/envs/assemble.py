@@ -1,0 +1,436 @@
+"""From a declaration to a diagram: the loop of station, guidance and observation, and whoever judges it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
+from pydrake.systems.primitives import ZeroOrderHold
+
+from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
+from guiderail.diagrams.envs.config import validated
+from guiderail.diagrams.envs.env import RECORDED, SAID
+from guiderail.diagrams.envs.observation import Observation, affine
+from guiderail.diagrams.envs.task_diagram import TaskDiagram
+from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
+from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
+from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.task import Task
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import did_you_mean
+from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives.reference import through
+from guiderail.systems.constraint_violation import ConstraintViolation
+from guiderail.systems.episode_monitor import EpisodeMonitor
+from guiderail.systems.policy_system import PolicySystem
+from guiderail.systems.reward_system import RewardSystem
+from guiderail.systems.safety_ledger import SafetyLedger
+
+
+def add_ledger(
+    builder: DiagramBuilder,
+    period: float,
+    *,
+    commanded_violation: OutputPort,
+    measured_violation: OutputPort,
+    contact_force: OutputPort,
+    collision: OutputPort,
+    saturation: OutputPort,
+    fallback: OutputPort,
+) -> OutputPort:
+    """Adds the ledger of a task with a control step of `period` [s], and returns where its fields come out."""
+    ledger = builder.AddNamedSystem("ledger", SafetyLedger(period, num_actuators=saturation.size()))
+    recorded = {
+        "commanded_violation": commanded_violation,
+        "measured_violation": measured_violation,
+        "contact_force": contact_force,
+        "collision": collision,
+        "saturation": saturation,
+        "fallback": fallback,
+    }
+    for name, port in recorded.items():
+        builder.Connect(port, ledger.get_record_input_port(name))
+    return ledger.get_ledger_output_port()
+
+
+HALF_TURN_MARGIN = 0.1  # [rad] what actions and contact turn a motion further by
+
+
+def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidance: Mapping[str, Any]) -> Known:
+    """What a task knows, for guidance on a station.
+
+    Args:
+        task: the declaration.
+        station: for its period and sizes.
+        primitive: options of `PrimitiveSkill` by name.
+        guidance: the kind of guidance's own options by name.
+
+    Raises:
+        InputError: if the reference trajectory has another clock than the station, or turns to where the station's
+            angles jump.
+    """
+    knows = task.knows()
+    skill = None
+    if "demonstrations" in knows:
+        options = dict(primitive)
+        reference = through(task.reference(), options.pop("via_points", ()), options.get("inverse_length", 2.0))
+        _check_clock(reference.times, station.nominal_period)
+        if station.wraps_angles:
+            _refuse_half_turns(reference.means)
+        skill = PrimitiveSkill(
+            reference=reference,
+            constraints=task.constraints() or LinearConstraints.none(station.pose_size),
+            control_period=station.control_period,
+            isotropic_groups=task.isotropic_groups,
+            keep_out=task.keep_out() if "keep_out" in knows else None,
+            wrench_size=station.wrench_size,
+            **options,
+        )
+    return Known(
+        period=station.control_period,
+        demonstrations=skill,
+        template=task.template() if "template" in knows else None,
+        approach=task.approach() if "approach" in knows else None,
+        options=guidance,
+        pose_size=station.pose_size,
+        wrench_size=station.wrench_size,
+    )
+
+
+def _check_clock(times: np.ndarray, period: float) -> None:
+    """Refuses a reference trajectory whose steps (N,) [s] are not control periods: its clock counts these."""
+    steps = np.diff(times)
+    if np.abs(steps - period).max(initial=0.0) > 1e-6 * period:
+        raise InputError(
+            f"the reference trajectory has steps of {steps.min():g} to {steps.max():g} s, and a control period is "
+            f"{period:g} s: resample it, or the motion is of another speed than was demonstrated"
+        )
+
+
+def _refuse_half_turns(means: np.ndarray) -> None:
+    """Refuses a motion (N, 6) that comes near an angle at which the station's pose jumps by a full turn."""
+    furthest = np.abs(means[:, 3:]).max(initial=0.0)
+    if furthest > np.pi - HALF_TURN_MARGIN:
+        raise InputError(
+            f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and what this station measures jumps by a full "
+            f"turn at 180°: draw the target's frame turned, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
+        )
+
+
+class Signals:
+    """Ports by name, while a diagram is built; "last_x" is x held from the control step before."""
+
+    def __init__(self, builder: DiagramBuilder, period: float, ports: Mapping[str, OutputPort]):
+        """
+        Args:
+            builder: what holds a signal is added to it.
+            period: s, seconds between control steps.
+            ports: the signals that there are.
+        """
+        self._builder, self._period, self._ports = builder, period, dict(ports)
+
+    def add(self, ports: Mapping[str, OutputPort]) -> None:
+        """Adds further signals; of two of the same name the later one counts."""
+        self._ports |= ports
+
+    def get(self, name: str, whose: str) -> OutputPort:
+        """The port of a signal.
+
+        Raises:
+            InputError: if there is none of that name.
+        """
+        held = name.removeprefix("last_")
+        if name not in self._ports and held != name and held in self._ports:
+            # A change over a control step is the difference of the two.
+            port = self._ports[held]
+            hold = self._builder.AddNamedSystem(name, ZeroOrderHold(self._period, port.size()))
+            self._builder.Connect(port, hold.get_input_port())
+            self._ports[name] = hold.get_output_port()
+        if name not in self._ports:
+            raise InputError(
+                f"{whose} needs the signal {name!r}, which nothing here has: {did_you_mean(name, self._ports)}"
+            )
+        return self._ports[name]
+
+    def connect(self, system: Any, names: Mapping[str, int], whose: str) -> None:
+        """Connects a system's inputs, each named and sized as its signal.
+
+        Raises:
+            InputError: if a signal is missing or of another size.
+        """
+        for name, size in names.items():
+            port = self.get(name, whose)
+            if port.size() != size:
+                raise InputError(f"{whose} takes the signal {name!r} as {size} numbers, and it has {port.size()}")
+            self._builder.Connect(port, system.get_signal_input_port(name))
+
+
+class Loop:
+    """Station, guidance and what a policy sees, closed but for the policy itself.
+
+    Attributes:
+        builder: of the root diagram.
+        station, guidance: its subsystems of these names.
+        signals: what can be named by whoever judges.
+        space: of observations.
+        observation: the port with what a policy sees.
+    """
+
+    def __init__(self, task: Task, station: Station, guidance: Diagram):
+        self.builder = builder = DiagramBuilder()
+        self.station = builder.AddNamedSystem("station", station)
+        self.guidance = builder.AddNamedSystem("guidance", guidance)
+        check_guidance_ports(guidance, station.pose_size, station.wrench_size, task.choice.guidance)
+        builder.Connect(station.get_pose_output_port(), guidance.GetInputPort("pose"))
+        builder.Connect(station.get_wrench_output_port(), guidance.GetInputPort("wrench"))
+        builder.Connect(guidance.GetOutputPort("desired_pose"), station.get_desired_pose_input_port())
+        self.signals = Signals(builder, station.control_period, _vector_ports(station) | _vector_ports(guidance))
+        self.signals.add({"action": guidance.GetOutputPort("held_action")})
+        self.signals.add(task.signals(builder, station))
+        self.space, self.observation = self._add_observation(task)
+
+    def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
+        observed, station = task.observed(), self.station
+        if isinstance(observed, Camera):
+            query = station.GetOutputPort("query")
+            image = add_camera(self.builder, station.scene_graph, query, "observation_camera", observed)
+            width, height = observed.size
+            return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
+        whose = f"the observation of {task.name}"
+        names = [one.signal for one in observed if one.signal not in ("time", "phase")]
+        ports = {name: self.signals.get(name, whose) for name in names}
+        duration = task.num_steps * station.control_period
+        sizes = {name: port.size() for name, port in ports.items()}
+        seen = Observation(observed, sizes, duration, task.clip, task.name)
+        diagram = self.builder.AddNamedSystem("observation", seen)
+        for name, port in ports.items():
+            self.builder.Connect(port, diagram.GetInputPort(name))
+        return diagram.space, diagram.get_observation_output_port()
+
+
+def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None) -> TaskDiagram:
+    """Wires a task: its loop, and reward, monitor and ledger beside it. The policy's `action` is an input.
+
+    Args:
+        task: the declaration.
+        station: where it is done.
+        guidance: a diagram with the ports of `Guidance`.
+        render_mode: "rgb_array" exports the picture of the task's camera; a browser view is no part of it.
+
+    Raises:
+        InputError: if a signal that the task names doesn't exist here, a port has the wrong size, or a reward term has
+            the name of something else.
+    """
+    loop = Loop(task, station, guidance)
+    builder, signals, period = loop.builder, loop.signals, station.control_period
+    builder.ExportInput(guidance.GetInputPort("action"), "action")
+
+    violations = _add_violations(builder, task, station, guidance)
+    conditions = task.conditions()
+    monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period, task.name))
+    watched = {name: size for condition in conditions for name, size in condition.inputs.items()}
+    signals.connect(monitor, watched, f"the end of an episode of {task.name}")
+    signals.add({"termination": monitor.get_termination_output_port()})
+
+    terms = task.reward_terms(guidance.GetInputPort("action").size())
+    reward = builder.AddNamedSystem("reward", RewardSystem(terms, task.name))
+    rewarded = {name: size for term in terms for name, size in term.inputs.items()}
+    signals.connect(reward, rewarded, f"reward {task.choice.reward!r} of {task.name}")
+
+    too_much = builder.AddNamedSystem("collision", affine(np.eye(1), [-task.collision.above]))
+    builder.Connect(signals.get(task.collision.signal, f"the ledger of {task.name}"), too_much.get_input_port())
+    force = station.get_contact_force_output_port()
+    ledger = add_ledger(
+        builder,
+        period,
+        **violations,
+        contact_force=force,
+        collision=too_much.get_output_port(),
+        saturation=station.get_saturation_output_port(),
+        fallback=guidance.GetOutputPort("fallback"),
+    )
+    exported = {
+        **violations,
+        "observation": loop.observation,
+        "reward": reward.get_reward_output_port(),
+        "termination": monitor.get_termination_output_port(),
+        "contact_force": force,
+        "ledger": ledger,
+        "desired_pose": guidance.GetOutputPort("desired_pose"),
+        "pose": station.get_pose_output_port(),
+        "wrench": station.get_wrench_output_port(),
+        "saturation": station.get_saturation_output_port(),
+        "collision": too_much.get_output_port(),
+        "holding": station.get_holding_output_port(),
+        "fallback": guidance.GetOutputPort("fallback"),
+    }
+    taken = {*exported, *SAID, *RECORDED}
+    for name in reward.term_names:
+        if name in taken:
+            raise InputError(
+                f"no reward term of {task.name} can be called {name!r}, which means something else in every task: "
+                "give it another name"
+            )
+        exported[name] = reward.get_term_output_port(name)
+    # What this guidance has beyond the contract, such as the state of a template.
+    exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
+    for name, port in exported.items():
+        builder.ExportOutput(port, name)
+    if render_mode == "rgb_array":
+        _add_picture(builder, task, station)
+    diagram = builder.Build()
+    diagram.set_name(task.name.replace("/", "_"))
+    displaces = GUIDANCE.get(task.choice.guidance).displaces  # what a symmetry of the task takes an action for
+    return TaskDiagram(
+        diagram=diagram,
+        control_period=period,
+        num_steps=task.num_steps,
+        observation_space=loop.space,
+        reward_terms=reward.term_names,
+        ledger_fields=SafetyLedger.FIELDS,
+        randomize=randomizes(task, station, guidance),
+        push=_push(station) if task.pushable else None,
+        query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
+        symmetry=task.symmetry() if displaces else None,
+        near_symmetry=task.near_symmetry() if displaces else None,
+        declaration=task,
+    )
+
+
+@dataclass(frozen=True)
+class SkillDiagram:
+    """A learned skill as a plain diagram, for a `Simulator`: observation → policy → guidance → station.
+
+    Attributes:
+        diagram: with subsystems of these names; exports pose, desired_pose, wrench, contact_force, held_action,
+            constraint_violation and fallback.
+        control_period: s, seconds between control steps.
+        num_steps: control steps of an episode.
+        randomize: as in `TaskDiagram`: call it with the root context before `Simulator.Initialize`.
+        meshcat: where the diagram publishes to, if anywhere.
+    """
+
+    diagram: Diagram
+    control_period: float
+    num_steps: int
+    randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]]
+    meshcat: Meshcat | None = None
+
+
+def assemble_skill(
+    task: Task,
+    station: Station,
+    guidance: Diagram,
+    policy: System | Callable[[np.ndarray], np.ndarray],
+    *,
+    render_mode: str | None = None,
+) -> SkillDiagram:
+    """Wires a learned skill, without whatever judges it.
+
+    Args:
+        task: what it is a skill of.
+        station, guidance: as for `assemble`.
+        policy: from an observation to an action, called at every `hold` control periods by a `PolicySystem`; or any
+            system with an input `observation` and an output `action`.
+        render_mode: None, or "human" for a view in the browser.
+
+    Raises:
+        InputError: as `assemble`, or if the policy's ports have other sizes.
+    """
+    loop = Loop(task, station, guidance)
+    builder, action = loop.builder, guidance.GetInputPort("action")
+    if not isinstance(policy, System):
+        port = loop.observation
+        seen_as = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
+        policy = PolicySystem(policy, seen_as, action.size(), task.choice.hold * station.control_period)
+    builder.AddNamedSystem("policy", policy)
+    seen, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
+    if seen.size() != loop.observation.size() or acts.size() != action.size():
+        raise InputError(
+            f"a policy of {task.name} sees {loop.observation.size()} numbers and gives {action.size()}, "
+            f"this one {seen.size()} and {acts.size()}: it was trained with other options"
+        )
+    builder.Connect(loop.observation, seen)
+    builder.Connect(acts, action)
+    for name in ("pose", "wrench", "contact_force"):
+        builder.ExportOutput(station.GetOutputPort(name), name)
+    for name in OUTPUTS:
+        builder.ExportOutput(guidance.GetOutputPort(name), name)
+    meshcat = add_meshcat(builder, station.GetOutputPort("query")) if render_mode == "human" else None
+    if render_mode == "rgb_array":
+        _add_picture(builder, task, station)
+    diagram = builder.Build()
+    diagram.set_name(f"{task.name.replace('/', '_')}_skill")
+    return SkillDiagram(diagram, station.control_period, task.num_steps, randomizes(task, station, guidance), meshcat)
+
+
+def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
+    ports = (diagram.get_output_port(index) for index in range(diagram.num_output_ports()))
+    return {port.get_name(): port for port in ports if port.get_data_type() == PortDataType.kVectorValued}
+
+
+def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guidance: Diagram) -> dict[str, OutputPort]:
+    """Judges commanded and measured poses by the task's own constraints; where it has none, guidance judges."""
+    constraints = task.constraints()
+    poses = {"commanded_violation": guidance.GetOutputPort("desired_pose")}
+    poses["measured_violation"] = station.get_pose_output_port()
+    violations = {}
+    if constraints is None:
+        constraints = LinearConstraints.none(station.pose_size)
+        violations["commanded_violation"] = guidance.GetOutputPort("constraint_violation")
+        if guidance.HasOutputPort("measured_violation"):
+            violations["measured_violation"] = guidance.GetOutputPort("measured_violation")
+    for name, port in poses.items():
+        if name not in violations:
+            violation = builder.AddNamedSystem(name, ConstraintViolation(constraints, station.control_period))
+            builder.Connect(port, violation.get_pose_input_port())
+            violations[name] = violation.get_violation_output_port()
+    return violations
+
+
+def randomizes(task: Task, station: Station, guidance: Diagram) -> Any:
+    """What draws an episode's conditions and writes them into the root context: `TaskDiagram.randomize`."""
+
+    def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
+        drawn = task.reset(station, guidance, context, rng, validated(task.Reset, options, f"a reset of {task.name}"))
+        if not isinstance(drawn, Mapping):
+            raise InputError(
+                f"reset of {task.name} returns what it drew by name, {{}} where it drew nothing, not {brief(drawn)}"
+            )
+        if taken := [name for name in drawn if name in SAID]:
+            raise InputError(
+                f"reset of {task.name} can call nothing that it drew {taken[0]!r}, which info says of every task: "
+                "give it another name"
+            )
+        return {**drawn, **station.disturb(context, rng)}
+
+    return randomize
+
+
+def _push(station: Station) -> Any:
+    def push(context: Context, displacement: np.ndarray) -> None:
+        pose = station.get_pose_output_port().Eval(station.GetMyContextFromRoot(context))
+        station.set_pose(context, pose + displacement)
+
+    return push
+
+
+def _add_picture(builder: DiagramBuilder, task: Task, station: Station) -> None:
+    """Adds the task's camera, whose image is exported."""
+    camera = task.camera()
+    if camera is None:
+        raise InputError(
+            f"{task.name} has no camera that could take a picture: leave out what asks for one "
+            "(--picture, render_mode='rgb_array'), or write its camera()"
+        )
+    picture = add_camera(
+        builder, station.scene_graph, station.GetOutputPort("query"), "picture", camera, for_people=True
+    )
+    builder.ExportOutput(picture, "rgb_image")

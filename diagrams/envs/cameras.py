@@ -1,0 +1,160 @@
+"""Cameras for image observations and for people, and the browser view."""
+
+import ctypes
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+
+import numpy as np
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    LightParameter,
+    MakeRenderEngineVtk,
+    Meshcat,
+    MeshcatParams,
+    MeshcatVisualizer,
+    MeshcatVisualizerParams,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    Role,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.sensors import CameraInfo, RgbdSensor
+
+from guiderail.models.common.errors import InputError
+
+_RENDERER, _FOR_PEOPLE = "vtk", "vtk_for_people"
+PUBLISH_PERIOD = 1 / 50  # s, between two pictures of a browser view
+
+
+# What policies see is lit from the camera, as Drake does unless told otherwise. People see edges better where light
+# comes from above too, and a page is white.
+_LIGHTS = [
+    LightParameter(type="directional", frame="camera", direction=[0.3, 0.2, 1.0], intensity=0.7),
+    LightParameter(type="directional", frame="world", direction=[-0.2, 0.3, -1.0], intensity=0.5),
+]
+_PARAMETERS = {
+    _RENDERER: RenderEngineVtkParams(),
+    _FOR_PEOPLE: RenderEngineVtkParams(default_clear_color=[1.0, 1.0, 1.0], lights=_LIGHTS),
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A fixed camera.
+
+    Attributes:
+        size: width and height of its image, in pixels.
+        vertical_fov: its vertical field of view [rad].
+        X_WC: where it is; C has x to the right, y down and z into the picture.
+    """
+
+    size: tuple[int, int]
+    vertical_fov: float
+    X_WC: RigidTransform
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Where points (n, 3) of the world are in its image: (n, 2), pixels from its upper left corner."""
+        p_C = self.X_WC.inverse() @ np.asarray(points, float).T
+        focal = 0.5 * self.size[1] / np.tan(0.5 * self.vertical_fov)
+        return (focal * p_C[:2] / p_C[2]).T + 0.5 * np.array(self.size)
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
+    """The pose X_WC of a camera at `eye` (3,) that looks at `target` (3,), the horizon level."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return RigidTransform(RotationMatrix(np.stack([right, np.cross(forward, right), forward], axis=1)), eye)
+
+
+def look_from_front(target: np.ndarray, distance: float, height: float) -> RigidTransform:
+    """A camera X_WC that looks slightly down at `target` from the side that faces away from the arm."""
+    return look_at(target + np.array([0.8 * distance, -0.6 * distance, height]), target)
+
+
+def add_camera(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    query: OutputPort,
+    name: str,
+    camera: Camera,
+    *,
+    for_people: bool = False,
+) -> OutputPort:
+    """Adds a camera and returns its colour image, an `ImageRgba8U`; `for_people` lights it for them, and not a policy.
+
+    Raises:
+        InputError: if this machine lacks the library that renders without a display.
+    """
+    check_rendering()
+    # Mesa renders with an LLVM, and Triton, which PyTorch with CUDA brings, has another one: loaded second, that of
+    # Triton ends the process in a segmentation fault, as it would when PyTorch imports its compiler after a render.
+    with suppress(ImportError):
+        import_module("triton")
+    renderer = _FOR_PEOPLE if for_people else _RENDERER
+    if not scene_graph.HasRenderer(renderer):
+        scene_graph.AddRenderer(renderer, MakeRenderEngineVtk(_PARAMETERS[renderer]))
+    clipping = ClippingRange(0.01, 10.0)
+    info = CameraInfo(*camera.size, camera.vertical_fov)
+    core = RenderCameraCore(renderer, info, clipping, RigidTransform())
+    sensor = RgbdSensor(
+        parent_id=scene_graph.world_frame_id(),
+        X_PB=camera.X_WC,
+        color_camera=ColorRenderCamera(core, show_window=False),
+        depth_camera=DepthRenderCamera(core, DepthRange(0.02, 9.0)),
+    )
+    builder.AddNamedSystem(name, sensor)
+    builder.Connect(query, sensor.query_object_input_port())
+    return sensor.color_image_output_port()
+
+
+def check_rendering() -> None:
+    """Refuses to render where EGL is missing, before Drake would end the process over it.
+
+    Raises:
+        InputError: naming the package to install.
+    """
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        raise InputError(
+            "images need libEGL.so.1, which this machine lacks: install it (Debian, Ubuntu: apt install libegl1), or "
+            "use observation='state' without render_mode='rgb_array'"
+        ) from None
+
+
+def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
+    """A browser view, on this machine only: Meshcat would listen on every interface by default.
+
+    Args:
+        meshcat: a page that is there already; a new one unless given.
+
+    Raises:
+        InputError: if the environment forbids Drake to open a port at all.
+    """
+    try:
+        meshcat = meshcat or Meshcat(MeshcatParams(host="localhost"))
+    except RuntimeError as error:
+        raise InputError(
+            f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"
+        ) from error
+    parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=PUBLISH_PERIOD)
+    return meshcat, MeshcatVisualizer(meshcat, parameters)
+
+
+def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> Meshcat:
+    """Adds a browser view to a diagram, with which it stays.
+
+    Raises:
+        InputError: as `open_meshcat`.
+    """
+    meshcat, visualizer = open_meshcat()
+    builder.AddNamedSystem("meshcat", visualizer)
+    builder.Connect(query, visualizer.query_object_input_port())
+    return meshcat

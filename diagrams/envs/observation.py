@@ -1,0 +1,160 @@
+"""What a policy sees, as a diagram: signals one after the other, each centred, scaled and clipped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gymnasium
+import numpy as np
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import AffineSystem, Multiplexer, PassThrough, Saturation, TrajectorySource
+from pydrake.trajectories import PiecewisePolynomial
+
+from guiderail.models.common.errors import InputError, brief
+
+CLOCKS = ("time", "phase")
+"""Signals that an observation has by itself: seconds since the episode began, and the same from −1 to 1."""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """A signal that a policy sees, as (value − centre) / scale.
+
+    Attributes:
+        signal: its name: a port of station, guidance or task, or one of `CLOCKS`.
+        centre, scale: finite numbers, or one per entry (n,), in the signal's unit; the scale is not 0.
+        entries: which of the signal's numbers; all unless given.
+    """
+
+    signal: str
+    centre: Sequence[float] | np.ndarray | float = 0.0
+    scale: Sequence[float] | np.ndarray | float = 1.0
+    entries: tuple[int, ...] | None = None
+
+
+class Observation(Diagram):
+    """Signals to an observation.
+
+    .. pydrake_system::
+
+        name: Observation
+        input_ports:
+        - one per signal that is no clock
+        output_ports:
+        - observation
+
+    ``observation`` is (n,), its entries in the order in which they are listed, clipped to ± the clip.
+    """
+
+    def __init__(
+        self, observed: Sequence[Observed], sizes: Mapping[str, int], duration: float, clip: float, of: str = ""
+    ):
+        """
+        Args:
+            observed: what is seen, at least one.
+            sizes: of the signals by name.
+            duration: of an episode [s].
+            clip: the largest number that is seen, positive.
+            of: whose observation it is, for sentences.
+
+        Raises:
+            InputError: if nothing is seen, an entry is none of its signal's, or a centre or a scale would make no
+                finite number of a finite signal.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        sizes = {**sizes, **dict.fromkeys(CLOCKS, 1)}
+        rows = [_rows(one, sizes[one.signal], f" of {of}" if of else "") for one in observed]
+        self.size = sum(len(scale) for _, _, scale in rows)
+        if not self.size:
+            raise InputError(f"the observation{f' of {of}' if of else ''} is of nothing: let observed() list a signal")
+        together = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
+        exported: set[str] = set()
+        for index, one in enumerate(observed):
+            if one.signal in CLOCKS:
+                builder.Connect(_add_clock(builder, one.signal, duration), together.get_input_port(index))
+                continue
+            if one.signal not in exported:
+                exported.add(one.signal)
+                signal = builder.AddNamedSystem(one.signal, PassThrough(sizes[one.signal]))
+                builder.ExportInput(signal.get_input_port(), one.signal)
+            builder.Connect(builder.GetSubsystemByName(one.signal).get_output_port(0), together.get_input_port(index))
+        scale = np.concatenate([scale for _, _, scale in rows])
+        centre = np.concatenate([centre for _, centre, _ in rows])
+        D = _block_diagonal([selection for selection, _, _ in rows]) / scale[:, None]
+        scaled = builder.AddNamedSystem("scaled", affine(D, -centre / scale))
+        clipped = builder.AddNamedSystem("clipped", Saturation(np.full(self.size, -clip), np.full(self.size, clip)))
+        builder.Connect(together.get_output_port(), scaled.get_input_port())
+        builder.Connect(scaled.get_output_port(), clipped.get_input_port())
+        builder.ExportOutput(clipped.get_output_port(), "observation")
+        builder.BuildInto(self)
+        self.space = gymnasium.spaces.Box(-clip, clip, (self.size,), np.float32)
+
+    @property
+    def signals(self) -> list[str]:
+        """The names of the input ports."""
+        return [self.get_input_port(index).get_name() for index in range(self.num_input_ports())]
+
+    def get_observation_output_port(self) -> OutputPort:
+        """What a policy sees, (n,)."""
+        return self.GetOutputPort("observation")
+
+
+def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:
+    """y = D u + y0, evaluated in C++."""
+    outputs, inputs = D.shape
+    return AffineSystem(
+        A=np.zeros((0, 0)), B=np.zeros((0, inputs)), f0=np.zeros(0), C=np.zeros((outputs, 0)), D=D, y0=np.asarray(y0)
+    )
+
+
+def _add_clock(builder: DiagramBuilder, name: str, duration: float) -> OutputPort:
+    ends = np.array([[0.0, duration]]) if name == "time" else np.array([[-1.0, 1.0]])
+    clock = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, duration], ends))
+    return builder.AddNamedSystem(name, clock).get_output_port()
+
+
+def _rows(one: Observed, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which entries (n, size), their centres (n,) and scales (n,)."""
+    try:
+        selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
+        if selection.ndim != 2:
+            raise ValueError
+    except (IndexError, TypeError, ValueError):
+        raise InputError(
+            f"the entries of the observed signal {one.signal!r}{of} are whole numbers from 0 to {size - 1}, "
+            f"not {brief(one.entries)}"
+        ) from None
+    centre, scale = (_numbers(one, name, len(selection), of) for name in ("centre", "scale"))
+    with np.errstate(all="ignore"):
+        is_usable = np.isfinite(1.0 / scale).all() and np.isfinite(centre / scale).all()
+    if not is_usable:
+        raise InputError(
+            f"the scale of the observed signal {one.signal!r}{of} divides it, so it cannot be {brief(one.scale)}"
+        )
+    return selection, centre, scale
+
+
+def _numbers(one: Observed, name: str, number: int, of: str) -> np.ndarray:
+    """The centre or the scale of each entry, (n,)."""
+    given = getattr(one, name)
+    try:
+        numbers = np.broadcast_to(given, number).astype(float)
+        if not np.isfinite(numbers).all():
+            raise ValueError
+    except (TypeError, ValueError):
+        raise InputError(
+            f"the {name} of the observed signal {one.signal!r}{of} is a finite number, or {number} of them, "
+            f"not {brief(given)}"
+        ) from None
+    return numbers
+
+
+def _block_diagonal(blocks: Sequence[np.ndarray]) -> np.ndarray:
+    rows, columns = (sum(block.shape[i] for block in blocks) for i in range(2))
+    matrix, row, column = np.zeros((rows, columns)), 0, 0
+    for block in blocks:
+        matrix[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    return matrix

@@ -1,0 +1,255 @@
+"""The tool centre on six rails: a Cartesian impedance without an arm, for learning at several times real time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    Frame,
+    JointActuator,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    RevoluteJoint,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+from pydrake.systems.primitives import LinearSystem, MatrixGain
+
+from guiderail.diagrams.stations.impedance_control import add_impedance_control
+from guiderail.diagrams.stations.registry import register_station
+from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
+    PLANT_PERIOD,
+    POSE_SIZE,
+    ContactOptions,
+    Impedance,
+    Station,
+    add_workcell_plant,
+    checked_pose,
+    export_simulation_ports,
+    export_station_ports,
+)
+from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.models.common.errors import InputError
+from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.pose_wrench import PoseWrench
+
+RAILS = (
+    ("x", PrismaticJoint, [1.0, 0.0, 0.0]),
+    ("y", PrismaticJoint, [0.0, 1.0, 0.0]),
+    ("z", PrismaticJoint, [0.0, 0.0, 1.0]),
+    ("Rz", RevoluteJoint, [0.0, 0.0, 1.0]),
+    ("Ry", RevoluteJoint, [0.0, 1.0, 0.0]),
+    ("Rx", RevoluteJoint, [1.0, 0.0, 0.0]),
+)
+CARRIAGE_MASS = (
+    1.5  # [kg], of all that moves: what an arm feels like at its tool when its controller shapes its inertia
+)
+CARRIAGE_INERTIA = 2e-3  # [kg m²]
+# A link between two rails weighs next to nothing; without any inertia the plant's mass matrix would be singular.
+LINK_MASS, LINK_RADIUS = 1e-3, 0.01
+
+ImpedanceControl = Literal["joint", "cartesian"]
+# Of the plant [s], with a controller: its forces are held for a step, where the rails' own are solved with it. It is
+# then as near to the finest step as the rails' own are at `PLANT_PERIOD`: see `guiderail bench impedance`.
+CONTROLLED_PERIOD = PLANT_PERIOD / 2
+
+
+def damping(impedance: Impedance) -> np.ndarray:
+    """Of the rails with such an impedance, (6,) [N s/m, Nm s/rad]."""
+    masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
+    return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
+
+
+class RailsOptions(ContactOptions):
+    """Of the rails' station."""
+
+    impedance_control: ImpedanceControl = Field(
+        "joint",
+        description="joint: springs and dampers of the rails themselves, solved with the contact; cartesian: the "
+        "controller that an arm has",
+    )
+
+
+@register_station("rails", world="workcell", options=RailsOptions)
+class RailsStation(Station):
+    """Joints x, y, z, Rz, Ry, Rx from the target frame to the tool centre, each with a spring, a damper and a limit.
+
+    Their positions are the pose itself. Springs and dampers are the plant's own actuator gains, solved implicitly with
+    the contact: stable at any stiffness and time step. Or they are a `CartesianImpedanceController`'s, whose forces are
+    computed from the state at each step of the plant: what a real robot does, which asks for shorter steps. Weight is
+    compensated by leaving it out.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
+        time_step: float | None = None,
+        wrench_time_constant: float = 0.01,
+        impedance_control: ImpedanceControl = "joint",
+    ):
+        """
+        Args:
+            workcell: what stands in the world and what is held.
+            impedance: of the rails.
+            time_step: of the plant [s]; half a control period unless given, a quarter with a controller.
+            wrench_time_constant: of the wrench's low-pass filter [s]; 0 disables it.
+            impedance_control: "joint" or "cartesian", see above.
+
+        Raises:
+            InputError: if the time step is too long for a controller with such an impedance.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        is_joint = impedance_control == "joint"
+        time_step = time_step or (PLANT_PERIOD if is_joint else CONTROLLED_PERIOD)
+        if not is_joint:
+            _refuse_long_step(impedance, time_step)
+        self.plant, self.scene_graph, self.rails = add_workcell_plant(
+            builder, workcell, time_step, lambda plant: _add_rails(plant, workcell, impedance, with_gains=is_joint)
+        )
+        plant, rails = self.plant, self.rails
+        pose = builder.AddNamedSystem("pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)))
+        builder.Connect(plant.get_state_output_port(rails), pose.get_input_port())
+        wrench = _add_wrench(builder, plant, rails, pose.get_output_port(), wrench_time_constant)
+        if is_joint:
+            _add_joint_control(builder, plant, rails, impedance, pose=pose.get_output_port(), wrench=wrench)
+        else:
+            torque = add_impedance_control(
+                builder,
+                _known(workcell, impedance),
+                impedance,
+                CONTROL_PERIOD,
+                state=plant.get_state_output_port(rails),
+                wrench=wrench,
+                compensate_gravity=False,
+            )
+            builder.Connect(torque, plant.get_actuation_input_port(rails))
+        export_simulation_ports(builder, self.plant, self.scene_graph)
+        builder.BuildInto(self)
+
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        self.plant.SetPositions(plant_context, self.rails, checked_pose(pose, POSE_SIZE))
+        self.plant.SetVelocities(plant_context, self.rails, np.zeros(POSE_SIZE))
+
+
+def longest_step(impedance: Impedance) -> float:
+    """The time step [s] from which on a controller of the rails with that impedance is unstable.
+
+    With a force K e − D v that is held for a step h, and x' = v' where the step ends, a mode of frequency ω and damping
+    ratio ζ is stable as long as h ω < 2 (√(1 + ζ²) − ζ).
+    """
+    masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
+    fastest = float(np.sqrt(np.max(np.array(impedance.stiffness) / masses)))  # [rad/s]
+    ratio = impedance.damping_ratio
+    return 2.0 * float(np.hypot(1.0, ratio) - ratio) / fastest
+
+
+def _refuse_long_step(impedance: Impedance, time_step: float) -> None:
+    longest = longest_step(impedance)
+    if time_step >= longest:
+        raise InputError(
+            f"time_step {time_step:g} s is too long for impedance_control='cartesian', which needs less than "
+            f"{longest:.2g} s with this impedance: make it shorter, or choose impedance_control='joint'"
+        )
+
+
+@dataclass(frozen=True)
+class KnownRails:
+    """The rails as their controller knows them: with the workpiece, without the fixture and without offsets."""
+
+    plant: MultibodyPlant
+    target: Frame
+    tool_centre: Frame
+    posture: np.ndarray
+
+
+def _known(workcell: Workcell, impedance: Impedance) -> KnownRails:
+    plant = MultibodyPlant(0.0)
+    _add_rails(plant, workcell, impedance, with_gains=False)
+    plant.Finalize()
+    target, tool_centre = (plant.GetFrameByName(name) for name in ("target", "tool_centre"))
+    return KnownRails(plant, target, tool_centre, np.zeros(POSE_SIZE))
+
+
+def _add_joint_control(
+    builder: DiagramBuilder,
+    plant: MultibodyPlant,
+    rails: ModelInstanceIndex,
+    impedance: Impedance,
+    *,
+    pose: OutputPort,
+    wrench: OutputPort,
+) -> None:
+    """Adds what commands the rails' own springs, and exports a station's ports."""
+    watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
+    # The desired pose is the desired state's first half; the desired velocity is zero, so that damping damps.
+    desired_state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
+    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
+    builder.Connect(watchdog.get_safe_pose_output_port(), desired_state.get_input_port())
+    builder.Connect(pose, watchdog.get_pose_input_port())
+    builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(rails))
+    builder.Connect(plant.get_net_actuation_output_port(rails), monitor.get_impedance_wrench_input_port())
+    export_station_ports(
+        builder,
+        watchdog.get_desired_pose_input_port(),
+        watchdog.get_command_time_input_port(),
+        pose=pose,
+        wrench=wrench,
+        contact_force=monitor.get_contact_force_output_port(),
+        saturation=monitor.get_saturation_output_port(),
+        holding=watchdog.get_holding_output_port(),
+    )
+
+
+def _add_rails(
+    plant: MultibodyPlant, workcell: Workcell, impedance: Impedance, *, with_gains: bool
+) -> ModelInstanceIndex:
+    """Adds the rails and behind them the tool with the workpiece, all weightless, with springs and dampers or none."""
+    model = plant.AddModelInstance("rails")
+    parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
+    for (name, joint_type, axis), stiffness, damps, limit in zip(
+        RAILS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
+    ):
+        link = plant.AddRigidBody(f"{name}_link", model, SpatialInertia.SolidSphereWithMass(LINK_MASS, LINK_RADIUS))
+        joint = plant.AddJoint(joint_type(name, parent, link.body_frame(), axis))
+        actuator: JointActuator = plant.AddJointActuator(f"{name}_motor", joint, limit)
+        if with_gains:
+            actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damps))
+        parent = link.body_frame()
+    inertia = UnitInertia(*np.full(3, CARRIAGE_INERTIA / CARRIAGE_MASS))
+    tool = plant.AddRigidBody("tool_centre", model, SpatialInertia(CARRIAGE_MASS, np.zeros(3), inertia))
+    plant.WeldFrames(parent, tool.body_frame())
+    workpiece = workcell.add_workpiece(plant, tool.body_frame())
+    for weightless in (model, workpiece.model_instance()):
+        plant.set_gravity_enabled(weightless, False)
+    return model
+
+
+def _add_wrench(
+    builder: DiagramBuilder, plant: MultibodyPlant, rails: ModelInstanceIndex, pose: OutputPort, time_constant: float
+) -> OutputPort:
+    """Adds the wrench of the plug's contact, low-pass filtered: one plant step old, as a sensor's is.
+
+    What runs at every plant step is Drake's own; the wrench is computed where somebody reads it.
+    """
+    period = plant.time_step()
+    decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
+    one, zero = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
+    low_pass = builder.AddNamedSystem("low_pass", LinearSystem(decay * one, (1.0 - decay) * one, one, zero, period))
+    wrench = builder.AddNamedSystem("wrench", PoseWrench())
+    builder.Connect(plant.get_generalized_contact_forces_output_port(rails), low_pass.get_input_port())
+    builder.Connect(low_pass.get_output_port(), wrench.get_generalized_force_input_port())
+    builder.Connect(pose, wrench.get_pose_input_port())
+    return wrench.get_wrench_output_port()

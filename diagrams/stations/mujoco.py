@@ -1,0 +1,253 @@
+"""The tool centre on six rails, in another physics engine: is a skill one of Drake's contact only?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydrake.geometry import SceneGraph
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, FixedOffsetFrame, PrismaticJoint, SpatialInertia
+from pydrake.systems.framework import Context, DiagramBuilder
+
+from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, RAILS, damping
+from guiderail.diagrams.stations.registry import register_station
+from guiderail.diagrams.stations.station import (
+    CONTROL_PERIOD,
+    PLANT_PERIOD,
+    POSE_SIZE,
+    ContactOptions,
+    Impedance,
+    Station,
+    checked_pose,
+    export_station_ports,
+)
+from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
+from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.mujoco_gantry import MovedBodies, MujocoRails, mujoco_engine
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+FIXTURE, TOOL, WORKPIECE = "fixture", "tool", "workpiece"
+"""Names of the model's bodies; the workpiece is the tool's child, and the tool's six joints are the model's first."""
+
+MAX_PAIRS = 31  # bits of a contact mask
+
+
+@dataclass(frozen=True)
+class MujocoContact:
+    """How MuJoCo's contacts give way, and how finely they are stepped: the engine's numbers, and no object's."""
+
+    time_step: float = 0.001  # [s], or nearly: a whole number of them is the plant's period
+    time_constant: float = 0.002  # [s] of a contact: the least that the engine integrates is two time steps
+    impedance: float = 0.95  # how much of a contact's force is the constraint's, and not softness
+    friction_ratio: float = 10.0  # how much harder friction is than the normal direction: what sticks creeps less
+    # A spring's body is so heavy that an explicit step of it is stable: natural frequency times time step.
+    spring_step: float = 1.0
+
+
+def mujoco_model(
+    fixture: list[Surface],
+    workpiece: list[Surface],
+    inertia: SpatialInertia,
+    impedance: Impedance,
+    contact: MujocoContact,
+    period: float,
+) -> mujoco.MjModel:
+    """The compiled model; its world is the target frame T, so that its first six joints are the pose itself.
+
+    Args:
+        fixture, workpiece: what touches, in the frames of the two bodies.
+        inertia: of the workpiece, in its frame.
+        impedance: of the rails.
+        contact: of all surfaces.
+        period: that a whole number of steps makes up [s].
+
+    Raises:
+        InputError: if MuJoCo isn't installed, or there are more kinds of pairs than a contact mask has bits.
+    """
+    mujoco = mujoco_engine()
+    pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
+    if len(pairs) > MAX_PAIRS:
+        raise InputError(
+            f"station='mujoco' tells at most {MAX_PAIRS} pairs of surfaces apart, and these are {len(pairs)}"
+        )
+    spec = mujoco.MjSpec()
+    spec.modelname = "workcell"
+    spec.compiler.autolimits = True
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    option = spec.option
+    option.timestep = period / max(round(period / contact.time_step), 1)
+    option.gravity = [0.0, 0.0, 0.0]  # weight is compensated by leaving it out, as on Drake's rails
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = contact.friction_ratio
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations, option.tolerance = 100, 1e-10
+    option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # [m]: these contacts are a micrometre deep
+
+    # The tool comes first, so that its joints do.
+    tool = spec.worldbody.add_body(
+        name=TOOL, mass=CARRIAGE_MASS, inertia=[CARRIAGE_INERTIA] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
+    )
+    _add_rails(mujoco, spec, tool, impedance)
+    moments = inertia.Shift(inertia.get_com()).CalcRotationalInertia().get_moments()
+    held = tool.add_body(
+        name=WORKPIECE, mass=inertia.get_mass(), inertia=moments, ipos=inertia.get_com(), explicitinertial=True
+    )
+    stands = spec.worldbody.add_body(name=FIXTURE)
+    masks = {pair: 1 << bit for bit, pair in enumerate(pairs)}
+    for surface in workpiece:
+        _add_surface(mujoco, spec, held, surface, {"contype": masks[surface.pair], "conaffinity": 0}, contact)
+    for surface in fixture:
+        _add_surface(mujoco, spec, stands, surface, {"contype": 0, "conaffinity": masks[surface.pair]}, contact)
+    return spec.compile()
+
+
+def _add_rails(mujoco: Any, spec: Any, tool: Any, impedance: Impedance) -> None:
+    for (name, joint_type, axis), stiffness, damps, limit in zip(
+        RAILS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
+    ):
+        slides = joint_type is PrismaticJoint
+        tool.add_joint(
+            name=name, axis=axis, type=mujoco.mjtJoint.mjJNT_SLIDE if slides else mujoco.mjtJoint.mjJNT_HINGE
+        )
+        motor = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        motor.gaintype, motor.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
+        motor.gainprm[0] = stiffness  # force = clip(k (u − q) − d q', ± limit)
+        motor.biasprm[1], motor.biasprm[2] = -stiffness, -damps
+        motor.forcelimited, motor.forcerange = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
+
+
+def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any, contact: MujocoContact) -> None:
+    spring = surface.spring
+    if spring is not None:
+        mass = spring.stiffness * (spec.option.timestep / contact.spring_step) ** 2
+        body = body.add_body(
+            name=surface.name, mass=mass, inertia=[1e-7] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
+        )
+        body.add_joint(
+            name=surface.name,
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=spring.axis,
+            stiffness=spring.stiffness,
+            damping=np.sqrt(spring.stiffness * mass),
+        )
+    shape, half = surface.shape, 0.5 * surface.pitch
+    if isinstance(shape, Hull):
+        mesh = spec.add_mesh(name=surface.name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
+        mesh.uservert = shape.vertices.ravel().tolist()
+        kind: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": surface.name}
+    elif isinstance(shape, Cylinder):
+        kind = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [shape.radius, shape.length / 2, 0.0]}
+    else:
+        kind = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [shape.x / 2, shape.y / 2, shape.z / 2]}
+    body.add_geom(
+        name=surface.name,
+        pos=surface.position,
+        quat=[np.cos(half), 0.0, np.sin(half), 0.0],
+        condim=3,
+        friction=[surface.friction, 0.0, 0.0],
+        solref=[contact.time_constant, 1.0],
+        solimp=[contact.impedance, contact.impedance, 1e-4, 0.5, 2.0],
+        **kind,
+        **masks,
+    )
+
+
+@register_station("mujoco", world="workcell", options=ContactOptions)
+class MujocoStation(Station):
+    """`RailsStation`'s twin, stepped by MuJoCo: ports, rails, impedance, watchdog and filter are the same.
+
+    Drake's plant is still there, without joints or a step: it knows where the fixture stands and how the workpiece
+    sits in the tool, which a reset draws into its context, and what all of it looks like.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        impedance: Impedance = Impedance(),  # noqa: B008 (frozen)
+        time_step: float | None = None,
+        wrench_time_constant: float = 0.01,
+        contact: MujocoContact = MujocoContact(),
+    ):
+        """
+        Args:
+            workcell: what stands in the world and what is held.
+            impedance: of the rails.
+            time_step: at which commands are taken in, and poses and wrenches given out [s]; half a control period
+                unless given. The engine's own is finer.
+            wrench_time_constant: of the wrench's low-pass filter [s].
+            contact: of the engine.
+
+        Raises:
+            InputError: if MuJoCo isn't installed, or nobody described the workcell's surfaces as convex solids.
+        """
+        super().__init__()
+        time_step = time_step or PLANT_PERIOD
+        if not isinstance(workcell, ConvexWorkcell):
+            raise InputError(
+                f"station='mujoco' collides convex solids, and {type(workcell).__name__} doesn't say which: "
+                "give it the methods of ConvexWorkcell"
+            )
+        builder = DiagramBuilder()
+        self.scene_graph = builder.AddSystem(SceneGraph())
+        self.plant = plant = builder.AddNamedSystem("plant", MultibodyPlant(0.0))
+        moved = _add_workcell(plant, self.scene_graph, workcell)
+        inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
+        surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
+        model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
+        rails = MujocoRails(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
+        self.rails = builder.AddNamedSystem("rails", rails)
+        watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
+        monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
+        builder.Connect(plant.get_body_poses_output_port(), rails.get_nominal_body_poses_input_port())
+        builder.Connect(watchdog.get_safe_pose_output_port(), rails.get_desired_pose_input_port())
+        builder.Connect(rails.get_pose_output_port(), watchdog.get_pose_input_port())
+        builder.Connect(rails.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+        builder.Connect(
+            rails.get_geometry_poses_output_port(), self.scene_graph.get_source_pose_port(plant.get_source_id())
+        )
+        export_station_ports(
+            builder,
+            watchdog.get_desired_pose_input_port(),
+            watchdog.get_command_time_input_port(),
+            pose=rails.get_pose_output_port(),
+            wrench=rails.get_wrench_output_port(),
+            contact_force=monitor.get_contact_force_output_port(),
+            saturation=monitor.get_saturation_output_port(),
+            holding=watchdog.get_holding_output_port(),
+        )
+        builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
+        builder.ExportOutput(rails.get_body_poses_output_port(), "body_poses")
+        builder.BuildInto(self)
+
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
+        self.rails.set_pose(self.rails.GetMyMutableContextFromRoot(context), checked_pose(pose, POSE_SIZE))
+
+    def set_contact(self, context: Context, friction: float, modulus: float) -> None:
+        """Multiplies the engine's friction and compliance; `context` is the root context."""
+        self.rails.set_contact(self.rails.GetMyMutableContextFromRoot(context), friction, modulus)
+
+
+def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Workcell) -> MovedBodies:
+    """Adds fixture, tool and workpiece to a plant in which nothing moves, and finalizes it."""
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    workcell.add_fixture(plant)
+    if plant.num_bodies() != 2:  # with the world
+        raise InputError(f"station='mujoco' knows a fixture of one body, and {type(workcell).__name__} adds another")
+    fixture = plant.get_body(BodyIndex(1))
+    target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
+    model = plant.AddModelInstance("rails")
+    tool = plant.AddRigidBody("tool_centre", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
+    plant.WeldFrames(target, tool.body_frame())
+    workpiece = workcell.add_workpiece(plant, tool.body_frame())
+    plant.Finalize()
+    return MovedBodies(fixture, tool, workpiece)

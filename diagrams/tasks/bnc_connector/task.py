@@ -1,0 +1,178 @@
+"""BncConnector: insert, align and lock a bayonet connector whose place is not exactly known (4.4.2, 5.4.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+
+from guiderail.diagrams.envs.cameras import Camera, look_from_front
+from guiderail.diagrams.envs.config import STANDARD
+from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.tasks.bnc_connector.options import HARD, BncOptions, BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.rewards import (
+    OBSERVATIONS,
+    REWARDS,
+    half_turn,
+    observed,
+    reward_terms,
+    sides_of_the_rim,
+)
+from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, BncWorkcell
+from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.offsets import in_ring, reference_of_file
+from guiderail.diagrams.tasks.registry import register_task
+from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.objects.bnc_connector import demonstrations as inserting
+from guiderail.models.objects.bnc_connector import search_demonstrations as searching
+from guiderail.models.objects.insertion import LEAST_FORCE, REPEATED, RHO
+from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
+from guiderail.systems.center_of_pressure import ContactLever
+from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.reward_system import RewardTerm
+
+NUM_STEPS, COMPONENTS = inserting.NUM_STEPS, 16
+FLOOR = np.array(REPEATED)
+DEMONSTRATIONS = {"insert": inserting, "search": searching}
+TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
+LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
+
+
+@cache
+def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
+    """What demonstrations have in common: Gaussian mixture and regression, fitted once a process.
+
+    Args:
+        demonstrations: the name of those that come along, or a file.
+    """
+    if demonstrations not in DEMONSTRATIONS:
+        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()))
+    loaded = DEMONSTRATIONS[demonstrations].load()
+    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR)
+
+
+@register_task("BncConnector")
+class BncConnector(InsertionTask):
+    """Insert, align and lock: "sparse" is the thesis's reward (4.27, 4.28); "shaped" and "aligned" add to it."""
+
+    Options = BncOptions
+    options: BncOptions
+    workpiece, fixture = "plug", "jack"
+    simulated_rewards = ("aligned",)
+    rewards = REWARDS
+    observations = OBSERVATIONS
+    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
+    defaults = {"guidance": "skgrl", "station": "rails", "hold": 10, "explored": (0, 1), "history_variance": RHO}
+    isotropic_groups = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
+
+    def __init__(self, options: BncOptions, choice: Choice):
+        super().__init__(options, choice)
+        o = options
+        self.offsets = BncUncertainty(o.uncertainty, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn)
+        self.collision = Threshold("contact_force", o.force_limit)
+        self._workcell = o.workcell()
+        self.num_steps = NUM_STEPS if o.demonstrations in DEMONSTRATIONS else self.reference().num_steps
+
+    def world(self) -> BncWorkcell:
+        """A jack in the world, a plug in the tool."""
+        return self._workcell
+
+    def reference(self) -> ReferenceTrajectory:
+        """Of five demonstrations, or of one's own."""
+        return reference_trajectory(self.options.demonstrations)
+
+    def constraints(self) -> LinearConstraints:
+        """|x|, |y| ≤ 2 mm, equation 4.26, or another bound."""
+        bound = np.array([self.options.bound, self.options.bound, np.inf, np.inf, np.inf, np.inf])
+        return LinearConstraints.box(-bound, bound)
+
+    def keep_out(self) -> KeepOut:
+        """No walls are known: what safe residual learning is projected to is the alignment alone."""
+        return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
+
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Beside where the plug is, the lever of what it stands on."""
+        lever = builder.AddNamedSystem("contact_lever", ContactLever(LEAST_FORCE))
+        builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
+        return {**super().signals(builder, station), "lever": lever.get_lever_output_port()}
+
+    def seen_by_robot(self) -> tuple[np.ndarray, np.ndarray]:
+        """Height and turn tell whether it is locked. How far beside the jack it is nobody knows: a pull tells."""
+        size = self._workcell.dimensions
+        D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
+        D[2, 2] = D[5, 3] = 1.0
+        y0[[2, 5]] = size.locked_height, -size.detent_angle
+        return D, y0
+
+    def observed(self) -> Sequence[Observed]:
+        """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
+        return observed(self.choice.observation, self.num_steps)
+
+    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+        """Of actions, forces and the end; of depth where the reward is shaped."""
+        return reward_terms(self.choice.reward, num_actions)
+
+    def conditions(self) -> list[Condition]:
+        """Locked for a while, or pushed too hard."""
+        return [Condition("success", {"plug": 6}, self._workcell.locks, steps=LOCKED_STEPS), self.force_limit()]
+
+    def symmetry(self) -> Symmetry:
+        """Half a turn about the jack's axis."""
+        explored = self.choice.values["explored"]
+        action = HALF_TURN if explored is None else HALF_TURN[list(explored)]
+        return Symmetry.of_signs(half_turn(self.choice.observation), action)
+
+    def near_symmetry(self) -> Symmetry:
+        """Quarter turns and mirrors too: alike as long as the plug stands on the rim, which has no sides."""
+        explored = self.choice.values["explored"]
+        sides = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if explored is None else explored)
+        return self.symmetry() if sides is None else Symmetry(*sides)
+
+    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+        """Moves the jack by (x, y) and its turn, the plug by (x, y) and its tilt about x and y, where they have one."""
+        plant_context = station.plant.GetMyMutableContextFromRoot(context)
+        tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
+        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
+        self._workcell.set_jack_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
+        self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform(tilt, [*workpiece[:2], 0.0]))
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        """Where the demonstrations start, or somewhere beside it, inside the constraints."""
+        start = self.reference().means[0].copy()
+        if self.options.start_beside > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.options.start_beside)
+        return self.constraints().nearest(start)
+
+    def camera(self) -> Camera:
+        """Looks slightly down at the jack."""
+        X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04)
+        return Camera((640, 480), np.deg2rad(30.0), X_WC)
+
+    def scene(self) -> Scene:
+        """The demonstrations, and the square that commands stay in."""
+        to_world = in_frame(self._workcell.X_WT)
+        near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
+        bound = self.options.bound
+        return Scene(
+            to_world=to_world,
+            demonstrations=tuple(_shown(self.options.demonstrations).outputs),
+            constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
+            viewpoint=near,
+            arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
+            line_radius=0.0001,
+        )
+
+
+def _shown(demonstrations: str) -> Demonstrations:
+    known = DEMONSTRATIONS.get(demonstrations)
+    return Demonstrations.load(Path(demonstrations)) if known is None else known.load()

@@ -1,0 +1,273 @@
+"""GridClamp: push five pegs into five holes at once until they snap, with forces as small as they can be (3.4.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, field_validator
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
+
+from guiderail.diagrams.envs.cameras import Camera, look_from_front
+from guiderail.diagrams.envs.config import STANDARD, Number, Numbers, Options
+from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.guidance.prior import Approach, Template
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
+from guiderail.diagrams.tasks.registry import register_task
+from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.units import MM
+from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
+from guiderail.models.objects.grid_clamp.sdf import FRICTION
+from guiderail.models.templates import Skill, load_skill
+from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, Condition
+from guiderail.systems.reward_system import RewardTerm
+
+# More than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m.
+COLLISION_FORCE = 35.0  # [N], of the impedance
+# The hand-designed skill before hands over a clamp above the hole, about here.
+START_HEIGHT = (0.015, 0.018)  # [m]: the tips 3 to 6 mm above the table
+HEIGHTS = (0.013, 0.060)  # [m] that it may begin at: above the table, and well inside the cuboid
+DRAWN = GridClampDimensions()
+
+
+class GridClampOptions(Options):
+    """Of the clamp."""
+
+    uncertainty: Literal["calibration", "disc", "known"] = Field(
+        "calibration", description="where table and clamp may be"
+    )
+    start_height: Numbers = Field(
+        START_HEIGHT, min_length=2, max_length=2, description="least and greatest height at which it begins [m]"
+    )
+    force_limit: Number = Field(COLLISION_FORCE, ge=8, le=60, description="more than that ends an episode [N]")
+    seconds: Number = Field(10.0, ge=2, le=30, description="that an episode may take")
+    hole_chamfer: Number = Field(DRAWN.hole_chamfer, ge=0.1 * MM, le=0.8 * MM, description="of the holes [m]")
+    peg_chamfer: Number = Field(DRAWN.peg_chamfer, ge=0.1 * MM, le=0.8 * MM, description="of the pegs' tips [m]")
+    clearance: Number = Field(
+        DRAWN.clearance, ge=0.05 * MM, le=0.15 * MM, description="between a peg and its hole, on each side [m]"
+    )
+    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="of pegs, holes and table")
+
+    @field_validator("start_height")
+    @classmethod
+    def _is_a_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if not HEIGHTS[0] <= value[0] <= value[1] <= HEIGHTS[1]:
+            raise ValueError(f"give two heights from {HEIGHTS[0]} to {HEIGHTS[1]} m, the lower one first")
+        return value
+
+    def workcell(self) -> GridClampWorkcell:
+        """The clamp and the table that are meant."""
+        dimensions = replace(
+            DRAWN.with_clearance(self.clearance), hole_chamfer=self.hole_chamfer, peg_chamfer=self.peg_chamfer
+        )
+        return GridClampWorkcell(dimensions, friction=self.friction)
+
+
+HARD: dict[str, Any] = {"force_limit": 10.0}
+"""The force limit is the difficulty: what comes down anywhere but in a hole, and goes on, has pushed too hard before it
+has slid there by itself; the snap alone asks for six of the ten newtons."""
+
+
+SUCCESS_REWARD = 50.0
+SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
+# Of coming nearer to the holes' axis [1/m], and of an end by too much force: steps are parts of a millimetre, and
+# whoever presses gently and long must not lose more than whoever gives up at once.
+ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
+
+REWARDS = ("shaped", "no_force", "sparse", "aligned")
+
+
+def reward_terms(reward: str, num_actions: int, hold: int) -> list[RewardTerm]:
+    """ "shaped" is the thesis's, "no_force" the same without the cost of force, "sparse" without the distance gained.
+
+    "aligned" adds nearness to the holes' axis, which only a simulation knows and a policy does not see, and a cost of
+    pushing too hard. What the thesis gives once a decision is divided among its `hold` control steps.
+    """
+    terms = [
+        RewardTerm("terminal_reward", {"termination": 1}, _terminal_reward),
+        RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / hold),
+    ]
+    if reward != "no_force":
+        terms.append(RewardTerm("force_cost", {"wrench": 6}, lambda wrench: _force_cost(wrench[:3]) / hold))
+    if reward != "sparse":
+        terms.append(RewardTerm("shaping", {"pose": POSE_SIZE, "last_pose": POSE_SIZE}, _distance_gained))
+    if reward == "aligned":
+        terms.append(RewardTerm("alignment", {"clamp": POSE_SIZE, "last_clamp": POSE_SIZE}, _alignment_gained))
+        terms.append(RewardTerm("collision_cost", {"termination": 1}, _collision_cost))
+    return terms
+
+
+def _terminal_reward(termination: np.ndarray) -> float:
+    return SUCCESS_REWARD * (termination[0] == SUCCESS)
+
+
+def _force_cost(force: np.ndarray) -> float:
+    return -FORCE_WEIGHT * float(force @ force)
+
+
+def _distance_gained(pose: np.ndarray, last_pose: np.ndarray) -> float:
+    return SHAPING * float(last_pose[2] - pose[2])
+
+
+def _alignment_gained(clamp: np.ndarray, last_clamp: np.ndarray) -> float:
+    return ALIGNMENT * float(np.hypot(*last_clamp[:2]) - np.hypot(*clamp[:2]))
+
+
+def _collision_cost(termination: np.ndarray) -> float:
+    return COLLISION_REWARD * (TERMINATIONS[int(termination[0])] == "collision")
+
+
+NUM_PLACES = 6  # where clamps are picked up
+# Parallel jaws centre what they close on; along the jaws, which is x, a clamp stays where it happened to be.
+ALONG_JAWS = 1.0 * MM  # the six places' offsets spread over ± this
+ACROSS_JAWS = 0.2 * MM
+CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest error of the hole's place
+REPEATABILITY = 0.1 * MM  # of one pick-up place
+KNOWN_RADIUS = 0.15 * MM
+
+
+class GridClampUncertainty(HiddenOffsets):
+    """Draws the offsets of table and clamp; `HiddenOffsets` has the options of a reset.
+
+    - "calibration": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp
+      offset of its own, all hidden and the same for a whole run. An episode picks up at one of the places, drawn, with
+      a repeatability of 0.1 mm. The thesis's case.
+    - "disc": the error of the table and the six grasp offsets are drawn anew every episode.
+    - "known": the clamp is within 0.15 mm of where it is thought to be.
+
+    The option `offset` puts the clamp there in the tool and the table in its place.
+    """
+
+    def __init__(self, kind: str):
+        """
+        Args:
+            kind: "calibration", "disc" or "known".
+        """
+        super().__init__()
+        self.kind = kind
+
+    def _draw_run(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """The table's offset (2,) and the grasp offsets (6, 2) of the places."""
+        step = 2 * ALONG_JAWS / NUM_PLACES
+        along = -ALONG_JAWS + step * (np.arange(NUM_PLACES) + rng.uniform(0.0, 1.0, NUM_PLACES))
+        across = rng.uniform(-ACROSS_JAWS, ACROSS_JAWS, NUM_PLACES)
+        return in_ring(rng, *CALIBRATION), np.column_stack([along, across])
+
+    def _draw_episode(
+        self, rng: np.random.Generator, run: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.kind == "known":
+            return np.zeros(2), in_ring(rng, 0.0, KNOWN_RADIUS)
+        table, grasps = self._draw_run(rng) if self.kind == "disc" else run
+        return table, grasps[rng.integers(NUM_PLACES)] + in_ring(rng, 0.0, REPEATABILITY)
+
+    def _given(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(2), offset
+
+
+SEATED_STEPS = 3  # control steps for which it must be seated before that counts
+
+# The command waits while the clamp is farther than this from it: 12 N, twice what the snap asks for.
+LEASH = 8.0 * MM
+
+START_BESIDE = 0.2 * MM  # along x and along y, where a clamp is handed over
+
+# What a policy sees, [position, force], is centred and scaled by these.
+CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
+SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
+
+
+def make_skill() -> Skill:
+    """The template of section 3.4.2."""
+    return load_skill("grid_clamp")
+
+
+@register_task("GridClamp")
+class GridClamp(InsertionTask):
+    """Insert the clamp: "shaped" is the thesis's reward (3.11, 3.12), "no_force" the same without the cost of force,
+    "sparse" without the distance gained, "aligned" with nearness to the holes' axis. Without `active_constraints` only
+    the impedance's own limits of force hold a policy back."""
+
+    Options = GridClampOptions
+    options: GridClampOptions
+    workpiece, fixture = "clamp", "table"
+    rewards = REWARDS
+    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
+    defaults = {"guidance": "sct", "station": "rails", "hold": 5, "active_constraints": True}
+    learner = {"algorithm": "sac", "preset": "clamp"}
+
+    def __init__(self, options: GridClampOptions, choice: Choice):
+        super().__init__(options, choice)
+        self.offsets = GridClampUncertainty(options.uncertainty)
+        self.collision = Threshold("contact_force", options.force_limit)
+        # 100 decisions at 10 Hz unless given; the thesis's episodes take 140 on average.
+        self.num_steps = round(options.seconds / CONTROL_PERIOD)
+        self._workcell = options.workcell()
+
+    def world(self) -> GridClampWorkcell:
+        """A table with holes, a clamp in the tool."""
+        return self._workcell
+
+    def template(self) -> Template:
+        """One phase: a cuboid above the hole, upright."""
+        active = self.choice.values["active_constraints"]
+        return Template(make_skill(), {"hole": RigidTransform()}, active_constraints=active, leash=LEASH)
+
+    def approach(self) -> Approach:
+        """Straight down into the hole."""
+        parameters = make_skill().parameters
+        heights = (max(self.options.start_height), -parameters["push_m"])
+        return Approach(heights, speed=parameters["speed_m_per_s"], reach=parameters["width_m"] / 2)
+
+    def observed(self) -> Sequence[Observed]:
+        """Position of the clamp in the hole's frame, and force."""
+        first_three = (0, 1, 2)
+        return Observed("pose", CENTRE[:3], SCALE[:3], first_three), Observed("wrench", 0.0, SCALE[3:], first_three)
+
+    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+        """Equations 3.11 and 3.12."""
+        return reward_terms(self.choice.reward, num_actions, self.choice.hold)
+
+    def conditions(self) -> list[Condition]:
+        """Seated for a while, or pushed too hard."""
+        seated = Condition("success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=SEATED_STEPS)
+        return [seated, self.force_limit()]
+
+    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+        """Moves the table, and the clamp in the tool, by (x, y)."""
+        plant_context = station.plant.GetMyMutableContextFromRoot(context)
+        self._workcell.set_table_offset(station.plant, plant_context, RigidTransform([*fixture, 0.0]))
+        self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece, 0.0]))
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        """About where the skill before hands over."""
+        start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
+        start[:3] = *rng.uniform(-START_BESIDE, START_BESIDE, 2), rng.uniform(lowest, highest)
+        return start
+
+    def camera(self) -> Camera:
+        """Looks slightly down at the holes."""
+        target = np.array(self._workcell.p_WG) + [0.0, 0.0, 0.01]
+        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=0.17, height=0.075))
+
+    def scene(self) -> Scene:
+        """The cuboid that commands stay in, as high as the clamp begins."""
+        to_world, parameters = in_frame(self._workcell.X_WT), make_skill().parameters
+        half = 0.5 * parameters["width_m"]
+        edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))
+        near = viewpoint(*to_world(np.array([[0.045, -0.065, 0.045], [0.0, 0.0, 0.008]])))
+        return Scene(
+            to_world=to_world,
+            constraint=tuple(to_world(edge) for edge in edges),
+            viewpoint=near,
+            arm_views={"the clamp": near, "the arm": ARM_VIEW},
+            line_radius=0.0001,
+        )

@@ -1,0 +1,246 @@
+"""A task of two meshes: its folder says every number, and makes it a task as those that come along are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache, cached_property
+from pathlib import Path
+from typing import ClassVar, cast
+
+import numpy as np
+from pydantic import Field
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
+
+from guiderail.diagrams.envs.cameras import Camera, look_from_front
+from guiderail.diagrams.envs.config import Number
+from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.rewards import REWARDS, reward_terms, sides_of_the_rim
+from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.offsets import HiddenPlace, in_ring, reference_of_file
+from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file, task_folder_digest
+from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
+from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.models.common.files import write_atomically
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.objects.insertion import COLLISION_FORCE, COMMAND_SCALE, LEAST_FORCE, LEVER_SCALE, RHO
+from guiderail.models.parts.model_files import part_sdf
+from guiderail.models.parts.symmetry import SIDES
+from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
+from guiderail.systems.center_of_pressure import ContactLever
+from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.reward_system import RewardTerm
+
+COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
+WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
+
+
+class PartOptions(HiddenPlace):
+    """Of a task of two meshes."""
+
+    start_beside: Number = Field(0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]")
+    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
+
+
+class PartInsertion(InsertionTask):
+    """Insert a plug into a socket: "sparse" costs action and force and rewards the end, "shaped" adds the depth gained,
+    "aligned" nearness to the socket's axis, too.
+
+    Attributes:
+        folder: of the task.
+        file: what `task.yaml` says.
+    """
+
+    Options = PartOptions
+    options: PartOptions
+    workpiece, fixture = PLUG, SOCKET
+    rewards = REWARDS
+    observations = ("state", "lever")
+    isotropic_groups = ((0, 1, 2), (3, 4, 5))
+    folder: ClassVar[Path]
+    file: ClassVar[PartTaskFile]
+
+    def __init__(self, options: PartOptions, choice: Choice):
+        super().__init__(options, choice)
+        self.offsets = BncUncertainty(options.uncertainty, offset_range=options.offset_range)
+        self.collision = Threshold("contact_force", options.force_limit)
+        self.num_steps = self.reference().num_steps
+
+    def world(self) -> PartWorkcell:
+        """The socket in the world, the plug in the tool."""
+        return self._workcell
+
+    @cached_property
+    def _workcell(self) -> PartWorkcell:
+        return workcell(self.folder, self.file)
+
+    def reference(self) -> ReferenceTrajectory:
+        """Of the folder's demonstrations."""
+        shown = self.file.demonstrations
+        return reference_of_file(self.folder / shown.file, shown.components, shown.floor)
+
+    def constraints(self) -> LinearConstraints:
+        """The folder's bounds."""
+        return self.file.bounds.constraints(self.reference().num_steps)
+
+    @classmethod
+    def knows(cls) -> tuple[str, ...]:
+        """As of every task; but what is to be kept out of can't change on the way."""
+        changes = cls.file.bounds.phases is not None
+        return tuple(one for one in super().knows() if not (one == "keep_out" and changes))
+
+    def keep_out(self) -> KeepOut:
+        """No walls are known: what safe residual learning is projected to are the bounds alone."""
+        return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
+
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Beside where the plug is, the lever of what it stands on."""
+        lever = builder.AddNamedSystem("contact_lever", ContactLever(LEAST_FORCE))
+        builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
+        return {**super().signals(builder, station), "lever": lever.get_lever_output_port()}
+
+    def observed(self) -> Sequence[Observed]:
+        """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
+        half = 0.5 * self.num_steps * CONTROL_PERIOD
+        height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
+        centre = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
+        scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
+        state = (Observed("time", half, half), Observed("pose", centre, scale), Observed("wrench", 0.0, WRENCH_SCALE))
+        if self.choice.observation == "state":
+            return state
+        return (*state, Observed("lever", 0.0, LEVER_SCALE), Observed("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
+
+    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+        """Of actions, forces and the end; of depth and nearness where the reward says so."""
+        return reward_terms(self.choice.reward, num_actions)
+
+    def conditions(self) -> list[Condition]:
+        """At the target for a while, or pushed too hard."""
+        seated = Condition("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
+        return [seated, self.force_limit()]
+
+    def symmetry(self) -> Symmetry | None:
+        """The sides from which both parts look the same."""
+        return self._seen_from(self.file.sides)
+
+    def near_symmetry(self) -> Symmetry | None:
+        """And those from which a plug on the rim feels nearly the same."""
+        return self._seen_from((*self.file.sides, *self.file.rim_sides))
+
+    def _seen_from(self, names: Sequence[str]) -> Symmetry | None:
+        explored = self.choice.values["explored"]
+        every = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if explored is None else explored)
+        chosen = [number for number, name in enumerate(SIDES) if name in names]
+        return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
+
+    @classmethod
+    def is_seated(cls, plug: np.ndarray) -> bool:
+        """Whether a plug at `plug`, position and rotation vector in the socket (6,), is at the target."""
+        tolerance = cls.file.tolerance
+        return bool(
+            abs(plug[2]) < tolerance.height
+            and np.hypot(plug[0], plug[1]) < tolerance.beside
+            and abs(plug[5]) < tolerance.turn * DEGREE
+        )
+
+    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+        """Moves the socket, and the plug in the tool, by (x, y)."""
+        plant_context = station.plant.GetMyMutableContextFromRoot(context)
+        world = self.world()
+        turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
+        world.set_socket_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
+        world.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        """Where the demonstrations start, or somewhere beside it, inside the bounds."""
+        start = self.reference().means[0].copy()
+        if self.options.start_beside > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.options.start_beside)
+        return self.constraints().nearest(start)
+
+    def camera(self) -> Camera:
+        """Looks slightly down at the socket."""
+        size = self.file.motion.travel
+        target = np.array(self.file.place) + [0.0, 0.0, 0.5 * size]
+        return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=6 * size, height=3 * size))
+
+    def scene(self) -> Scene:
+        """The demonstrations, and the box that commands stay in, in each phase."""
+        to_world, size = in_frame(self.world().X_WT), self.file.motion.travel
+        near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
+        lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())
+        lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
+        boxes = [corners for corners in zip(lower, upper, strict=True) if np.isfinite(corners).all()]
+        return Scene(
+            to_world=to_world,
+            demonstrations=tuple(Demonstrations.load(self.folder / self.file.demonstrations.file).outputs),
+            constraint=tuple(to_world(edge) for corners in boxes for edge in box_edges(*corners)),
+            viewpoint=near,
+            arm_views={"the parts": near, "the arm": ARM_VIEW},
+            line_radius=0.0001,
+        )
+
+
+def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
+    """What a task folder is about, its SDF files written beside its meshes.
+
+    Raises:
+        InputError: if they can't be written.
+    """
+    for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
+        text = part_sdf(
+            name,
+            part.visual,
+            part.pieces,
+            mass=part.mass,
+            centre=part.centre,
+            gyration=part.gyration,
+            colour=COLOURS[name],
+        )
+        path = folder / f"{name}.sdf"
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            write_atomically(path, text.encode())  # other processes read it too
+    return PartWorkcell(
+        str(folder / f"{PLUG}.sdf"),
+        str(folder / f"{SOCKET}.sdf"),
+        cast(tuple[float, float, float], file.place),
+        file.stiction_tolerance,
+        tuple(str(folder / name) for name in file.scenario),
+    )
+
+
+def load_task_folder(folder: Path) -> type[PartInsertion]:
+    """The task of a folder, as a class that a registry takes.
+
+    Raises:
+        InputError: if it is no task folder, or something in it makes no sense.
+    """
+    folder = folder.resolve()
+    return _task_class(folder, task_folder_digest(folder))
+
+
+@cache
+def _task_class(folder: Path, content: str) -> type[PartInsertion]:
+    """One class for each folder and what is in it, so that environments of it can share diagrams."""
+    file = read_task_file(folder)
+    defaults = {
+        "guidance": "skgrl",
+        "station": "rails",
+        "hold": 10,
+        "explored": file.explored,
+        "history_variance": RHO,
+        "force_limit": file.force_limit,
+        "time_step": file.time_step,
+        **file.recommended.environment,
+    }
+    learner = file.recommended.learner
+    members = {"folder": folder, "file": file, "defaults": defaults, "learner": learner, "__module__": __name__}
+    task = type(f"PartInsertion({folder})", (PartInsertion,), members)
+    task.__doc__ = f"Insert {file.plug.source or 'a plug'} into {file.socket.source or 'a socket'}."
+    return cast(type[PartInsertion], task)

@@ -1,0 +1,37 @@
+"""Arrays of numbers, as callers and files give them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from guiderail.models.common.errors import InputError
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a × b of two vectors (3,). NumPy's own is made for arrays of vectors, and many times slower for one."""
+    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
+
+
+_EXACT = 2**53  # from there on a double skips whole numbers
+
+
+def numbers(values: ArrayLike, what: str) -> np.ndarray:
+    """A new array of doubles that holds exactly the numbers given; `what` names them in messages.
+
+    Raises:
+        InputError: if they are ragged, or no real numbers: texts, dates, complex numbers and objects are none.
+    """
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind not in "fiubO":
+            raise InputError(f"{what} is not an array of numbers: it holds {given.dtype}")
+        array = np.array(given, dtype=float)
+    except InputError:
+        raise
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{what} is not an array of numbers: {error}") from error
+    if given.dtype.kind in "iu" and given.dtype.itemsize == 8 and (np.abs(array) >= _EXACT).any():
+        raise InputError(f"{what} holds whole numbers of 2^53 and more, which a double rounds: subtract an offset")
+    return array

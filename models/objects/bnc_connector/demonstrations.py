@@ -1,0 +1,73 @@
+"""Five demonstrations of inserting and locking a BNC plug: how the demonstrator moves, and the file they lie in.
+
+A scripted demonstrator stands in for the hand of the thesis (section 4.4.2). Like a hand it is never twice the same: it
+comes down roughly above the jack, wanders over the rim while pressing lightly until the plug drops in, is precise
+where the connector leaves no choice, and takes its time differently each time. It moves a station's *desired* pose; the
+connector answers through the impedance. Both the commanded and the measured pose are kept. Under impedance control a
+primitive learns the commanded one: the push lives in the difference.
+
+`guiderail generate connector-demonstrations` records them again.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from guiderail.models.objects.bnc_connector.geometry import MM
+from guiderail.models.objects.bnc_connector.motion import insert_and_lock
+from guiderail.models.primitives import Demonstrations
+
+PATH = Path(__file__).with_name("bnc_connector.npz")
+NUM_DEMONSTRATIONS = 5
+NUM_STEPS = 400
+NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
+
+DEGREE = np.deg2rad(1.0)
+# How much the hand varies, as standard deviations: above the jack, touching the rim, wandering over it, dropping in,
+# seated, turning, locked. Times are those of the motion's waypoints.
+_TIMES = [0.0, 1.2, 1.6, 3.4, 4.1, 4.8, 7.0, 8.0]  # [s]
+_DEVIATIONS = {
+    "x": np.array([1.0, 1.2, 1.2, 1.2, 0.35, 0.15, 0.15, 0.10]) * MM,
+    "y": np.array([1.0, 1.2, 1.2, 1.2, 0.35, 0.15, 0.15, 0.10]) * MM,
+    "z": np.array([1.0, 0.9, 0.5, 0.5, 0.7, 0.5, 0.5, 0.3]) * MM,
+    "Rz": np.array([2.0, 1.5, 1.0, 1.0, 1.0, 1.5, 1.5, 0.7]) * DEGREE,
+    "Ry": np.array([1.2, 1.2, 1.2, 1.2, 0.5, 0.2, 0.2, 0.15]) * DEGREE,
+    "Rx": np.array([1.2, 1.2, 1.2, 1.2, 0.5, 0.2, 0.2, 0.15]) * DEGREE,
+}
+_CORRELATION = {"x": 0.22, "y": 0.22, "z": 0.35, "Rz": 0.5, "Ry": 0.3, "Rx": 0.3}  # [s] how quickly the hand wanders
+_CENTRING = 0.9  # five random curves have a mean of their own; this much of it is taken out: nobody knows a better path
+_TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # [s]: ahead of or behind the script by this much, for this long
+
+
+def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
+    """Desired poses (M, N, 6) of a session of M demonstrations at `times` (N,) [s], in the locked frame."""
+    rng = np.random.default_rng(seed)
+    script_times, script = insert_and_lock()
+    scripted, curves = [], []
+    for _ in range(NUM_DEMONSTRATIONS):
+        lead = _TEMPO_DEVIATION * correlated(rng, times, _TEMPO_CORRELATION) * np.sin(np.pi * times / times[-1])
+        at = np.clip(times + lead, 0.0, script_times[-1])
+        scripted.append(np.stack([np.interp(at, script_times, column) for column in script.T], axis=1))
+        curves.append(np.stack([correlated(rng, times, _CORRELATION[name]) for name in _DEVIATIONS], axis=1))
+    wander = np.stack(curves) - _CENTRING * np.mean(curves, axis=0)
+    scale = np.stack([np.interp(times, _TIMES, deviation) for deviation in _DEVIATIONS.values()], axis=1)
+    return np.stack(scripted) + scale * wander
+
+
+def load() -> Demonstrations:
+    """What was commanded, five times 400 poses in the locked frame."""
+    return Demonstrations.load(PATH)
+
+
+def load_all() -> dict[str, np.ndarray]:
+    """Everything in the file: `times` (N,), `outputs` and `measured` (M, N, 6), `wrench` (M, N, 6), and metadata."""
+    with np.load(PATH, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+def correlated(rng: np.random.Generator, times: np.ndarray, correlation: float) -> np.ndarray:
+    """A random curve of unit variance that forgets itself after `correlation` seconds."""
+    covariance = np.exp(-0.5 * ((times[:, None] - times) / correlation) ** 2) + 1e-6 * np.eye(len(times))
+    return np.linalg.cholesky(covariance) @ rng.standard_normal(len(times))

@@ -1,0 +1,225 @@
+"""A BNC bayonet connector at true scale: a jack with two lugs, and a plug whose ring carries two slots.
+
+Frames. The jack frame J lies at the bottom of the barrel's centre line, z along the barrel to its open end, x through
+the lugs. The plug frame P lies in the plane of the ring's mouth, z from the mouth to the cable, x through the entries
+of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by minus `detent_angle`, and is locked at
+X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
+
+Contact. The ring is two open rigid surfaces, a bore that only the barrel may touch and a pair of slots that only the
+lugs may touch: a third of the triangles of a closed ring, and five times faster. The jack's barrel and lugs are
+compliant primitives. A soft pad on the barrel stands for the gasket: it pushes the lugs into their detents.
+
+`python -m guiderail.models.objects.bnc_connector.sdf` writes the files beside this one that a simulator loads.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, equal_area_radius, lathe, strip
+
+MM = 1e-3
+FOLDER = Path(__file__).parent
+JACK_SDF = FOLDER / "bnc_jack.sdf"
+PLUG_SDF = FOLDER / "bnc_plug.sdf"
+BORE_SIDES = 24  # of the polygon that stands for the bore
+
+
+@dataclass(frozen=True)
+class BncDimensions:
+    """The drawing, in metres and radians. Depths and heights of the slot are of the lug's centre, from the mouth."""
+
+    barrel_radius: float = 4.825 * MM
+    barrel_height: float = 10.0 * MM
+    lug_radius: float = 0.975 * MM
+    lug_tip_radius: float = 5.5 * MM  # from the centre line to the end of a lug
+    lug_root_radius: float = 4.025 * MM  # a lug starts inside the barrel
+    lug_depth: float = 5.5 * MM  # below the barrel's open end
+
+    bore_radius: float = 4.925 * MM
+    ring_radius: float = 7.0 * MM
+    ring_length: float = 9.5 * MM
+    mouth_chamfer: float = 0.4 * MM
+    slot_clearance: float = 0.125 * MM  # a side
+    slot_depth: float = 0.9 * MM  # how far the walls that the lugs touch go into the ring
+
+    entry_height: float = 3.4 * MM  # bottom of the straight entry
+    entry_angle: float = np.deg2rad(6.0)  # where the ramp starts
+    apex_height: float = 5.4 * MM
+    apex_angle: float = np.deg2rad(78.0)
+    detent_height: float = 5.0 * MM
+    detent_start_angle: float = np.deg2rad(87.0)
+    detent_angle: float = np.deg2rad(90.0)
+
+    pad_radius: float = 3.0 * MM
+    pad_height: float = 0.6 * MM  # above the barrel's open end
+    pad_thickness: float = 2.0 * MM
+    seat_height: float = 10.7 * MM  # the face in the plug that meets the pad, from the mouth
+    seat_width: float = 8.0 * MM
+    seat_thickness: float = 2.0 * MM
+    shell_radius: float = 5.0 * MM  # the plug's back shell, that is held
+    shell_length: float = 16.0 * MM
+
+    @property
+    def bore_clearance(self) -> float:
+        """Between barrel and bore, on each side."""
+        return round(self.bore_radius - self.barrel_radius, 9)
+
+    def with_bore_clearance(self, clearance: float) -> BncDimensions:
+        """The same connector with a wider or a narrower bore."""
+        return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
+
+    @property
+    def lug_height(self) -> float:
+        """Height of the lugs' centres in J."""
+        return self.barrel_height - self.lug_depth
+
+    @property
+    def locked_height(self) -> float:
+        """Height of P in J when the lugs sit in the detents."""
+        return self.lug_height - self.detent_height
+
+    @property
+    def slot_radius(self) -> float:
+        """Radius at which the slot's outline is a plane drawing: a little outside the barrel."""
+        return self.barrel_radius + 0.3 * MM
+
+    @property
+    def slot_half_width(self) -> float:
+        """Radius of the mill that would cut the slot."""
+        return self.lug_radius + self.slot_clearance
+
+
+@dataclass(frozen=True)
+class SlotColumns:
+    """The slot unrolled: at each angle [rad], the walls below and above it [m]."""
+
+    angles: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    num_entry: int  # columns 0 … num_entry span the entry, which is open towards the mouth
+
+
+def slot_columns(dimensions: BncDimensions, num_entry: int = 6, num_ramp: int = 14, num_end: int = 3) -> SlotColumns:
+    """The walls that a mill of the slot's half width leaves when it follows the lug's path."""
+    d = dimensions
+    radius, half_width = d.slot_radius, d.slot_half_width
+    knots = np.array(
+        [
+            [0.0, 0.0],
+            [0.0, d.entry_height],
+            [d.entry_angle, d.entry_height],
+            [d.apex_angle, d.apex_height],
+            [d.detent_start_angle, d.detent_height],
+            [d.detent_angle, d.detent_height],
+        ]
+    ) * [radius, 1.0]
+    path = np.concatenate(
+        [start + np.linspace(0.0, 1.0, 200)[:, None] * (end - start) for start, end in itertools.pairwise(knots)]
+    )
+    last = knots[-1, 0]
+    arcs = np.concatenate(
+        [
+            -half_width * np.cos(np.linspace(0.0, np.pi, num_entry + 1)),
+            np.linspace(half_width, last, num_ramp + 1)[1:],
+            last + half_width * np.sin(np.linspace(0.0, np.pi / 2, num_end + 1))[1:],
+        ]
+    )
+
+    def walls(arc: float) -> tuple[float, float]:
+        distance = np.abs(path[:, 0] - np.clip(arc, -half_width + 1e-9, last + half_width - 1e-9))
+        near = distance <= half_width
+        reach = np.sqrt(half_width**2 - distance[near] ** 2)
+        return float(np.min(path[near, 1] - reach)), float(np.max(path[near, 1] + reach))
+
+    lower, upper = np.array([walls(arc) for arc in arcs]).T
+    lower[: num_entry + 1] = walls(half_width + 1e-10)[0]  # the entry's right-hand wall ends where the ramp begins
+    lower[-1] = upper[-1] = 0.5 * (lower[-1] + upper[-1])  # the mill's round closes the slot
+    return SlotColumns(arcs / radius, lower, upper, num_entry)
+
+
+def _both_halves(quads: np.ndarray) -> np.ndarray:
+    return np.concatenate([quads, quads * [-1.0, -1.0, 1.0]])
+
+
+def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) -> np.ndarray:
+    """The slot's outline, from the mouth around the detent and back to the mouth, cut from the bore outwards."""
+    d, columns = dimensions, slot_columns(dimensions)
+    entry_left, entry_right = columns.angles[0], columns.angles[columns.num_entry]
+    ramp = slice(columns.num_entry, None)
+    outline = np.concatenate(
+        [
+            [[entry_right + chamfer / d.slot_radius, 0.0], [entry_right, chamfer]],
+            np.stack([columns.angles[ramp], columns.lower[ramp]], axis=1),
+            np.stack([columns.angles, columns.upper], axis=1)[-2::-1],
+            [[entry_left, chamfer], [entry_left - chamfer / d.slot_radius, 0.0]],
+        ]
+    )
+    return strip(
+        cylindrical(d.bore_radius, outline[:, 0], outline[:, 1]),
+        cylindrical(outer_radius, outline[:, 0], outline[:, 1]),
+    )
+
+
+def _faces_between_entries(
+    dimensions: BncDimensions, radii: tuple[float, float], margin: float, height: float, num_sides: int
+) -> np.ndarray:
+    """A flat ring from one slot's entry to the other's, facing the jack."""
+    columns = slot_columns(dimensions)
+    angles = np.linspace(columns.angles[columns.num_entry] + margin, np.pi + columns.angles[0] - margin, num_sides + 1)
+    return strip(cylindrical(radii[1], angles, height), cylindrical(radii[0], angles, height))
+
+
+def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """What the lugs touch: both slots' walls, and the mouth's face between the entries, chamfered at the entries."""
+    d = dimensions
+    outer_radius = d.bore_radius + d.slot_depth
+    walls = _slot_walls(d, outer_radius, d.mouth_chamfer)
+    face = _faces_between_entries(
+        d, (d.bore_radius + d.mouth_chamfer, outer_radius), d.mouth_chamfer / d.slot_radius, 0.0, num_sides=17
+    )
+    return TriangleMesh.from_quads(_both_halves(np.concatenate([walls, face])))
+
+
+def bore_mesh(dimensions: BncDimensions, num_sides: int = BORE_SIDES, equal_area: bool = False) -> TriangleMesh:
+    """What the barrel touches: the mouth's face, its chamfer and the bore.
+
+    A polygon around the true circle, or with `equal_area` one of the circle's area.
+    """
+    d = dimensions
+    corner = equal_area_radius(1.0, num_sides) if equal_area else 1.0 / float(np.cos(np.pi / num_sides))
+    profile = [
+        (d.ring_radius, 0.0),
+        ((d.bore_radius + d.mouth_chamfer) * corner, 0.0),
+        (d.bore_radius * corner, d.mouth_chamfer),
+        (d.bore_radius * corner, d.ring_length),
+    ]
+    return lathe(profile, num_sides)
+
+
+def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """What one sees: the ring, its slots cut through so that the lugs can be watched."""
+    d, columns = dimensions, slot_columns(dimensions)
+    ramp = slice(columns.num_entry, None)
+    plain_angles = np.linspace(columns.angles[-1], np.pi + columns.angles[0], 9)
+
+    def shell(angles: np.ndarray, low: np.ndarray | float, high: np.ndarray | float) -> list[np.ndarray]:
+        low_in, high_in = (cylindrical(d.bore_radius, angles, height) for height in (low, high))
+        low_out, high_out = (cylindrical(d.ring_radius, angles, height) for height in (low, high))
+        return [strip(low_in, high_in), strip(high_out, low_out)]
+
+    radii = (d.bore_radius, d.ring_radius)
+    all_angles = np.concatenate([columns.angles, plain_angles[1:]])
+    quads = (
+        shell(columns.angles, columns.upper, d.ring_length)
+        + shell(columns.angles[ramp], 0.0, columns.lower[ramp])
+        + shell(plain_angles, 0.0, d.ring_length)
+        + [_slot_walls(d, d.ring_radius, chamfer=0.0)]
+        + [_faces_between_entries(d, radii, 0.0, 0.0, num_sides=24)]
+        + [strip(cylindrical(radii[0], all_angles, d.ring_length), cylindrical(radii[1], all_angles, d.ring_length))]
+    )
+    return TriangleMesh.from_quads(_both_halves(np.concatenate(quads)))

@@ -1,0 +1,108 @@
+"""The SDF files of the BNC jack and plug, written from the drawing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from guiderail.models.objects.bnc_connector.geometry import FOLDER, MM, BncDimensions, bore_mesh, ring_mesh, slot_mesh
+from guiderail.models.objects.sdf import ContactMaterial, at, box, collision, cylinder, made, mesh, model, visual
+from guiderail.models.objects.triangle_mesh import equal_area_radius
+
+BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
+
+
+FRICTION = 0.2  # of metal on metal
+# Without it a step of 10 ms leaps as far into metal as the plug moves in it, and the next one throws the plug out. With
+# it, what slides fast is held back by more than friction (`guiderail bench engines`), the more the longer the step.
+MARGIN = 0.1 * MM
+# As stiff as brass. A softer barrel spreads a rim's load evenly, and a plug that stands beside the jack feels a torque
+# that no metal has (docs/experiments.md, "Where a plug on the rim feels its force").
+BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM, margin=MARGIN)
+LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
+PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket is a spring that slips
+RING = ContactMaterial(friction=FRICTION)
+SEAT = ContactMaterial(friction=0.05)
+
+PLUG_MASS = 0.03  # [kg]
+
+
+def barrel_sides(dimensions: BncDimensions) -> int:
+    """Of the polygon that Drake makes of the barrel: its sides are as long as the resolution hint, or shorter."""
+    assert BARREL.resolution is not None
+    return int(np.ceil(2.0 * np.pi * dimensions.barrel_radius / BARREL.resolution))
+
+
+def jack_sdf(
+    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
+) -> str:
+    """The jack: link `jack` is frame J. Geometry `barrel`, `pad`, `lug_0`, `lug_1`.
+
+    The barrel touches as a polygon whose corners lie on the circle, or with `equal_area` as one of the circle's area.
+    """
+    d = dimensions
+    barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
+    place, barrel = at(z=d.barrel_height / 2), cylinder(d.barrel_radius, d.barrel_height)
+    touching = cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height) if equal_area else barrel
+    pad = (
+        at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2),
+        cylinder(d.pad_radius, d.pad_thickness),
+    )
+    lug_length = d.lug_tip_radius - d.lug_root_radius
+    lug_centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
+    contents = collision("barrel", place, touching, barrel_material) + visual("barrel_visual", place, barrel, NICKEL)
+    contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
+    for number, side in enumerate((1.0, -1.0)):
+        lug = (at(x=side * lug_centre, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
+        contents += collision(f"lug_{number}", *lug, lug_material) + visual(f"lug_{number}_visual", *lug, BRASS)
+    return model("jack", 0.05, (0.0, 0.0, d.barrel_height / 2), 5.0 * MM, contents)
+
+
+def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
+    """The plug: link `plug` is frame P. Geometry `bore`, `slots`, `seat`."""
+    d, ring = dimensions, replace(RING, friction=friction)
+    seat = (
+        at(z=d.seat_height + d.seat_thickness / 2),
+        box(d.seat_width, d.seat_width, d.seat_thickness),
+    )
+    shell = (at(z=d.ring_length + d.shell_length / 2), cylinder(d.shell_radius, d.shell_length))
+    contents = collision("bore", at(), mesh("bnc_bore.obj"), ring)
+    contents += collision("slots", at(), mesh("bnc_slots.obj"), ring)
+    contents += collision("seat", *seat, SEAT)
+    contents += visual("ring_visual", at(), mesh("bnc_ring.obj"), NICKEL)
+    contents += visual("shell_visual", *shell, BRASS)
+    return model("plug", PLUG_MASS, (0.0, 0.0, d.ring_length), 8.0 * MM, contents)
+
+
+def files(
+    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
+) -> dict[str, str]:
+    """What each file holds, by name."""
+    return {
+        "bnc_bore.obj": bore_mesh(dimensions, equal_area=equal_area).to_obj(),
+        "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
+        "bnc_ring.obj": ring_mesh(dimensions).to_obj(),
+        "bnc_jack.sdf": jack_sdf(dimensions, friction, margin, equal_area),
+        "bnc_plug.sdf": plug_sdf(dimensions, friction),
+    }
+
+
+def folder_of(
+    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
+) -> Path:
+    """Where the files of a connector lie: beside this one, or made to measure."""
+    if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
+        return FOLDER
+    return made(files, dimensions, friction, margin, equal_area)
+
+
+def main(folder: Path = FOLDER) -> None:
+    """Writes every file."""
+    for name, content in files(BncDimensions()).items():
+        (folder / name).write_text(content)
+
+
+if __name__ == "__main__":
+    main()

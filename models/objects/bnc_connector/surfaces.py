@@ -1,0 +1,135 @@
+"""The BNC connector as convex solids, from its drawing: the bore a ring of prisms, each slot what its mill left."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from guiderail.models.objects.bnc_connector.geometry import BORE_SIDES, BncDimensions, slot_columns
+from guiderail.models.objects.bnc_connector.sdf import FRICTION, PAD
+from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hull, Spring, Surface, ring_hulls
+from guiderail.models.objects.triangle_mesh import cylindrical
+
+WIDEST = np.deg2rad(6.0)  # of a prism about the axis: its flat face is then 7 µm inside the circle
+# A rigid disc on a spring stands for the gasket. Drake's pad pushes so hard for its depth, within 15 % up to 0.6 mm.
+PAD_STIFFNESS = 1.5e5  # [N/m]
+
+
+def jack_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list[Surface]:
+    """What of the jack touches, in its frame J."""
+    d = dimensions
+    barrel = Surface(
+        "barrel", "bore", Cylinder(d.barrel_radius, d.barrel_height), friction, (0.0, 0.0, d.barrel_height / 2)
+    )
+    pad_centre = d.barrel_height + d.pad_height - d.pad_thickness / 2
+    spring = Spring((0.0, 0.0, 1.0), PAD_STIFFNESS)
+    pad = Surface(
+        "pad", "pad", Cylinder(d.pad_radius, d.pad_thickness), PAD.friction, (0.0, 0.0, pad_centre), spring=spring
+    )
+    centre, shape = (
+        0.5 * (d.lug_tip_radius + d.lug_root_radius),
+        Cylinder(d.lug_radius, d.lug_tip_radius - d.lug_root_radius),
+    )
+    lugs = [
+        Surface(f"lug_{number}", "slots", shape, friction, (side * centre, 0.0, d.lug_height), pitch=np.pi / 2)
+        for number, side in enumerate((1.0, -1.0))
+    ]
+    return [barrel, pad, *lugs]
+
+
+def plug_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list[Surface]:
+    """What of the plug touches, in its frame P."""
+    d = dimensions
+    surfaces = [
+        Surface(f"{pair}_{number}", pair, Hull(vertices), friction)
+        for pair, hulls in (("bore", bore_hulls(d)), ("slots", slot_hulls(d)))
+        for number, vertices in enumerate(hulls)
+    ]
+    seat = (0.0, 0.0, d.seat_height + d.seat_thickness / 2)
+    return [*surfaces, Surface("seat", "pad", Box(d.seat_width, d.seat_width, d.seat_thickness), PAD.friction, seat)]
+
+
+def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
+    """The ring around the barrel, chamfered at the mouth: the same polygon as `bore_mesh`."""
+    d = dimensions
+    profile = [
+        [d.bore_radius + d.mouth_chamfer, 0.0],
+        [d.ring_radius, 0.0],
+        [d.ring_radius, d.ring_length],
+        [d.bore_radius, d.ring_length],
+        [d.bore_radius, d.mouth_chamfer],
+    ]
+    return ring_hulls(np.array(profile), BORE_SIDES)
+
+
+def slot_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
+    """What is left between the mouth and the ring's end once both slots are cut: prisms over, under and beside them."""
+    outlines = [*_over_the_slot(dimensions), *_under_the_ramp(dimensions), *_beside_the_slot(dimensions)]
+    return [_prism(np.array(outline) + [turn, 0.0], dimensions) for turn in (0.0, np.pi) for outline in outlines]
+
+
+Outline = list[list[float]]
+"""Corners [angle, height] of a prism, in any order."""
+
+
+def _prism(outline: np.ndarray, d: BncDimensions) -> np.ndarray:
+    angle, height = outline.T
+    return np.concatenate([cylindrical(radius, angle, height) for radius in (d.bore_radius, d.ring_radius)])
+
+
+def _over_the_slot(d: BncDimensions) -> list[Outline]:
+    columns = slot_columns(d)
+    a, wall = columns.angles, columns.upper
+    return [
+        [[a[i], wall[i]], [a[i + 1], wall[i + 1]], [a[i + 1], d.ring_length], [a[i], d.ring_length]]
+        + _shoulders(d, a, wall, i, facing=-1.0)
+        for i in range(len(a) - 1)
+    ]
+
+
+def _under_the_ramp(d: BncDimensions) -> list[Outline]:
+    columns = slot_columns(d)
+    a, wall, first = columns.angles, columns.lower, columns.num_entry
+    wide, chamfer = SHOULDER / d.slot_radius, d.mouth_chamfer / d.slot_radius
+    outlines = []
+    for i in range(first, len(a) - 1):
+        outline = [[a[i + 1], 0.0], [a[i + 1], wall[i + 1]], [a[i], wall[i]], [a[i + 1] + wide, BELOW]]
+        if i == first:  # chamfered where the entry begins
+            outline += [[a[i], d.mouth_chamfer], [a[i] + chamfer, 0.0]]
+        else:
+            outline += [[a[i], 0.0], [a[i] - wide, BELOW]]
+        outlines.append(outline + _shoulders(d, a, wall, i, facing=1.0, left=i != first))
+    return outlines
+
+
+def _beside_the_slot(d: BncDimensions) -> list[Outline]:
+    """From where a slot ends to the other one's entry, which is chamfered."""
+    angles, top = slot_columns(d).angles, d.ring_length
+    wide, chamfer = SHOULDER / d.slot_radius, d.mouth_chamfer / d.slot_radius
+    begin, end = angles[-1], np.pi + angles[0]
+    edges = np.linspace(begin, end, 2 + int((end - begin) / WIDEST))
+    outlines = []
+    for left, right in itertools.pairwise(edges):
+        outline = [[left, 0.0], [right, top], [left, top]]
+        if left != begin:
+            outline += [[left - wide, BELOW]]
+        if right == end:
+            outline += [[right - chamfer, 0.0], [right, d.mouth_chamfer]]
+        else:
+            outline += [[right, 0.0], [right + wide, BELOW]]
+        outlines.append(outline)
+    return outlines
+
+
+def _shoulders(d: BncDimensions, a: np.ndarray, wall: np.ndarray, i: int, facing: float, left: bool = True) -> Outline:
+    """Of the edge from column i to i + 1 of a wall that faces up (1) or down (−1): into the solid on both sides."""
+    wide, h = SHOULDER / d.slot_radius, facing * wall
+    slope = (h[i + 1] - h[i]) / (a[i + 1] - a[i])
+    # To the right a wall may fall away below its line; to the left of the line the solid always reaches it.
+    right_surface = min(np.interp(a[i + 1] + wide, a, h), h[i + 1])
+    points = [[a[i + 1] + wide, facing * (min(h[i + 1] + slope * wide, right_surface) - BELOW)]]
+    if left:
+        left_surface = np.interp(a[i] - wide, a, h)
+        points.append([a[i] - wide, facing * (min(h[i] - slope * wide, left_surface) - BELOW)])
+    return points

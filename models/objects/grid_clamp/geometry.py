@@ -1,0 +1,170 @@
+"""A grid clamp with five peg-like heads, and the part of a table's grid that it is clamped to.
+
+Frames. The table's frame G lies in its surface, in the middle hole's centre, z up. The clamp's frame C is the middle
+peg's tip, z up the peg. The clamp has snapped in at X_GC = (0, 0, −`peg_length`), its shoulder on the table.
+
+Contact. Every hole is an open rigid surface that only its own peg may touch: the face around it, a chamfer and a short
+land. Pegs are compliant convex solids with as many sides as their holes, so that few triangles leave the full
+clearance; a wall as deep as the hole would take half of all simulation time. The middle hole also has a lip, and the
+middle peg a soft bead that must squeeze past it: a resistance that grows, falls away, and holds back. The body, a soft
+pad as thick as it can be so that no impact takes it through, may touch only the table's slab.
+
+`python -m guiderail.models.objects.grid_clamp.sdf` writes the files beside this one that a simulator loads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, lathe, strip
+
+MM = 1e-3
+FOLDER = Path(__file__).parent
+CLAMP_SDF = FOLDER / "grid_clamp.sdf"
+TABLE_SDF = FOLDER / "grid_table.sdf"
+NUM_SIDES = 6  # of what touches
+NUM_VISUAL_SIDES = 12
+
+
+@dataclass(frozen=True)
+class GridClampDimensions:
+    """The drawing, in metres. A radius is that of the circle inside the polygon; depths are from the table's face."""
+
+    peg_radius: float = 4.0 * MM
+    peg_length: float = 12.0 * MM  # from the shoulder to the tip
+    peg_chamfer: float = 0.6 * MM
+    spacing: float = 20.0 * MM  # of the four outer pegs from the middle one, along x and along y
+
+    hole_radius: float = 4.15 * MM
+    hole_chamfer: float = 0.5 * MM
+    hole_land: float = 3.0 * MM  # the wall's part that a peg touches: below, the hole is relieved
+    hole_depth: float = 13.0 * MM
+    face_radius: float = 14.0 * MM  # of the part of the table's face that a peg beside its hole stands on
+
+    lip_radius: float = 4.15 * MM
+    lip_depth: float = 0.6 * MM  # where its land begins
+    lip_land: float = 0.4 * MM
+    lip_flank: float = 0.4 * MM  # how far the flanks rise and fall, at 45 degrees
+    bead_radius: float = 4.35 * MM
+    bead_depth: float = 1.5 * MM  # of its crest when the shoulder is on the table
+    bead_entry: float = 1.2 * MM  # length of the flank that meets the lip first
+    bead_exit: float = 0.6 * MM
+
+    shoulder_width: float = 56.0 * MM
+    body_height: float = 8.0 * MM
+    table_width: float = 96.0 * MM
+    table_thickness: float = 14.0 * MM
+
+    @property
+    def clearance(self) -> float:
+        """Between a peg and its hole, on each side."""
+        return round(self.hole_radius - self.peg_radius, 9)
+
+    def with_clearance(self, clearance: float) -> GridClampDimensions:
+        """The same clamp and a table with other holes."""
+        return self if clearance == self.clearance else replace(self, hole_radius=self.peg_radius + clearance)
+
+    @property
+    def peg_positions(self) -> np.ndarray:
+        """Centres (5, 2) of the pegs in C and of the holes in G: the middle one, then the corners."""
+        corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+        return np.concatenate([np.zeros((1, 2)), self.spacing * corners])
+
+    @property
+    def capture_radius(self) -> float:
+        """How far off a peg may be for the chamfers alone to lead it into its hole."""
+        return self.hole_radius - self.peg_radius + self.hole_chamfer + self.peg_chamfer
+
+
+def _around(radius: float) -> float:
+    """Radius of the corners of a polygon around a circle."""
+    return radius / np.cos(np.pi / NUM_SIDES)
+
+
+def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
+    return lathe([(_around(radius), height) for radius, height in profile], NUM_SIDES)
+
+
+def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """What a peg touches: the wall, the chamfer and the face around; its origin is the hole's centre in the face."""
+    d = dimensions
+    return _lathe(
+        [
+            (d.hole_radius, -d.hole_land),
+            (d.hole_radius, -d.hole_chamfer),
+            (d.hole_radius + d.hole_chamfer, 0.0),
+            (d.face_radius, 0.0),
+        ]
+    )
+
+
+def lip_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """What the bead touches: a ring that narrows and widens again; its origin is the middle hole's."""
+    d = dimensions
+    top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
+    return _lathe(
+        [
+            (d.lip_radius + d.lip_flank, bottom - d.lip_flank),
+            (d.lip_radius, bottom),
+            (d.lip_radius, top),
+            (d.lip_radius + d.lip_flank, top + d.lip_flank),
+        ]
+    )
+
+
+def peg_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """A peg, a convex solid; its origin is its tip."""
+    d = dimensions
+    return _lathe(
+        [
+            (0.0, d.peg_length),
+            (d.peg_radius, d.peg_length),
+            (d.peg_radius, d.peg_chamfer),
+            (d.peg_radius - d.peg_chamfer, 0.0),
+            (0.0, 0.0),
+        ]
+    )
+
+
+def bead_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """The bead, a convex solid about the middle peg; its origin is its crest."""
+    d = dimensions
+    return _lathe(
+        [
+            (0.0, d.bead_exit),
+            (d.peg_radius, d.bead_exit),
+            (d.bead_radius, 0.0),
+            (d.peg_radius, -d.bead_entry),
+            (0.0, -d.bead_entry),
+        ]
+    )
+
+
+def slab_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
+    """What one sees of the table: its face, the holes in it and its sides."""
+    d = dimensions
+    angles = 2.0 * np.pi * (np.arange(NUM_VISUAL_SIDES + 1) + 0.5) / NUM_VISUAL_SIDES
+    half_cell, half_table = d.spacing / 2, d.table_width / 2
+    on_cell = half_cell / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
+    bottom, wall, mouth = (
+        cylindrical(radius, angles, height)
+        for radius, height in (
+            (d.hole_radius, -d.hole_depth),
+            (d.hole_radius, -d.hole_chamfer),
+            (d.hole_radius + d.hole_chamfer, 0.0),
+        )
+    )
+    hole = np.concatenate([strip(bottom, wall), strip(wall, mouth), strip(mouth, cylindrical(on_cell, angles, 0.0))])
+    quads = [hole + np.array([x, y, 0.0]) for x, y in d.peg_positions]
+    # Cells without a hole, and the frame around the three by three of them.
+    corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+    sides = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    quads.append(half_cell * corners + d.spacing * sides[:, None])
+    outer, inner = half_table * corners, 3 * half_cell * corners
+    below = outer - [0.0, 0.0, d.table_thickness]
+    quads.append(np.stack([outer, np.roll(outer, -1, axis=0), np.roll(inner, -1, axis=0), inner], axis=1))
+    quads.append(np.stack([below, np.roll(below, -1, axis=0), np.roll(outer, -1, axis=0), outer], axis=1))
+    return TriangleMesh.from_quads(np.concatenate(quads))

@@ -1,0 +1,129 @@
+"""What is poured from, poured into, and poured: a thermos, a mug and table-tennis balls.
+
+A vessel's frame is its tip: the centre of its opening, z out of the opening. Its wall is a ring of boxes, because point
+contact would fill a hollow mesh to its convex hull.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.geometry import AddContactMaterial, Box, Cylinder, ProximityProperties, Shape, Sphere
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import RigidBody, SpatialInertia, UnitInertia
+
+from guiderail.models.common.errors import InputError
+
+WALL_BOXES = 16
+FRICTION = 0.4
+
+
+@dataclass(frozen=True)
+class Vessel:
+    """A round vessel, open at the top."""
+
+    inner_diameter: float  # [m]
+    depth: float  # [m] of the inside
+    wall: float = 0.004  # [m]
+    bottom: float = 0.006  # [m]
+    mass: float = 0.3  # [kg]
+
+    def __post_init__(self) -> None:
+        for name in ("inner_diameter", "depth", "wall", "bottom", "mass"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(f"A vessel's {name} must be positive, not {getattr(self, name)}.")
+
+    @property
+    def outer_radius(self) -> float:
+        """[m] out to the corners of the boxes."""
+        return (self.inner_diameter / 2 + self.wall) / np.cos(np.pi / WALL_BOXES)
+
+    @property
+    def height(self) -> float:
+        """[m] outside."""
+        return self.depth + self.bottom
+
+    @property
+    def inertia(self) -> SpatialInertia:
+        """About the tip, as if it were solid."""
+        centre = np.array([0.0, 0.0, -self.height / 2])
+        solid = UnitInertia.SolidCylinder(self.outer_radius, self.height, np.array([0.0, 0.0, 1.0]))
+        return SpatialInertia(self.mass, centre, solid.ShiftFromCenterOfMass(-centre))
+
+    def boxes(self) -> list[tuple[RigidTransform, Box]]:
+        """The wall, in the tip frame; each box is an inner face wide enough to close the ring."""
+        radius = self.inner_diameter / 2
+        width = 2 * (radius + self.wall) * np.tan(np.pi / WALL_BOXES)
+        boxes = []
+        for angle in 2 * np.pi * np.arange(WALL_BOXES) / WALL_BOXES:
+            R = RotationMatrix.MakeZRotation(angle)
+            centre = R @ np.array([radius + self.wall / 2, 0.0, -self.height / 2])
+            boxes.append((RigidTransform(R, centre), Box(self.wall, width, self.height)))
+        return boxes
+
+    def contains(self, p_TP: np.ndarray, margin: float = 0.0) -> bool:
+        """Whether a point is inside, given in the tip frame [m]; `margin` makes the inside larger."""
+        radius = np.hypot(p_TP[0], p_TP[1])
+        return bool(radius <= self.inner_diameter / 2 + margin and -self.depth - margin <= p_TP[2] <= margin)
+
+
+THERMOS = Vessel(inner_diameter=0.050, depth=0.120, mass=0.5)
+MUG = Vessel(inner_diameter=0.080, depth=0.095)
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A table-tennis ball."""
+
+    diameter: float = 0.040  # [m]
+    mass: float = 0.0027  # [kg]
+    # A stiff ball needs a short plant step; at this stiffness and 2 ms none of them left a vessel through its wall.
+    stiffness: float = 1e3  # [N/m]
+    dissipation: float = 0.5  # [s/m]
+
+
+def contact(stiffness: float | None = None, dissipation: float | None = None) -> ProximityProperties:
+    """What everything here feels like; without a stiffness, as hard as the plant takes for hard."""
+    properties = ProximityProperties()
+    AddContactMaterial(
+        properties=properties,
+        dissipation=dissipation,
+        point_stiffness=stiffness,
+        friction=CoulombFriction(FRICTION, FRICTION),
+    )
+    return properties
+
+
+def add_shape(
+    plant: MultibodyPlant,
+    body: RigidBody,
+    name: str,
+    X_BG: RigidTransform,
+    shape: Shape,
+    color: tuple[float, ...],
+    properties: ProximityProperties | None = None,
+) -> None:
+    """Makes a shape both felt and seen. A plant without a scene graph, a controller's own, has no use for either."""
+    if plant.geometry_source_is_registered():
+        plant.RegisterCollisionGeometry(body, X_BG, shape, name, properties or contact())
+        plant.RegisterVisualGeometry(body, X_BG, shape, f"{name}_visual", np.array(color))
+
+
+def add_vessel(plant: MultibodyPlant, name: str, vessel: Vessel, color: tuple[float, ...]) -> RigidBody:
+    """Adds a vessel as a model of its own; its body's frame is the tip."""
+    body = plant.AddRigidBody(name, plant.AddModelInstance(name), vessel.inertia)
+    parts = [(f"wall_{i}", X, box) for i, (X, box) in enumerate(vessel.boxes())]
+    bottom = Cylinder(vessel.inner_diameter / 2 + vessel.wall / 2, vessel.bottom)
+    parts.append(("bottom", RigidTransform([0.0, 0.0, -vessel.depth - vessel.bottom / 2]), bottom))
+    for part, X_TG, shape in parts:
+        add_shape(plant, body, part, X_TG, shape, color)
+    return body
+
+
+def add_ball(plant: MultibodyPlant, name: str, ball: Ball, color: tuple[float, ...]) -> RigidBody:
+    """Adds a ball that floats freely, as a model of its own."""
+    inertia = SpatialInertia.HollowSphereWithMass(ball.mass, ball.diameter / 2)
+    body = plant.AddRigidBody(name, plant.AddModelInstance(name), inertia)
+    shape = Sphere(ball.diameter / 2)
+    add_shape(plant, body, "ball", RigidTransform(), shape, color, contact(ball.stiffness, ball.dissipation))
+    return body

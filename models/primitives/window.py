@@ -1,0 +1,227 @@
+"""One step of an LC-NS-KMP: everything that depends on the window alone, computed once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from guiderail.models.primitives.features import WindowFeatures
+from guiderail.models.primitives.qp import Solver, solve_least_norm
+
+# Directions of the constraint rows (of unit length) below this are rounding: they would only make the QP larger.
+_NEGLIGIBLE = 1e-13
+
+
+@dataclass(frozen=True)
+class Window:
+    """What is known about the executed point (the first) and the horizon behind it.
+
+    Attributes:
+        means: (H+1, O).
+        covariances: (H+1, O, O), positive definite.
+        G, c: (H+1, F, O) and (H+1, F), constraints G y ≥ c.
+    """
+
+    means: np.ndarray
+    covariances: np.ndarray
+    G: np.ndarray
+    c: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """The whole window as a function of x = [history, null-space action], where no constraint is active.
+
+    y = L (latent_mean + latent_map x) + direct_map history, and a correction v moves it by L v.
+    """
+
+    whiten: np.ndarray  # Σ^(-1/2), (H+1, O, O)
+    Lw: np.ndarray  # Σ^(-1/2) L
+    L: np.ndarray
+    latent_mean: np.ndarray
+    latent_map: np.ndarray
+    direct_map: np.ndarray
+
+    def rows(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The map (n, PO+O) and the offset (n,) that give the rows `at` of y from x."""
+        map_ = self.L[at] @ self.latent_map
+        map_[:, : self.direct_map.shape[1]] += self.direct_map[at]
+        return map_, self.L[at] @ self.latent_mean
+
+
+class StepFactor:
+    """The factored problem 4.5 of one window, in terms of x = [history, null-space action].
+
+    With y = W̄h + F̄w for weights w of unit prior, problem 4.5 is a regularized least-squares problem in w; its QR
+    factor gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ directly, without ever forming Σ⁻¹ or K⁻¹ (equation 4.12, read in weights).
+    The window is then linear in x, and the executed point and the constrained directions are rows of it. Only those
+    rows are kept: the rest of the window is solved for again when somebody wants to look at it.
+
+    Attributes:
+        output_map, output_offset: (O, PO+O) and (O,), the executed point from x.
+        constraint_map, lower, upper: (m, PO+O), (m,), (m,): constrained directions from x, and their bounds, each in
+            units of how far its direction can move.
+        constraint_rows: (m, r), unit rows that a correction v moves those directions by.
+        correction_map: (O, r), what v does to the executed point.
+    """
+
+    def __init__(self, window: Window, features: WindowFeatures, lambda_: float, beta: float):
+        self._window, self._features, self._hbar, self._beta = window, features, lambda_ + beta, beta
+        outputs = window.means.shape[1]
+        solution = self._solve()
+        self.output_map, self.output_offset = solution.rows(np.arange(outputs))
+        self._factor_constraints(solution)
+
+    def _solve(self) -> _Solution:
+        steps, outputs = self._window.means.shape
+        # Columns of F̄ = F ⊗ I are ordered (feature, output); rows (step, output).
+        F, W = self._features.features, self._features.history_map
+        rank, past = F.shape[1], W.shape[1]
+        whiten = np.linalg.inv(np.linalg.cholesky(self._window.covariances))
+        whitened = np.einsum("jk,joi->joki", F, whiten).reshape(steps * outputs, rank * outputs)
+        R = np.linalg.qr(np.vstack([whitened, np.sqrt(self._hbar) * np.eye(rank * outputs)]), mode="r")
+        eye = np.eye(outputs)
+        F_bar = np.einsum("jk,oi->joki", F, eye).reshape(steps * outputs, rank * outputs)
+        # Lw = Σ^(-1/2) L. L follows from the features, not from Σ^(1/2) Lw: the former is exact where Σ is tiny.
+        L = solve_triangular(R, F_bar.T, trans="T", check_finite=False).T
+        Lw = solve_triangular(R, whitened.T, trans="T", check_finite=False).T
+        # Data terms: L Lᵀ Σ⁻¹ μ of the means, and W̄ − L Lᵀ Σ⁻¹ W̄ of the history.
+        whitened_means = np.einsum("joi,ji->jo", whiten, self._window.means).ravel()
+        whitened_map = np.einsum("jp,joi->jopi", W, whiten).reshape(steps * outputs, past * outputs)
+        return _Solution(
+            whiten=whiten,
+            Lw=Lw,
+            L=L,
+            latent_mean=Lw.T @ whitened_means,
+            latent_map=np.concatenate([-Lw.T @ whitened_map, self._beta * L[:outputs].T], axis=1),
+            direct_map=np.einsum("jp,oi->jopi", W, eye).reshape(steps * outputs, past * outputs),
+        )
+
+    def _factor_constraints(self, solution: _Solution) -> None:
+        window = self._window
+        steps, outputs = window.means.shape
+        self._directions = directions, first, second = _pair_opposites(window.G)
+        D = window.G[:, directions].reshape(-1, outputs)
+        lower = np.where(first >= 0, window.c[:, first], -np.inf)
+        upper = np.where(second >= 0, -window.c[:, second], np.inf)
+
+        y_map, y_offset = solution.rows(np.arange(steps * outputs))
+        at = np.repeat(np.arange(steps), len(directions))
+        A = np.einsum("mo,mor->mr", D, solution.L.reshape(steps, outputs, -1)[at])
+        size = np.linalg.norm(A, axis=1)
+        self._scale = 1 / np.where(size > 0, size, 1)
+        A = A * self._scale[:, None]
+        offset = np.einsum("mo,mo->m", D, y_offset.reshape(steps, outputs)[at])
+        self.lower, self.upper = ((bound.ravel() - offset) * self._scale for bound in (lower, upper))
+        y_map = y_map.reshape(steps, outputs, -1)[at]
+        self.constraint_map = np.ascontiguousarray(np.einsum("mo,mox,m->mx", D, y_map, self._scale))
+        if len(A):
+            U, s, Vt = np.linalg.svd(A, full_matrices=False)
+            keep = s > _NEGLIGIBLE * s[0]
+            self._basis = np.ascontiguousarray(Vt[keep].T)
+            self.constraint_rows = np.ascontiguousarray(U[:, keep] * s[keep])
+        else:
+            self._basis, self.constraint_rows = np.zeros((A.shape[1], 0)), A[:, :0]
+        self.correction_map = solution.L[:outputs] @ self._basis
+
+    def correct(self, free: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
+        """The least-norm correction v of a window whose constrained directions come out as `free` (m,).
+
+        Returns:
+            v (r,), such that the executed point moves by `correction_map @ v`, and the solver's multipliers (m,).
+
+        Raises:
+            UnsolvableError: if the solver finds none.
+        """
+        return solve_least_norm(self.constraint_rows, self.lower - free, self.upper - free, solver)
+
+    def output_sizes(self) -> np.ndarray:
+        """How far a correction of size one can move each output of the executed point at most, (O,)."""
+        return np.linalg.norm(self._solve().L[: self._window.means.shape[1]], axis=1)
+
+    def multipliers(self, signed: np.ndarray) -> np.ndarray:
+        """α (H+1, F) ≥ 0 of the solver's (m,), which are positive at an upper and negative at a lower bound."""
+        directions, first, second = self._directions
+        signed = (signed * self._scale).reshape(-1, len(directions))
+        alpha = np.zeros(self.multipliers_shape)
+        alpha[:, first[first >= 0]] = np.maximum(-signed[:, first >= 0], 0)
+        alpha[:, second[second >= 0]] = np.maximum(signed[:, second >= 0], 0)
+        return alpha
+
+    def violation(self, output: np.ndarray) -> float:
+        """max(c − G y) of an output (O,) at the executed point; there is at least one constraint."""
+        return float((self._window.c[0] - self._window.G[0] @ output).max())
+
+    def trajectory(self, x: np.ndarray, v: np.ndarray | None) -> np.ndarray:
+        """The whole window (H+1, O), corrected by v if given."""
+        solution = self._solve()
+        latent = solution.latent_mean + solution.latent_map @ x
+        if v is not None:
+            latent = latent + self._basis @ v
+        y = solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]
+        return y.reshape(self._window.means.shape)
+
+    def modified(self, x: np.ndarray, wish: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray | None]:
+        """The window under null-space actions at several points: equation 4.18 with its multipliers of 4.17.
+
+        Args:
+            x: [history, null-space action], the action zero.
+            wish: (H+1, O), what the actions ask for at every point, K̂ K̲⁻¹ ξ̂ given the history.
+            solver: for the constraints.
+
+        Returns:
+            The window (H+1, O), and the solver's multipliers (m,), None where every constraint is slack.
+
+        Raises:
+            UnsolvableError: if the solver finds no correction.
+        """
+        solution = self._solve()
+        # β/ħ (K̂ − K A K̂) K̲⁻¹ ξ̂: what is wished for, less what the demonstrations' covariance does not let through.
+        whitened = np.einsum("joi,ji->jo", solution.whiten, wish).ravel()
+        pull = self._beta / self._hbar * (wish - (solution.L @ (solution.Lw.T @ whitened)).reshape(wish.shape))
+        latent = solution.latent_mean + solution.latent_map @ x
+        y = (solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]).reshape(wish.shape) + pull
+        along = np.einsum("jmo,jo->jm", self._window.G[:, self._directions[0]], pull).ravel() * self._scale
+        free = self.constraint_map @ x + along
+        if (free >= self.lower).all() and (free <= self.upper).all():
+            return y, None
+        v, signed = self.correct(free, solver)
+        return y + (solution.L @ (self._basis @ v)).reshape(wish.shape), signed
+
+    def worst_violation(self, trajectory: np.ndarray) -> float:
+        """max(c − G y) over a whole window (H+1, O); −inf where there is no constraint."""
+        short = self._window.c - np.einsum("nfo,no->nf", self._window.G, trajectory)
+        return float(short.max(initial=-np.inf))
+
+    @property
+    def multipliers_shape(self) -> tuple[int, int]:
+        """(H+1, F)."""
+        return self._window.c.shape
+
+    @property
+    def nbytes(self) -> int:
+        """What keeping this step costs [bytes]."""
+        arrays = (*vars(self).values(), self._window.means, self._window.covariances)
+        return sum(value.nbytes for value in arrays if isinstance(value, np.ndarray))
+
+
+def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which rows of G (n, F, O) are each other's negative at every step: a box then costs one row a side pair.
+
+    Returns:
+        For each direction: the row of G that it is, the row whose bound is its lower bound, and the row whose bound is
+        its upper bound (−1: none).
+    """
+    directions, first, second = [], [], []
+    taken: set[int] = set()
+    for f in range(G.shape[1]):
+        if f in taken:
+            continue
+        opposite = next(
+            (k for k in range(f + 1, G.shape[1]) if k not in taken and np.array_equal(G[:, k], -G[:, f])), -1
+        )
+        taken |= {f, opposite}
+        directions.append(f)
+        first.append(f)
+        second.append(opposite)
+    return np.array(directions, dtype=int), np.array(first, dtype=int), np.array(second, dtype=int)

@@ -1,0 +1,110 @@
+"""A skill's state machine, drawn: as Graphviz text for those who have it, as a picture for everyone."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.templates.template import Skill, SkillState
+
+
+def state_lines(state: SkillState) -> list[str]:
+    """What a state does, one short line a mapping, constraint and distance, in the order they apply."""
+    mappings = [f"{type(m).__name__} ← {', '.join(f'u{i + 1}' for i in m.used_inputs)}" for m in state.input_mapping]
+    constraints = [f"{i + 1}. {type(c).__name__}" for i, c in enumerate(state.active_constraints)]
+    return [*mappings, *constraints, f"d: {type(state.transition_distance).__name__}"]
+
+
+def edges(skill: Skill) -> list[tuple[str, str, str]]:
+    """(from, to, condition) of every transition, the ways back included."""
+    arrows = []
+    for state in skill.states:
+        unit = state.transition_distance.unit
+        scale = 1.0 if unit == "m" else 57.29577951308232
+        for transition in state.transitions:
+            arrows.append((state.name, transition.to, f"d < {scale * transition.below:.3g} {unit}"))
+            if transition.hysteresis is not None:
+                back = scale * (transition.below + transition.hysteresis)
+                arrows.append((transition.to, state.name, f"d({state.name}) > {back:.3g} {unit}"))
+    return arrows
+
+
+def to_dot(skill: Skill) -> str:
+    """The state machine in Graphviz's language."""
+    lines = [f"digraph {_quoted(skill.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
+    for number, state in enumerate(skill.states):
+        label = "\n".join([state.name.upper(), *state_lines(state)])
+        emphasis = ", penwidth=2" if number == skill.initial_state else ""
+        lines.append(f"  {_quoted(state.name)} [label={_quoted(label)}{emphasis}];")
+    lines += [f"  {_quoted(start)} -> {_quoted(end)} [label={_quoted(said)}];" for start, end, said in edges(skill)]
+    return "\n".join([*lines, "}"]) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """A name or a label in Graphviz's language, whatever a person called their states."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    return f'"{escaped}"'
+
+
+def draw(skill: Skill, path: str | Path) -> None:
+    """Writes the state machine to a file: .dot or .gv as text, .png, .svg or .pdf as a picture."""
+    path = Path(path)
+    if path.suffix in (".dot", ".gv"):
+        path.write_text(to_dot(skill), encoding="utf-8")
+        return
+    if path.suffix not in (".png", ".svg", ".pdf"):
+        raise InputError(f"A state machine can't be drawn as {path.suffix or 'that'}; use .png, .svg, .pdf or .dot.")
+    drawn(skill).savefig(path, dpi=120)
+
+
+def drawn(skill: Skill) -> "Figure":
+    """The state machine as a Matplotlib figure, which a notebook shows."""
+    from matplotlib.figure import Figure
+
+    width, gap = 1.8, 1.7
+    tallest = max(len(state_lines(state)) for state in skill.states)
+    size = (len(skill.states) * (width + gap) + 0.4, 0.2 * tallest + 1.0)
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_axis_off()
+    axes.set_xlim(-width / 2 - 0.2, (len(skill.states) - 1) * (width + gap) + width / 2 + 0.2)
+    axes.set_ylim(-1.4, 1.4)
+    plain: Any = {"parse_math": False}  # a name with a dollar is a name
+    where = {state.name: i * (width + gap) for i, state in enumerate(skill.states)}
+    for number, state in enumerate(skill.states):
+        box = {
+            "boxstyle": "round,pad=0.5",
+            "facecolor": "#eef3f8",
+            "edgecolor": "#33506b",
+            "linewidth": 2.2 if number == skill.initial_state else 1.0,
+        }
+        text = "\n".join([state.name.upper(), *state_lines(state)])
+        axes.text(
+            where[state.name], 0.0, text, ha="center", va="center", fontsize=8, linespacing=1.4, bbox=box, **plain
+        )
+    for start, end, condition in edges(skill):
+        forward = where[end] > where[start]
+        side = 1.0 if forward else -1.0
+        y = 0.25 * side
+        left, right = (start, end) if forward else (end, start)
+        span = (where[left] + width / 2, where[right] - width / 2)
+        axes.annotate(
+            "",
+            xy=(span[1] if forward else span[0], y),
+            xytext=(span[0] if forward else span[1], y),
+            arrowprops={"arrowstyle": "-|>", "color": "#33506b"},
+        )
+        axes.annotate(
+            condition,
+            xy=(sum(span) / 2, y),
+            xytext=(0, 4 * side),
+            textcoords="offset points",
+            ha="center",
+            va="bottom" if forward else "top",
+            fontsize=8,
+            color="#33506b",
+        )
+    axes.set_title(f"{skill.name}: {skill.inputs} inputs", fontsize=10, **plain)
+    return figure

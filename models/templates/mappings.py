@@ -1,0 +1,192 @@
+"""Input mappings: what a person's or a policy's few inputs move (thesis, equations 2.19 and 2.20)."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from guiderail.models.templates.geometry import WORLD, Frames, about, bearing, position_in, tilt_axis
+from guiderail.models.templates.kinds import INPUT_MAPPINGS, interpolate, register, require, require_three
+
+TOOL = "tool"
+
+
+class InputMapping(ABC):
+    """map_q of equation 2.19 for some of the inputs.
+
+    A displacement ΔH is a RigidTransform whose translation is added to p_WE and whose rotation is applied to R_WE
+    from the left, that is about the end effector's origin and expressed in the world.
+    """
+
+    @abstractmethod
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
+        """ΔH during one period, from all of the skill's inputs, each in [−1, 1]."""
+
+    @property
+    @abstractmethod
+    def used_inputs(self) -> tuple[int, ...]:
+        """Which inputs it listens to."""
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """The objects' frames it needs."""
+        frame = getattr(self, "frame", WORLD)
+        return () if frame in (WORLD, TOOL) else (frame,)
+
+
+def axes_in_world(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
+    """R_WF, its columns the axes of `frame`, which may be `world`, `tool` or an object's."""
+    if frame == WORLD:
+        return np.eye(3)
+    return (X_WE if frame == TOOL else frames[frame]).rotation().matrix()
+
+
+def _require_axes(inputs: tuple[int, ...], axes: tuple[tuple[float, ...], ...]) -> None:
+    require(len(inputs) == len(axes) > 0, f"{len(inputs)} inputs need as many axes, and at least one, not {len(axes)}.")
+    for axis in axes:
+        require_three(axis, "an axis")
+        require(np.any(axis), "an axis must not be all zero.")
+
+
+def _require_object(frame: str) -> None:
+    require(frame != TOOL, "frame must be an object's, not the tool's own.")
+
+
+@register(INPUT_MAPPINGS, "translation")
+@dataclass(frozen=True)
+class Translation(InputMapping):
+    """Each input moves the end effector along one axis of a frame (`world`, `tool`, or an object's).
+
+    A full input means `speed_m_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    """
+
+    inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
+    speed_m_per_s: float  # at full input
+    frame: str = WORLD  # in which axes are given: an object's, `world` or `tool`
+    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one for each input
+
+    def __post_init__(self) -> None:
+        _require_axes(self.inputs, self.axes)
+        require(self.speed_m_per_s > 0, f"speed_m_per_s must be positive, not {self.speed_m_per_s}.")
+
+    @property
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.inputs
+
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
+        v_FE = self.speed_m_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
+        return RigidTransform(RotationMatrix(), axes_in_world(self.frame, X_WE, frames) @ v_FE * period_s)
+
+
+@register(INPUT_MAPPINGS, "rotation")
+@dataclass(frozen=True)
+class Rotation(InputMapping):
+    """Each input turns the end effector about one axis of a frame (`world`, `tool`, or an object's).
+
+    A full input means `speed_rad_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    """
+
+    inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
+    speed_rad_per_s: float  # at full input
+    frame: str = WORLD  # in which axes are given: an object's, `world` or `tool`
+    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one for each input
+
+    def __post_init__(self) -> None:
+        _require_axes(self.inputs, self.axes)
+        require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
+
+    @property
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.inputs
+
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
+        w_FE = self.speed_rad_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
+        turn = axes_in_world(self.frame, X_WE, frames) @ w_FE * period_s
+        angle = float(np.linalg.norm(turn))
+        return RigidTransform(RotationMatrix() if angle == 0 else about(turn / angle, angle), np.zeros(3))
+
+
+@register(INPUT_MAPPINGS, "tilt_towards")
+@dataclass(frozen=True)
+class TiltTowards(InputMapping):
+    """Two inputs, a horizontal vector in the frame, are projected on the direction to it: tilt follows that scalar."""
+
+    inputs: tuple[int, ...]  # numbers of two inputs, from 0
+    speed_rad_per_s: float  # at full input
+    frame: str  # an object's: tilted towards it
+
+    def __post_init__(self) -> None:
+        _require_object(self.frame)
+        require(len(self.inputs) == 2, f"tilt_towards needs two inputs, x and y, not {len(self.inputs)}.")
+        require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
+
+    @property
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.inputs
+
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
+        p_FE = position_in(self.frame, X_WE, frames)
+        along = float(np.clip(inputs[list(self.inputs)] @ bearing(p_FE)[:2], -1.0, 1.0))
+        axis_W = axes_in_world(self.frame, X_WE, frames) @ tilt_axis(p_FE)
+        return RigidTransform(about(axis_W, along * self.speed_rad_per_s * period_s), np.zeros(3))
+
+
+@register(INPUT_MAPPINGS, "scaled")
+@dataclass(frozen=True)
+class Scaled(InputMapping):
+    """Another mapping, its inputs multiplied by a factor that depends on the distance to a frame: slower when near."""
+
+    frame: str  # an object's, to which the distance is
+    distance_m: tuple[float, ...]  # increasing
+    factor: tuple[float, ...]  # in [0, 1], one for each distance, linear in between
+    of: InputMapping  # the mapping, as an entry of its own
+
+    def __post_init__(self) -> None:
+        _require_object(self.frame)
+        require(
+            len(self.distance_m) == len(self.factor) >= 1 and np.all(np.diff(self.distance_m) > 0),
+            "distance_m must increase, with one factor for each distance.",
+        )
+        require(min(self.factor) >= 0 and max(self.factor) <= 1, "every factor must be between 0 and 1.")
+
+    @property
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.of.used_inputs
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        return (*super().frame_names, *self.of.frame_names)
+
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
+        distance = float(np.linalg.norm(position_in(self.frame, X_WE, frames)))
+        factor = interpolate(distance, self.distance_m, self.factor)
+        return self.of.displacement(factor * inputs, X_WE, frames, period_s)
+
+
+@register(INPUT_MAPPINGS, "uneven")
+@dataclass(frozen=True)
+class Uneven(InputMapping):
+    """Another mapping, its inputs above and below zero multiplied by factors: one way slower than the other.
+
+    Zero still is to stand still, but inputs without a preference lead the faster way on average: what explores at
+    random otherwise walks away from a goal as often as towards it.
+    """
+
+    above: float  # in (0, 1]
+    below: float  # in (0, 1]
+    of: InputMapping  # the mapping, as an entry of its own
+
+    def __post_init__(self) -> None:
+        require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")
+
+    @property
+    def used_inputs(self) -> tuple[int, ...]:
+        return self.of.used_inputs
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        return self.of.frame_names
+
+    def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
+        return self.of.displacement(np.where(inputs < 0.0, self.below, self.above) * inputs, X_WE, frames, period_s)

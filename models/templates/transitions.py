@@ -1,0 +1,106 @@
+"""Transition distances: how far it is to the end of a state (thesis, section 2.3)."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from guiderail.models.templates.constraints import TiltLimits, axes
+from guiderail.models.templates.geometry import WORLD, Frames, angle_between, position_in, rotation_deg
+from guiderail.models.templates.kinds import TRANSITION_DISTANCES, register, require, require_three
+
+
+class TransitionDistance(ABC):
+    """d_t: decreases monotonically as the task gets on, in metres or in radians."""
+
+    unit: str = "m"  # or "deg": the unit of the thresholds in the file; values are in m or rad
+
+    @abstractmethod
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
+        """The distance at X_WE, [m] or [rad]."""
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """The objects' frames it needs."""
+        frame = getattr(self, "frame", WORLD)
+        return () if frame == WORLD else (frame,)
+
+
+@register(TRANSITION_DISTANCES, "distance")
+@dataclass(frozen=True)
+class Distance(TransitionDistance):
+    """‖p_FE‖, from the end effector's origin to a point of F."""
+
+    frame: str  # F: an object's, or `world`
+    point_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # in F
+
+    def __post_init__(self) -> None:
+        require_three(self.point_m, "point_m")
+
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
+        p_PE = position_in(self.frame, X_WE, frames) - self.point_m
+        return math.sqrt(p_PE @ p_PE)
+
+
+@register(TRANSITION_DISTANCES, "height")
+@dataclass(frozen=True)
+class Height(TransitionDistance):
+    """z of p_FE: how high above F."""
+
+    frame: str  # F: an object's, or `world`
+
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
+        return float(position_in(self.frame, X_WE, frames)[2])
+
+
+@register(TRANSITION_DISTANCES, "axis_distance")
+@dataclass(frozen=True)
+class AxisDistance(TransitionDistance):
+    """How far the end effector's origin is from F's z axis."""
+
+    frame: str  # F: an object's, or `world`
+
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
+        return float(np.hypot(*position_in(self.frame, X_WE, frames)[:2]))
+
+
+@register(TRANSITION_DISTANCES, "tilt_to_go")
+@dataclass(frozen=True)
+class TiltToGo(TransitionDistance):
+    """What is missing of the tilt `until_deg` towards F's z axis."""
+
+    frame: str  # F: an object's, or `world`
+    until_deg: float  # the tilt at which nothing is missing
+    rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
+    turns_along: bool = False  # as in the constraint on the tilt
+    unit = "deg"
+
+    def __post_init__(self) -> None:
+        require_three(self.rpy_deg, "rpy_deg")
+        require(-180 <= self.until_deg <= 180, f"until_deg must be between −180 and 180, not {self.until_deg}.")
+
+    @cached_property
+    def _any_tilt(self) -> TiltLimits:
+        return TiltLimits(self.frame, -180.0, 180.0, self.rpy_deg, self.turns_along)
+
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
+        return math.radians(self.until_deg) - self._any_tilt.tilt(X_WE, frames)
+
+
+@register(TRANSITION_DISTANCES, "rotation_to_go")
+@dataclass(frozen=True)
+class RotationToGo(TransitionDistance):
+    """The angle between the end effector's orientation and a given one."""
+
+    rpy_deg: tuple[float, ...]  # the given orientation, R_FE
+    frame: str = WORLD  # F: an object's, or `world`
+    unit = "deg"
+
+    def __post_init__(self) -> None:
+        require_three(self.rpy_deg, "rpy_deg")
+
+    def value(self, X_WE: RigidTransform, frames: Frames) -> float:
+        return angle_between(X_WE.rotation(), axes(self.frame, frames).multiply(rotation_deg(self.rpy_deg)))

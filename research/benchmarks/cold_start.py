@@ -1,0 +1,97 @@
+"""From the start of the command to a learned policy: `guiderail bench cold_start`.
+
+Each run is `guiderail train` in a process of its own, timed from its start to its end, everything that it imports,
+saves and draws included; then its policy is judged in held-out episodes, which do not count. Both kinds of one seed run
+one after the other, so that their ratio is of one machine in one state. The seeds chose nothing.
+"""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.evaluate import evaluate_run
+from guiderail.tools.evaluation.rollout import as_learned
+from guiderail.tools.learning.run_folder import RunFolder
+from research.benchmarks import told
+
+TASK = "BncConnector"
+ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "uncertainty": "calibration"}
+EPISODES = 20  # seeds 30 to 34 have converged after at most 10
+SEEDS = range(400, 405)
+HELD_OUT = 100
+KINDS = {"one after the other": "false", "acting while it learns": "true"}  # the setting `pipelined`
+REQUIRED_MEDIAN, REQUIRED_WORST = 60.0, 120.0  # [s]
+
+
+def measure(
+    task: str | None = None,
+    environment: Mapping[str, Any] | None = None,
+    imports: Sequence[str] = (),
+    *,
+    episodes: int = EPISODES,
+    seeds: range = SEEDS,
+    held_out: int = HELD_OUT,
+) -> dict[str, Any]:
+    """Seconds of each run, and how often its policy succeeds.
+
+    Args:
+        task: what is learned.
+        environment: its options; the connector's with a hidden offset per run unless any is given.
+        imports: modules or files that register the task, where nothing installed does.
+        episodes: how many are learned from.
+        seeds: of the runs.
+        held_out: how many episodes judge a policy.
+
+    Raises:
+        InputError: if a run fails.
+    """
+    options = environment or (ENVIRONMENT if task in (None, TASK) else {})
+    task = task or TASK
+    runs = []
+    with tempfile.TemporaryDirectory() as folder:
+        for seed, kind in told([(seed, kind) for seed in seeds for kind in KINDS], "run"):
+            out = Path(folder) / f"{seed}-{KINDS[kind]}"
+            seconds = _train(task, options, episodes, seed, KINDS[kind], out, imports)
+            judged = evaluate_run(RunFolder(out).config(), partial(as_learned, Policy.load(out)), episodes=held_out)
+            success = float((judged["termination"] == "success").mean())
+            runs.append({"kind": kind, "seed": seed, "seconds": seconds, "success_rate": success})
+    return {"task": task, "environment": dict(options), "episodes": episodes, "held_out": held_out, "runs": runs}
+
+
+def _train(
+    task: str, options: Mapping[str, Any], episodes: int, seed: int, pipelined: str, out: Path, imports: Sequence[str]
+) -> float:
+    words = [sys.executable, "-c", "from guiderail.tools.cli.main import main; main()", "train", task, "--json"]
+    words += ["--episodes", str(episodes), "--seed", str(seed), "--set", f"pipelined={pipelined}", "--out", str(out)]
+    for name, value in options.items():
+        words += ["--env", f"{name}={value}"]
+    for module in imports:
+        words += ["--import", module]
+    start = time.perf_counter()
+    ended = subprocess.run(words, capture_output=True, text=True)
+    seconds = time.perf_counter() - start
+    if ended.returncode:
+        raise InputError(f"a run failed: {ended.stderr.strip().splitlines()[-1]}")
+    return seconds
+
+
+def show(result: dict[str, Any]) -> None:
+    """Prints each run, and the median and worst of each kind beside what was asked for."""
+    print(f"{result['task']}, {result['episodes']} episodes, from the command's start to its end")
+    for kind in KINDS:
+        runs = [run for run in result["runs"] if run["kind"] == kind]
+        seconds = [run["seconds"] for run in runs]
+        print(f"{kind}: median {statistics.median(seconds):.1f} s, worst {max(seconds):.1f} s")
+        for run in runs:
+            print(f"  seed {run['seed']}: {run['seconds']:.1f} s, {run['success_rate']:.0%} of {result['held_out']}")
+    print(f"asked of the connector with a hidden offset: {REQUIRED_MEDIAN:.0f} s, {REQUIRED_WORST:.0f} s")

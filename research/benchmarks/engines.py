@@ -1,0 +1,186 @@
+"""`guiderail bench engines`: the same scripted motions in Drake and in MuJoCo, and what a plug on the rim feels."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.envs.recording import DrivenStation, along, drive_along
+from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
+from guiderail.diagrams.tasks.bnc_connector.options import HARD
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.units import MM
+from guiderail.models.control.wrench import contact_lever
+from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from guiderail.models.objects.bnc_connector.motion import poses
+from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
+from guiderail.systems.recorder import Recording
+from guiderail.tools.visualization.style import legend, new_figure, save_figure
+from research.benchmarks import told
+from research.benchmarks.simulation import scripted_motion
+
+ENGINES = {"Drake": "rails", "MuJoCo": "mujoco"}
+COLOURS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
+TASKS = ("BncConnector", "GridClamp")
+OFFSETS = (0.8, 1.25, 2.0, 3.0)  # [mm], of a plug on the rim
+MODULI = (0.01, 0.1, 1.0, 10.0)  # times the contact's own, in Drake
+PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
+LEAST_FORCE = 0.5  # [N] below which a lever says nothing
+NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
+IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that has dropped in, and an offset from which none does
+HALVINGS = 6  # of that offset
+AROUND, SPEEDS = 3.0 * MM, (0.003, 0.02, 0.04)  # circle about the jack on which a plug slides over the rim [m, m/s]
+CAPTURES = {  # station, and whether Drake's polygons have their circles' areas
+    "Drake": ("rails", False),
+    "Drake, equal areas": ("rails", True),
+    "MuJoCo": ("mujoco", False),
+}
+CONTACTS = {  # station, step [s] and margin [m]
+    "Drake, 10 ms": ("rails", PLANT_PERIOD, MARGIN),
+    "Drake, 2.5 ms": ("rails", PLANT_PERIOD / 4, MARGIN),
+    "Drake, 2.5 ms, no margin": ("rails", PLANT_PERIOD / 4, 0.0),
+    "MuJoCo": ("mujoco", PLANT_PERIOD, MARGIN),
+}
+
+
+def measure() -> dict[str, Any]:
+    """Force profiles and real-time factors of both engines, by one process's CPU time, and the rim's levers."""
+    jobs = [(task, engine) for task in TASKS for engine in ENGINES]
+    profiles = {f"{task} {engine}": _profile(task, ENGINES[engine]) for task, engine in told(jobs, "motion")}
+    pressed = [("Drake", modulus) for modulus in MODULI] + [("MuJoCo", 1.0)]
+    levers = {
+        f"{engine}, modulus × {modulus:g}" if engine == "Drake" else engine: [
+            _lever(ENGINES[engine], offset * MM, modulus) / MM for offset in OFFSETS
+        ]
+        for engine, modulus in told(pressed, "rim")
+    }
+    levers["two points, rigid"] = [rigid_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
+    levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
+    captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
+    captures |= {engine: _capture(*how) / MM for engine, how in told(CAPTURES.items(), "capture")}
+    drags = {contact: [drag(*how, speed) for speed in SPEEDS] for contact, how in told(CONTACTS.items(), "drag")}
+    measured = {"levers_mm": levers, "captures_mm": captures, "drags": drags}
+    return {"profiles": profiles, "offsets_mm": list(OFFSETS), **measured}
+
+
+def rigid_lever(d: BncDimensions, offset: float) -> float:
+    """From the plug's axis to where two rigid bodies that tilt meet: the chord of their overlap [m]."""
+    mouth = d.bore_radius + d.mouth_chamfer
+    return float((mouth**2 + offset**2 - d.barrel_radius**2) / (2.0 * offset))
+
+
+def even_lever(d: BncDimensions, offset: float) -> float:
+    """From the plug's axis to the middle of the area where mouth and barrel overlap [m]."""
+    x, y = np.meshgrid(*(np.linspace(-d.ring_radius, d.ring_radius, 1401),) * 2)
+    inside = (np.hypot(x, y) > d.bore_radius + d.mouth_chamfer) & (np.hypot(x, y) < d.ring_radius)
+    inside &= np.hypot(x - offset, y) < d.barrel_radius
+    return float(x[inside].mean())
+
+
+def _profile(task: str, station: str) -> dict[str, Any]:
+    workcell, times, motion, _ = scripted_motion(task)
+    driven = DrivenStation(
+        STATIONS.get(station).build(workcell), along(times, motion), round(times[-1] / CONTROL_PERIOD)
+    )
+    driven.start(motion[0])
+    begin = time.process_time()
+    recording = driven.run()
+    spent = time.process_time() - begin
+    return {
+        "real_time_factor": float(times[-1] / spent),
+        "time": (CONTROL_PERIOD * np.arange(len(recording["pose"]))).tolist(),
+        "height_mm": (recording["pose"][:, 2] / MM).tolist(),
+        "push_n": recording["wrench"][:, 2].tolist(),
+        "torque_nm": recording["wrench"][:, 5].tolist(),
+        "peak_force_n": float(recording["contact_force"].max()),
+    }
+
+
+def _lever(name: str, offset: float, modulus: float) -> float:
+    """From the plug's axis to where the rim pushes, at rest on it beside the barrel [m]."""
+    recording = _pressed(name, BncWorkcell(), offset, modulus)
+    return float(np.linalg.norm(contact_lever(recording["wrench"][-10:].mean(axis=0), LEAST_FORCE)))
+
+
+def _capture(name: str, equal_area: bool = False) -> float:
+    """How far beside the jack a plug may be pressed on it that still drops in [m]."""
+    near, far = 0.0, FARTHEST
+    for _ in range(HALVINGS):
+        middle = 0.5 * (near + far)
+        workcell = BncWorkcell(NARROW, equal_area=equal_area)
+        dropped = _pressed(name, workcell, middle)["pose"][-1, 2] < IN
+        near, far = (middle, far) if dropped else (near, middle)
+    return near
+
+
+def drag(station: str, time_step: float, margin: float, speed: float) -> float:
+    """Drag over push of a plug that slides over a sharp rim: the friction that it feels."""
+    workcell = BncWorkcell(NARROW, margin=margin)
+    down = poses(np.array([11.0 * MM, PRESSED]), np.pi / 2)
+    times = np.concatenate([[0.0], np.linspace(0.6, 1.4, 81)])
+    motion = np.concatenate([down[:1], np.tile(down[1], (81, 1))])
+    angles = speed / AROUND * np.maximum(times - 0.6, 0.0)
+    motion[:, :2] += AROUND * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    built = STATIONS.get(station).build(workcell, time_step=time_step)
+    wrench = drive_along(built, times, motion)[1]["wrench"][45:]
+    wrench = wrench[wrench[:, 2] > LEAST_FORCE]
+    return float(np.median(np.linalg.norm(wrench[:, :2], axis=1) / wrench[:, 2]))
+
+
+def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1.0) -> Recording:
+    """A plug that is pressed on a jack that is this far beside it [m]."""
+    motion = poses(np.array([11.0 * MM, PRESSED, PRESSED]), np.pi / 2)
+    station = STATIONS.get(name).build(workcell)
+    times = np.array([0.0, 0.6, 1.4])
+    driven = DrivenStation(station, along(times, motion), round(times[-1] / CONTROL_PERIOD))
+    workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform([offset, 0.0, 0.0]))
+    if modulus != 1.0:
+        station.set_contact(driven.context, 1.0, modulus)
+    driven.start(motion[0])
+    return driven.run()
+
+
+def show(results: dict[str, Any]) -> None:
+    """Prints a line for each motion and each lever."""
+    for name, profile in results["profiles"].items():
+        factor, peak = profile["real_time_factor"], profile["peak_force_n"]
+        print(f"{name}: {factor:.1f} times real time, {peak:.1f} N at most")
+    print(
+        "lever of a plug on the rim [mm], at", ", ".join(f"{offset:g}" for offset in results["offsets_mm"]), "mm beside"
+    )
+    for name, levers in results["levers_mm"].items():
+        print(f"  {name}: {', '.join(f'{lever:.2f}' for lever in levers)}")
+    print("a plug drops in from", ", ".join(f"{mm:.2f} mm ({name})" for name, mm in results["captures_mm"].items()))
+    speeds = ", ".join(f"{1e3 * speed:g}" for speed in SPEEDS)
+    print(f"drag of a plug that slides over a sharp rim, of its push, at {speeds} mm/s; its friction is {FRICTION:g}")
+    for name, drags in results["drags"].items():
+        print(f"  {name}: {', '.join(f'{share:.2f}' for share in drags)}")
+
+
+def draw(results: dict[str, Any], path: Path) -> Path:
+    """Writes the picture: height, push and torque of both engines, and the rim's lever."""
+    figure, axes = new_figure(2, 3, (11.0, 5.6))
+    for row, task in enumerate(TASKS):
+        for engine in ENGINES:
+            profile = results["profiles"][f"{task} {engine}"]
+            for axis, key in zip(axes[row], ("height_mm", "push_n", "torque_nm"), strict=True):
+                axis.plot(profile["time"], profile[key], color=COLOURS[engine], label=engine)
+        for axis, words in zip(axes[row], ("height [mm]", "push [N]", "torque about z [Nm]"), strict=True):
+            axis.set_ylabel(words)
+            axis.set_xlabel(f"{task}: time [s]")
+    legend(figure, axes[0, 0])
+    lever = axes[1, 2]
+    lever.clear()
+    for name, levers in results["levers_mm"].items():
+        nominal = name in ("MuJoCo", "Drake, modulus × 1")
+        colour = COLOURS.get(name.split(",")[0], "0.6")
+        lever.plot(results["offsets_mm"], levers, ".-", color=colour, alpha=1.0 if nominal else 0.5)
+        lever.annotate(name, (results["offsets_mm"][-1], levers[-1]), fontsize=6)
+    lever.set_xlabel("plug on the rim: offset [mm]")
+    lever.set_ylabel("lever of its force [mm]")
+    return save_figure(figure, path)

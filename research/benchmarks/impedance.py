@@ -1,0 +1,134 @@
+"""The rails' two impedances, side by side: `guiderail bench impedance`.
+
+Springs and dampers of the rails themselves, which a plant solves with the contact, and a Cartesian impedance controller
+as an arm has it, whose forces are held for a step of the plant. They have the same stiffness, damping ratio and limits.
+A scripted insertion is compared with its finest time step; demonstrations alone and a rule written by hand act in the
+same held-out episodes of the connector under both.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.units import MM
+from guiderail.models.objects.bnc_connector.motion import insert_and_lock
+from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.metrics import summary
+from guiderail.tools.evaluation.scripted import untrained
+from research.benchmarks import told
+
+CONTROLS = ("joint", "cartesian")
+TIME_STEPS = {"joint": (1, 2, 4, 16), "cartesian": (4, 8, 16)}  # parts of a control period; the last is the finest
+DIFFICULTIES = ("standard", "hard")
+POLICIES = {"demonstrations": "zero", "rule": "rule"}
+EPISODES = 10  # of each
+RESPONSE = 15  # control periods
+STEP = np.array([4.0 * MM, -3.0 * MM, 5.0 * MM, 0.05, -0.04, 0.03])  # of the desired pose, in the air
+SHOWN = ("success_rate", "success_low", "success_high", "mean_force", "peak_force", "mean_steps", "worst_violation")
+
+
+def measure() -> dict[str, Any]:
+    """All of it, as a program may read it: `motion`, `step` and `episodes`, rows each."""
+    jobs = [(control, parts) for control in CONTROLS for parts in reversed(TIME_STEPS[control])]
+    motions: list[dict[str, Any]] = []
+    finest: dict[str, np.ndarray] = {}
+    for control, parts in told(jobs, "motion"):
+        row, pose = insertion(control, CONTROL_PERIOD / parts)
+        finest.setdefault(control, pose)
+        motions.append(row | _apart(pose, finest[control], "own"))
+    for row, (control, parts) in zip(motions, jobs, strict=True):
+        if parts == TIME_STEPS[control][-1]:
+            row |= _apart(finest[control], finest[CONTROLS[0]], "joint")
+    acting = [(d, name, control) for d in DIFFICULTIES for name in POLICIES for control in CONTROLS]
+    return {
+        "motion": motions,
+        "step": [step_response(control) for control in CONTROLS],
+        "episodes": [_episodes(*one) for one in told(acting, "episodes")],
+    }
+
+
+def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarray]:
+    """What a scripted insertion comes to and costs with a time step [s], and where the plug was, (n, 6)."""
+    workcell, (times, poses) = BncWorkcell(), insert_and_lock()
+    station = RailsStation(workcell, time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
+    driven = DrivenStation(station, along(times, poses), round(times[-1] / CONTROL_PERIOD))
+    driven.start(poses[0])
+    begin = time.process_time()
+    recording = driven.run()
+    row = {
+        "control": control,
+        "time_step": time_step,
+        "seconds": time.process_time() - begin,
+        "locks": workcell.is_locked(workcell.plug_in_locked_frame(station.plant, driven.plant_context)),
+        "peak_force": float(recording["contact_force"].max()),
+    }
+    return row, recording["pose"]
+
+
+def step_response(control: str, time_step: float | None = None) -> dict[str, Any]:
+    """How far the tool centre is at the control instants after a step of all six coordinates, in its parts, (n, 6)."""
+    station = RailsStation(BncWorkcell(), time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
+    start = np.array([0.0, 0.0, 50.0 * MM, 0.0, 0.0, 0.0])
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    station.get_desired_pose_input_port().FixValue(context, start + STEP)
+    station.set_pose(context, start)
+    simulator.Initialize()
+    poses = []
+    for n in range(1, RESPONSE + 1):
+        simulator.AdvanceTo(n * CONTROL_PERIOD)
+        poses.append(station.get_pose_output_port().Eval(context))
+    return {"control": control, "response": ((np.array(poses) - start) / STEP).tolist()}
+
+
+def _apart(poses: np.ndarray, others: np.ndarray, name: str) -> dict[str, float]:
+    away = np.linalg.norm((poses - others)[:, :3], axis=1)
+    turned = np.abs((poses - others)[:, 3:])
+    return {f"{name}_position_rms": float(np.sqrt((away**2).mean())), f"{name}_angle_most": float(turned.max())}
+
+
+def _episodes(difficulty: str, name: str, control: str) -> dict[str, Any]:
+    env = make_env("BncConnector", guidance="kgrl", difficulty=difficulty, impedance_control=control)
+    env.reset(seed=0)
+    act = untrained("BncConnector", POLICIES[name])(env)
+    begin = time.process_time()
+    rows = evaluate_policy(env, act, episodes=EPISODES, options={"new_run": True})
+    spent = time.process_time() - begin
+    env.close()
+    of = {"difficulty": difficulty, "policy": name, "control": control, "episodes": EPISODES}
+    return of | summary(rows, SHOWN) | {"seconds_per_1000_steps": 1000.0 * spent / float(rows["steps"].sum())}
+
+
+def show(results: dict[str, Any]) -> None:
+    """Prints what was measured."""
+    print("scripted insertion   step     CPU    peak    locks  RMS to its finest step")
+    for row in results["motion"]:
+        near = f"{row['own_position_rms'] / MM:6.3f} mm"
+        if row.get("joint_position_rms"):
+            near += f", {row['joint_position_rms'] / MM:.3f} mm to that of the rails' own"
+        print(
+            f"  {row['control']:<17}{1e3 * row['time_step']:6.2f} ms {row['seconds']:5.2f} s "
+            f"{row['peak_force']:5.1f} N  {'yes' if row['locks'] else 'no':<5} {near}"
+        )
+    print("step response, parts of the step after 1, 2, 3, 5, 10 control periods")
+    for row in results["step"]:
+        told = np.array(row["response"])
+        for words, column in (("x, y, z", slice(0, 3)), ("angles", slice(3, POSE_SIZE))):
+            means = told[[0, 1, 2, 4, 9], column].mean(axis=1)
+            print(f"  {row['control']:<12}{words:<8}{'  '.join(f'{value:.3f}' for value in means)}")
+    print("held-out episodes            success (95 %)       mean    peak    CPU of 1000 control steps")
+    for row in results["episodes"]:
+        who = f"{row['difficulty']}, {row['policy']}, {row['control']}"
+        print(
+            f"  {who:<37} {row['success_rate']:4.0%} ({row['success_low']:.0%}–{row['success_high']:.0%}) "
+            f"{row['mean_force']:5.1f} N {row['peak_force']:5.1f} N {row['seconds_per_1000_steps']:6.1f} s"
+        )

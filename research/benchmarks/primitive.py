@@ -1,0 +1,283 @@
+"""`guiderail bench primitive`: what one control step of an LC-NS-KMP costs, as ratios in one run on one core.
+
+Every row is a closed loop (history → next point, with uniform actions in ±1 at gains calibrated by authority), in three
+regimes: constraints slack, grazed now and then, and active at almost every step. The dense step is the thesis's own:
+K + ħΣ inverted, the dual of equation 4.20 assembled over the whole window and given to its solver, PIQP (to DAQP where
+PIQP is not installed). Difference is the largest one to that step, in scales of the outputs, and nearly all of it is
+the dense step's own error: the tests compare both with extended precision, where the history's covariance is small.
+"""
+
+import gc
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
+from guiderail.models.primitives.gains import authority_gains
+from guiderail.models.primitives.qp import SOLVERS
+from research.benchmarks import told
+
+#: O, F, H, P: planar, connector, and something larger than either.
+SIZES = ((2, 1, 40, 10), (6, 4, 40, 10), (6, 12, 100, 20))
+REGIMES = {"slack": 1.3, "grazing": 1.0, "active": 0.5}
+DENSE_SECONDS = 5.0
+_LARGEST = SIZES[-1]
+STEPS = 20_000
+PERIOD = 0.02
+_MOTION = 400
+
+
+@dataclass
+class _Loop:
+    """One closed loop: a primitive, its actions, and how it remembers."""
+
+    primitive: LcNsKmp
+    actions: np.ndarray
+
+    def run(self, predict, steps: int) -> tuple[np.ndarray, int, list]:
+        """Seconds per call (steps,), how many steps were constrained, and every 50th problem with its output."""
+        p, seconds, constrained, samples = self.primitive, np.empty(steps), 0, []
+        for k in range(steps):
+            n = k % _MOTION
+            if n == 0:
+                history = np.tile(p.constraints.nearest(p.reference.means[0]), (p.history, 1))
+            action = self.actions[k % len(self.actions)]
+            begin = time.perf_counter()
+            prediction = predict(n, action, history)
+            seconds[k] = time.perf_counter() - begin
+            constrained += prediction.constrained
+            if k % 50 == 7:
+                samples.append((n, action, history, prediction.output))
+            history = np.vstack([history[1:], prediction.output])
+        return seconds, constrained, samples
+
+
+def _reference(outputs: int) -> ReferenceTrajectory:
+    """A smooth motion with correlated deviations that widen and narrow, at the scales of a connector."""
+    rng = np.random.default_rng(0)
+    t = PERIOD * np.arange(_MOTION)
+    s = t / t[-1]
+    scale = np.resize([2e-3, 2e-3, 3e-2, 1.5, 2e-2, 2e-2], outputs)
+    means = scale * np.sin(np.outer(s, np.arange(1, outputs + 1)) + np.arange(outputs))
+    mix = np.eye(outputs) + 0.3 * rng.standard_normal((outputs, outputs))
+    width = scale * (0.1 + 0.3 * np.sin(np.pi * s)[:, None])
+    return ReferenceTrajectory(t, means, np.einsum("ni,ij,kj,nk->nik", width, mix, mix, width))
+
+
+def _primitive(size: tuple[int, int, int, int], share: float, solver: str = "daqp") -> LcNsKmp:
+    """Bounds at a share of where the mean goes: F/2 outputs in a box, or one of them from above."""
+    outputs, rows, horizon, history = size
+    reference = _reference(outputs)
+    reach = share * (np.abs(reference.means) + reference.standard_deviations * (share > 1) * 3).max(axis=0)
+    lower, upper = np.full(outputs, -np.inf), np.full(outputs, np.inf)
+    boxed = np.arange(max(rows // 2, 1))
+    upper[boxed] = reach[boxed]
+    if rows > 1:
+        lower[boxed] = -reach[boxed]
+    return LcNsKmp(
+        reference,
+        horizon=horizon,
+        history=history,
+        history_variance=1e-8,
+        constraints=LinearConstraints.box(lower, upper),
+        solver=solver,
+    )
+
+
+def _dense_step(p: LcNsKmp, step: int, action: np.ndarray, history: np.ndarray) -> np.ndarray:
+    """Equations 4.18-4.21 as they stand (errata mended): every matrix of the window, at every step."""
+    outputs, past, rows = p.num_outputs, p.history, p.constraints.num_constraints
+    held = np.minimum(np.arange(step, step + p.horizon + 1), p.num_steps - 1)
+    t = p.reference.inputs(np.arange(step - past, step + p.horizon + 1))
+    points = len(t)
+    K = np.kron(p.kernel(t, t), np.eye(outputs))
+    sigma = np.zeros_like(K)
+    known = np.tile(p.history_variance * np.eye(outputs), (past, 1, 1))
+    for i, block in enumerate(np.concatenate([known, p.reference.covariances[held]])):
+        sigma[i * outputs : (i + 1) * outputs, i * outputs : (i + 1) * outputs] = block
+    mu = np.concatenate([history, p.reference.means[held]]).ravel()
+    hbar = p.lambda_ + p.beta
+    A = np.linalg.inv(K + hbar * sigma)
+    executed = slice(past * outputs, (past + 1) * outputs)
+    G_bar = np.zeros((points * outputs, (p.horizon + 1) * rows))
+    G, c = p.constraints.window(held)
+    for i, block in enumerate(G):
+        at = (past + i) * outputs
+        G_bar[at : at + outputs, i * rows : (i + 1) * rows] = block.T
+    KA = K @ A
+    y = KA @ mu + p.beta * sigma @ (A @ K[:, executed] @ action)
+    S_G = KA @ (sigma @ G_bar)
+    alpha = _dual(G_bar.T @ S_G, G_bar.T @ y - c.ravel())
+    return y[executed] + S_G[executed] @ alpha
+
+
+def _dual(H: np.ndarray, slack: np.ndarray) -> np.ndarray:
+    """min ½αᵀHα + slackᵀα over α ≥ 0 (equation 4.20)."""
+    size = len(slack)
+    H = (H + H.T) / 2 + 1e-12 * np.eye(size)
+    try:
+        import piqp
+    except ImportError:
+        import daqp
+
+        return daqp.solve(H, slack, np.zeros((0, size)), np.full(size, 1e30), np.zeros(size))[0]
+    solver = piqp.DenseSolver()
+    solver.settings.verbose = False
+    solver.setup(H, slack, None, None, None, None, None, np.zeros(size), None)
+    solver.solve()
+    return solver.result.x
+
+
+def _microseconds(seconds: np.ndarray) -> dict[str, float]:
+    median, p99, p999, worst = (float(1e6 * t) for t in np.percentile(seconds, [50, 99, 99.9, 100]))
+    return {"median_us": median, "p99_us": p99, "p999_us": p999, "worst_us": worst}
+
+
+def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> tuple[dict, np.ndarray]:
+    """The row of one regime, and the seconds of each of its steps."""
+    p = _primitive(size, share)
+    rng = np.random.default_rng(1)
+    actions = authority_gains(p) * rng.uniform(-1, 1, (997, p.num_outputs))
+    loop = _Loop(p, actions)
+    loop.run(p.predict, _MOTION)
+    gc.collect()
+    seconds, constrained, samples = loop.run(p.predict, steps)
+    scale = np.abs(p.reference.means).max(axis=0)
+    dense_seconds: list[float] = []
+    difference = 0.0
+    for n, action, history, output in samples[::8][:25]:
+        if sum(dense_seconds) > DENSE_SECONDS:
+            break
+        begin = time.perf_counter()
+        expected = _dense_step(p, n, action, history)
+        dense_seconds.append(time.perf_counter() - begin)
+        difference = max(difference, float((np.abs(expected - output) / scale).max()))
+    violation = max(p.constraints.violation(sample[3], sample[0]) for sample in samples)
+    dense_ms = 1e3 * float(np.median(dense_seconds))
+    row = {"constrained": constrained / steps, **_microseconds(seconds)}
+    row |= {
+        "dense_ms": dense_ms,
+        "times_dense": 1e3 * dense_ms / row["median_us"],
+        "difference_to_dense": difference,
+        "worst_violation": violation,
+    }
+    return row, seconds
+
+
+def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict]:
+    """A row a regime, and one of all of them together, as a robot would meet them in a day."""
+    rows, seconds = {}, []
+    for regime, share in REGIMES.items():
+        rows[regime], spent = _regime(size, share, steps)
+        seconds.append(spent)
+    together = _microseconds(np.concatenate(seconds))
+    mean = {key: float(np.mean([row[key] for row in rows.values()])) for key in ("constrained", "dense_ms")}
+    worst = {key: max(row[key] for row in rows.values()) for key in ("difference_to_dense", "worst_violation")}
+    rows["together"] = {**mean, **together, "times_dense": 1e3 * mean["dense_ms"] / together["median_us"], **worst}
+    return rows
+
+
+def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict]:
+    """The same constrained steps through each solver: median time and worst violation of the commanded output."""
+    first = _primitive(size, REGIMES["active"])
+    actions = authority_gains(first) * np.random.default_rng(2).uniform(-1, 1, (997, first.num_outputs))
+    _, _, samples = _Loop(first, actions).run(first.predict, 4 * _MOTION)
+    rows = {}
+    for name in SOLVERS if size != _LARGEST else ("daqp", "piqp"):  # OSQP needs a second a step at the largest size
+        p = _primitive(size, REGIMES["active"], name)
+        seconds, failed, difference = [], 0, 0.0
+        scale = np.abs(p.reference.means).max(axis=0)
+        for n, action, history, output in samples:
+            p.linear_response(n)
+            begin = time.perf_counter()
+            try:
+                prediction = p.predict(n, action, history)
+            except UnsolvableError:
+                failed += 1
+                continue
+            seconds.append(time.perf_counter() - begin)
+            difference = max(difference, float((np.abs(prediction.output - output) / scale).max()))
+        median = 1e6 * float(np.median(seconds)) if seconds else float("nan")
+        rows[name] = {"median_us": median, "refused": failed, "of": len(samples), "difference_to_daqp": difference}
+    return rows
+
+
+def _leaf_system(size: tuple[int, int, int, int], steps: int) -> dict[str, float]:
+    """The same prediction through `LcNsKmpSystem`'s output port, at a new action each time."""
+    from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+
+    p = _primitive(size, REGIMES["grazing"])
+    system = LcNsKmpSystem(p, authority_gains(p), PERIOD)
+    context = system.CreateDefaultContext()
+    action = system.get_null_space_action_input_port().FixValue(context, np.zeros(p.num_outputs))
+    system.get_history_input_port().FixValue(context, np.tile(p.reference.means[0], (p.history, 1)).ravel())
+    port = system.get_output_output_port()
+    actions = np.random.default_rng(1).uniform(-1, 1, (steps, p.num_outputs))
+    seconds = np.empty(steps)
+    for k in range(steps):
+        action.GetMutableData().set_value(actions[k])
+        begin = time.perf_counter()
+        port.Eval(context)
+        seconds[k] = time.perf_counter() - begin
+    return _microseconds(seconds)
+
+
+def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
+    """What a fresh primitive's first prediction takes, and what factoring costs in time and memory."""
+    p = _primitive(size, REGIMES["grazing"])
+    history = np.tile(p.reference.means[0], (p.history, 1))
+    begin = time.perf_counter()
+    p.predict(0, np.zeros(p.num_outputs), history)
+    first = time.perf_counter() - begin
+    begin = time.perf_counter()
+    total = p.factor_all()
+    seconds = time.perf_counter() - begin
+    return {"first_ms": 1e3 * first, "step_ms": 1e3 * seconds / p.num_steps, "step_kB": total / p.num_steps / 1e3}
+
+
+def measure(steps: int = STEPS) -> dict:
+    """Everything the benchmark reports, by size."""
+    report = {}
+    for size in told(SIZES, "primitive, O F H P"):
+        name = "O{} F{} H{} P{}".format(*size)
+        report[name] = {
+            "predict": _predict(size, steps),
+            "leaf_system": _leaf_system(size, steps),
+            "factoring": _factoring(size),
+            "solvers": _solvers(size),
+        }
+    return report
+
+
+def show(report: dict) -> None:
+    """Prints the tables."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    for size, parts in report.items():
+        table = Table(title=f"LC-NS-KMP, {size}: one prediction [µs]")
+        for column in ("regime", "constrained", "median", "p99", "p99.9", "worst", "dense [ms]", "ratio", "difference"):
+            table.add_column(column, justify="right")
+        for regime, row in parts["predict"].items():
+            table.add_row(
+                regime,
+                f"{row['constrained']:.0%}",
+                *(f"{row[key]:.0f}" for key in ("median_us", "p99_us", "p999_us", "worst_us")),
+                f"{row['dense_ms']:.1f}",
+                f"{row['times_dense']:.0f}",
+                f"{row['difference_to_dense']:.0e}",
+            )
+        console.print(table)
+        leaf, factoring = parts["leaf_system"], parts["factoring"]
+        console.print(
+            f"through the LeafSystem: median {leaf['median_us']:.0f} µs, p99 {leaf['p99_us']:.0f} µs; first prediction "
+            f"{factoring['first_ms']:.1f} ms; factoring a step costs {factoring['step_ms']:.2f} ms and "
+            f"{factoring['step_kB']:.0f} kB"
+        )
+        for name, row in parts["solvers"].items():
+            console.print(
+                f"  constrained steps by {name}: median {row['median_us']:.0f} µs, refused {row['refused']} of "
+                f"{row['of']}, differs by {row['difference_to_daqp']:.0e}"
+            )

@@ -1,0 +1,179 @@
+"""How fast the simulations of contact are: `guiderail bench simulation`.
+
+CPU time of one core, not wall clock, and the best of some runs: what else a machine does changes that less. Python's
+share is the time in callbacks of systems written in Python, with what they call.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.stations.pouring import PouringConfig
+from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+from guiderail.models.common.poses import POSE_SIZE
+from guiderail.models.objects.bnc_connector.motion import insert_and_lock
+from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
+from guiderail.systems.cartesian_position_controller import CartesianPositionController
+from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.contact_detector import ContactWatch
+from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.measured_pose import MeasuredPose
+from guiderail.systems.pose_wrench import PoseWrench
+from guiderail.systems.recorder import Recorder
+from guiderail.systems.support.command_watch import CommandWatch
+from guiderail.systems.wrench_sensor import WrenchSensor
+from research.benchmarks import told
+
+# Outermost callbacks only: one that is called within another would count twice.
+CALLBACKS: tuple[tuple[type, str], ...] = (
+    (WrenchSensor, "_sample"),
+    (PoseWrench, "_calc_wrench"),
+    (CartesianImpedanceController, "_calc_law"),
+    (CartesianPositionController, "_step"),
+    (MeasuredPose, "_calc_pose"),
+    (ContactWatch, "_update"),
+    (CommandWatch, "_update"),
+    (CommandWatchdog, "_calc_safe_pose"),
+    (ImpedanceMonitor, "_calc_contact_force"),
+    (ImpedanceMonitor, "_calc_saturation"),
+    (Recorder, "_record"),
+)
+# From the plug's first touch to its release, locked [s].
+CONTACT = (3.8, 7.6)
+# The clamp is dragged over the table into its holes and pushed until it has snapped in: times [s], and x and z [m].
+CLAMP_TIMES, CLAMP_X, CLAMP_Z = (0.0, 0.4, 2.4, 4.0), (-0.003, -0.003, 0.0, 0.0), (0.014, 0.009, 0.009, -0.005)
+CLAMP_CONTACT = (0.4, 4.0)
+# The thermos is brought beside the mug, tilted on the way, and emptied: times [s], and poses of its tip in the target.
+POUR_TIMES = (0.0, 1.0, 2.0, 4.5, 5.0, 7.6)
+POUR_POSES = (
+    (-0.063, -0.292, 0.169, -0.213, 0.0, 0.0),
+    (0.012, -0.217, 0.225, 0.055, 0.0, 0.0),
+    (0.056, -0.153, 0.176, 0.349, 0.0, -0.001),
+    (0.018, -0.049, 0.076, 0.349, 0.0, -1.052),
+    (0.013, -0.036, 0.072, 0.349, 0.0, -1.182),
+    (0.013, -0.036, 0.075, 0.349, 0.0, -1.804),
+)
+POUR_CONTACT = (2.0, 7.6)  # the balls roll, and fall
+# What is driven along what, and how many times real time it is to be.
+REQUIRED_FACTOR = {
+    "rails": ("BncConnector", 10.0),
+    "arm": ("BncConnector", 6.0),
+    "grid_clamp": ("GridClamp", 10.0),
+    "pouring": ("Pouring", 10.0),
+}
+REQUIRED_SECONDS = 1.0
+REPEATS = 3
+
+
+@contextmanager
+def timed_callbacks() -> Iterator[Callable[[], float]]:
+    """While it lasts, systems that are built count the seconds in their own callbacks; yields what reads the count."""
+    spent = [0.0]
+    depth = [0]
+
+    def timed(method):
+        def call(*arguments):
+            depth[0] += 1
+            start = time.process_time()
+            try:
+                return method(*arguments)
+            finally:
+                depth[0] -= 1
+                if depth[0] == 0:
+                    spent[0] += time.process_time() - start
+
+        return call
+
+    originals = [(system, name, getattr(system, name)) for system, name in CALLBACKS]
+    for system, name, method in originals:
+        setattr(system, name, timed(method))
+    try:
+        yield lambda: spent[0]
+    finally:
+        for system, name, method in originals:
+            setattr(system, name, method)
+
+
+def real_time_factor(name: str) -> dict[str, float]:
+    """The best of `REPEATS` runs, which is the least disturbed one, of one of `REQUIRED_FACTOR`."""
+    return max((_one_run(name) for _ in range(REPEATS)), key=lambda run: run["real_time_factor"])
+
+
+def _one_run(name: str) -> dict[str, float]:
+    """Simulated seconds per second of CPU time while there is contact."""
+    world, times, poses, contact = scripted_motion(REQUIRED_FACTOR[name][0])
+    with timed_callbacks() as spent:
+        station = STATIONS.get(name if name in STATIONS.names() else "rails").build(world)
+        driven = DrivenStation(station, along(times, poses), num_samples=NUM_STEPS)
+        driven.start(poses[0])
+        first, last = (round(t / CONTROL_PERIOD) for t in contact)
+        driven.run(first)
+        python_before, start = spent(), time.process_time()
+        driven.run(last - first)
+        seconds = time.process_time() - start
+        python_seconds = spent() - python_before
+    simulated = (last - first) * CONTROL_PERIOD
+    return {"real_time_factor": simulated / seconds, "python_share": python_seconds / seconds}
+
+
+def scripted_motion(task: str) -> tuple[Any, np.ndarray, np.ndarray, tuple[float, float]]:
+    """The world of a task's stations, what is commanded at which times, and from when to when there is contact."""
+    if task == "BncConnector":
+        return BncWorkcell(), *insert_and_lock(), CONTACT
+    if task == "Pouring":
+        return PouringConfig(), np.array(POUR_TIMES), np.array(POUR_POSES), POUR_CONTACT
+    poses = np.zeros((len(CLAMP_TIMES), POSE_SIZE))
+    poses[:, 0], poses[:, 2] = CLAMP_X, CLAMP_Z
+    return GridClampWorkcell(), np.array(CLAMP_TIMES), poses, CLAMP_CONTACT
+
+
+def env_seconds(guidance: str = "kgrl") -> float:
+    """CPU seconds of 400 control steps of the environment on rails with random actions; the best of some episodes."""
+    env = make_env("BncConnector", guidance=guidance, uncertainty="disc", hold=5)
+    rng = np.random.default_rng(0)
+    best = np.inf
+    for episode in range(1 + REPEATS):
+        env.reset(seed=episode)
+        start, finished, info = time.process_time(), False, {}
+        while not finished:
+            _, _, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+            finished = terminated or truncated
+        if episode > 0:  # the first one also factors the primitive
+            best = min(best, (time.process_time() - start) / info["control_steps"] * NUM_STEPS)
+    return best
+
+
+def measure() -> dict[str, Any]:
+    """All of it, as a program may read it."""
+    measurements: dict[str, Callable[[], Any]] = {name: partial(real_time_factor, name) for name in REQUIRED_FACTOR}
+    measurements["env_seconds_per_400_steps"] = env_seconds
+    results: dict[str, Any] = {name: measurements[name]() for name in told(measurements, "simulation")}
+    results["fast_enough"] = (
+        all(results[name]["real_time_factor"] >= factor for name, (_, factor) in REQUIRED_FACTOR.items())
+        and results["env_seconds_per_400_steps"] <= REQUIRED_SECONDS
+    )
+    return results
+
+
+def show(results: dict[str, Any]) -> None:
+    """Prints what was measured."""
+    for name, (_, factor) in REQUIRED_FACTOR.items():
+        row = results[name]
+        print(
+            f"{name:10s}  {row['real_time_factor']:4.1f} times real time in contact (at least {factor:.0f}), "
+            f"{100 * row['python_share']:.0f} % of it Python"
+        )
+    seconds = results["env_seconds_per_400_steps"]
+    print(f"env         {seconds:4.2f} s for 400 control steps (at most {REQUIRED_SECONDS:.0f})")

@@ -1,0 +1,114 @@
+"""By how much a plant's time step is wrong, and what it costs: `guiderail bench time_step`.
+
+Scripted motions are simulated on rails with coarser and coarser time steps and compared with the finest: a connector
+that locks, one that starts 1.2 mm beside the jack, sits on its rim and slips off, and a clamp that is dragged into its
+holes. The plants are of first order in time: errors are proportional to the time step, except where something slips
+and hits, whose peak force a coarse time step overstates.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.units import MM
+from guiderail.tools.visualization.style import new_figure, save_figure
+from research.benchmarks import told
+from research.benchmarks.simulation import scripted_motion
+
+HALVINGS = (0, 1, 2, 3, 4)  # of the control period; the last is what the others are compared with
+MOTIONS = {
+    "connector, known": ("BncConnector", (0.0, 0.0, 0.0)),
+    "connector, slips off the rim": ("BncConnector", (0.8 * MM, -0.9 * MM, 0.0)),
+    "clamp": ("GridClamp", (0.0, 0.0, 0.0)),
+}
+"""Of each motion its task, and where the jack is instead of where it should be [m]."""
+
+
+def simulate(motion: str, time_step: float) -> tuple[dict[str, np.ndarray], float]:
+    """The recorded signals of a motion with that time step [s], and the CPU seconds that it took."""
+    task, offset = MOTIONS[motion]
+    workcell, times, poses, _ = scripted_motion(task)
+    station = RailsStation(workcell, time_step=time_step)
+    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    if isinstance(workcell, BncWorkcell):
+        workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform(np.array(offset)))
+    driven.start(poses[0])
+    start = time.process_time()
+    signals = driven.run().signals
+    return signals, time.process_time() - start
+
+
+def measure() -> dict[str, Any]:
+    """All of it, as a program may read it: rows of each motion and time step, the finest first."""
+    rows = []
+    for motion in told(MOTIONS, "time step"):
+        finest: dict[str, np.ndarray] = {}
+        for halvings in reversed(HALVINGS):
+            time_step = CONTROL_PERIOD / 2**halvings
+            signals, seconds = simulate(motion, time_step)
+            finest = finest or signals
+            rows.append({"motion": motion, "time_step": time_step, "seconds": seconds, **_errors(signals, finest)})
+    return {"rows": rows, "chosen": PLANT_PERIOD}
+
+
+def _errors(signals: dict[str, np.ndarray], finest: dict[str, np.ndarray]) -> dict[str, float]:
+    apart = {name: signals[name] - finest[name] for name in ("pose", "wrench")}
+    return {
+        "position_rms": _rms(apart["pose"][:, :3]),
+        "angle_rms": _rms(apart["pose"][:, 3:]),
+        "force_rms": _rms(apart["wrench"][:, :3]),
+        "torque_rms": _rms(apart["wrench"][:, 3:]),
+        "peak_contact_force": float(signals["contact_force"].max()),
+        "end_apart": float(np.linalg.norm(apart["pose"][-1, :3])),
+    }
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt((values**2).sum(1).mean()))
+
+
+def show(results: dict[str, Any]) -> None:
+    """Prints what was measured."""
+    print("time step  CPU    position  angle    force   torque    peak    end")
+    motion = None
+    for row in results["rows"]:
+        if row["motion"] != motion:
+            motion = row["motion"]
+            print(motion)
+        print(
+            f"{1e3 * row['time_step']:6.2f} ms  {row['seconds']:4.2f} s {1e3 * row['position_rms']:6.3f} mm "
+            f"{np.rad2deg(row['angle_rms']):5.2f}°  {row['force_rms']:5.2f} N {1e3 * row['torque_rms']:5.1f} mNm "
+            f"{row['peak_contact_force']:5.1f} N {1e3 * row['end_apart']:5.3f} mm"
+        )
+    print(f"errors are RMS against the finest; a station takes {1e3 * results['chosen']:.0f} ms unless told otherwise")
+
+
+def draw(results: dict[str, Any], path: Path) -> Path:
+    """Error and peak force against CPU time, one curve a motion, one dot a time step; the chosen one is filled."""
+    figure, axes = new_figure(1, 2, (10.0, 4.0))
+    shown = (("force_rms", "force, RMS error [N]"), ("peak_contact_force", "peak contact force [N]"))
+    for axis, (column, label) in zip(axes.flat, shown, strict=True):
+        for motion in MOTIONS:
+            rows = [row for row in results["rows"] if row["motion"] == motion]
+            (line,) = axis.plot(
+                [row["seconds"] for row in rows], [row[column] for row in rows], "o-", mfc="white", label=motion
+            )
+            for row in rows:
+                place, beside = (row["seconds"], row[column]), {"xytext": (3, 5), "textcoords": "offset points"}
+                axis.annotate(f"{1e3 * row['time_step']:g} ms", place, fontsize=7, **beside)
+                if row["time_step"] == results["chosen"]:
+                    axis.plot(row["seconds"], row[column], "o", color=line.get_color())
+        axis.set(xlabel="CPU time of the motion [s]", ylabel=label, xscale="log", xticks=[0.5, 1.0, 2.0, 5.0])
+        axis.minorticks_off()
+        axis.xaxis.set_major_formatter("{x:g}")
+    axes.flat[0].legend(frameon=False)
+    return save_figure(figure, path)

@@ -1,0 +1,190 @@
+"""Where the wall clock of a training run goes: `guiderail bench training TASK --env station=arm`.
+
+One short run as `guiderail train` makes it, whose learner begins early. Time counts for the innermost part that is
+measured: a callback of a system does not count for the simulation that called it, nor what Drake computes because a
+port is read for who reads it. What Drake computes by itself (contact, the solver, kinematics) is one part, as nothing
+in Python sees inside of it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import wraps
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import InputPort, OutputPort
+
+import guiderail.systems
+from guiderail.diagrams.envs.env import GuidedEnv
+from guiderail.tools.learning import checkpoint, off_policy
+from guiderail.tools.learning import trainer as train
+from guiderail.tools.learning.fast_sb3 import batched_mlp as perceptrons
+from guiderail.tools.learning.fast_sb3 import ensemble, flat_adam
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import configure, with_defaults
+
+TASK = "BncConnector"
+EPISODES = 6
+LEARNING_STARTS = 40  # decisions, so that most of the run learns
+
+# Parts by what is called; a function of a module is found there by whoever calls it.
+PARTS: tuple[tuple[Any, str, str], ...] = (
+    (train, "make_environment", "building the environment"),
+    (train, "rollout", "rollout"),
+    (train, "_save", "checkpoint"),
+    (GuidedEnv, "reset", "reset"),
+    (GuidedEnv, "step", "environment"),
+    (Simulator, "AdvanceTo", "Drake"),
+    (InputPort, "Eval", "Drake, as a port is read"),
+    (OutputPort, "Eval", "Drake, as a port is read"),
+    (off_policy.OffPolicyLearner, "__init__", "building the learner"),
+    (off_policy.OffPolicyLearner, "act", "acting"),
+    (off_policy.OffPolicyLearner, "remember", "remembering"),
+    (off_policy.OffPolicyLearner, "learn", "gradient step"),
+    (off_policy.NStepReplayBuffer, "sample", "replay"),
+    (ensemble.Ensemble, "train", "gradient step"),
+    (perceptrons.Perceptrons, "forward", "forward"),
+    (perceptrons.Perceptrons, "backward", "backward"),
+    (perceptrons.Perceptrons, "input_gradient", "backward"),
+    (flat_adam.FlatAdam, "step", "optimizer"),
+    (checkpoint, "save_checkpoint", "checkpoint"),
+)
+REST = "everything else"
+CALLBACK = "Python: "
+
+
+class Clock:
+    """Adds up wall-clock seconds by part, each instant for the innermost part that has begun.
+
+    Attributes:
+        seconds: by part.
+        calls: by part, where it began within another.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {REST: 0.0}
+        self.calls: dict[str, int] = {REST: 1}
+        self._inside = [REST]
+        self._last = time.perf_counter()
+
+    def timed(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        """The function, whose time counts for that part."""
+        self.seconds.setdefault(part, 0.0)
+        self.calls.setdefault(part, 0)
+        inside, seconds, calls = self._inside, self.seconds, self.calls
+
+        @wraps(function)
+        def call(*given: Any, **named: Any) -> Any:
+            now = time.perf_counter()
+            seconds[inside[-1]] += now - self._last
+            self._last = now
+            calls[part] += inside[-1] != part
+            inside.append(part)
+            try:
+                return function(*given, **named)
+            finally:
+                now = time.perf_counter()
+                seconds[inside.pop()] += now - self._last
+                self._last = now
+
+        return call
+
+    def stop(self) -> None:
+        """Counts the time until now."""
+        now = time.perf_counter()
+        self.seconds[self._inside[-1]] += now - self._last
+        self._last = now
+
+
+@contextmanager
+def timed_parts() -> Iterator[Clock]:
+    """While it lasts, what is called and what is built counts its seconds."""
+    clock = Clock()
+    parts = [*PARTS, *((system, name, CALLBACK + system.__name__) for system, name in _callbacks())]
+    originals = [(owner, name, inspect.getattr_static(owner, name)) for owner, name, _ in parts]
+    for owner, name, part in parts:
+        setattr(owner, name, clock.timed(getattr(owner, name), part))
+    try:
+        yield clock
+    finally:
+        clock.stop()
+        for owner, name, original in originals:
+            setattr(owner, name, original)
+
+
+def _callbacks() -> Iterator[tuple[type, str]]:
+    """The private methods of every system, and of what several are made of: Drake calls nothing else."""
+    for found in pkgutil.walk_packages(guiderail.systems.__path__, "guiderail.systems."):
+        module = import_module(found.name)
+        for kind in vars(module).values():
+            if inspect.isclass(kind) and kind.__module__ == module.__name__:
+                for name, value in vars(kind).items():
+                    if inspect.isfunction(value) and not name.startswith("__"):
+                        yield kind, name
+
+
+def measure(
+    task: str | None = None, environment: Mapping[str, Any] | None = None, episodes: int = EPISODES
+) -> dict[str, Any]:
+    """The parts of one run with their seconds, the largest first, and what the run did.
+
+    Args:
+        task: what is learned.
+        environment: its options.
+        episodes: how many.
+    """
+    task = task or TASK
+    how = with_defaults(task, {"settings": {"learning_starts": LEARNING_STARTS}})
+    config = configure(task, environment or {}, episodes=episodes, **how)
+    with tempfile.TemporaryDirectory() as folder, timed_parts() as clock:
+        start = time.perf_counter()
+        rows = train.train(RunFolder(Path(folder) / "run"), config)
+        wall = time.perf_counter() - start
+    steps = sum(row["steps"] for row in rows)
+    parts = [
+        {"part": part, "seconds": seconds, "share": seconds / wall, "calls": clock.calls[part]}
+        for part, seconds in sorted(clock.seconds.items(), key=lambda item: -item[1])
+        if seconds > 0.0
+    ]
+    return {
+        "task": task,
+        "environment": dict(config.environment),
+        "episodes": episodes,
+        "wall_s": wall,
+        "control_steps": steps,
+        "python_share_of_simulation": _python_share(clock.seconds),
+        "parts": parts,
+    }
+
+
+def _python_share(seconds: Mapping[str, float]) -> float:
+    python = sum(value for part, value in seconds.items() if part.startswith(CALLBACK))
+    return python / max(python + sum(value for part, value in seconds.items() if part.startswith("Drake")), 1e-12)
+
+
+def show(result: dict[str, Any]) -> None:
+    """Prints the table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    station = result["environment"].get("station")
+    where = result["task"] if station is None else f"{result['task']}, {station}"
+    table = Table(title=f"{where}: {result['episodes']} episodes in {result['wall_s']:.1f} s")
+    for column, side in (("part", "left"), ("s", "right"), ("share", "right"), ("calls", "right"), ("ms", "right")):
+        table.add_column(column, justify=side)  # type: ignore[arg-type]
+    for row in result["parts"]:
+        if row["share"] >= 0.001:
+            each = 1e3 * row["seconds"] / max(row["calls"], 1)
+            table.add_row(row["part"], f"{row['seconds']:.2f}", f"{row['share']:.1%}", f"{row['calls']}", f"{each:.3f}")
+    console = Console()
+    console.print(table)
+    python = f"{result['python_share_of_simulation']:.0%}"
+    console.print(f"{result['control_steps']} control steps; {python} of the simulation is Python")

@@ -1,0 +1,260 @@
+"""Figures 4.2 to 4.8 and table 4.1: what KGRL's null space is, and what it is for."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.patches import Ellipse, Rectangle
+
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.primitives import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory
+from guiderail.models.primitives.gains import rms_gains
+from guiderail.models.primitives.mixture import fit_mixture
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.metrics import summary
+from guiderail.tools.evaluation.rollout import Paths, rollout
+from guiderail.tools.experiments.study import run_study
+from guiderail.tools.visualization.curves import draw_world
+from guiderail.tools.visualization.style import colour, label, new_figure
+from research.figures.runs import figure_study, learning_curves, leave, said, settings_table
+from research.figures.thesis import TABLE_4_1
+
+DURATION, STEPS, COMPONENTS = 6.0, 200, 8
+MODULATED_AT = 3.2  # s, as in the thesis
+NEARBY = 0.5  # s before and after that; the kernel's length is as much
+MOVED_ELSEWHERE = f"moved_most_over_{NEARBY:g}_s_away"
+LOWER, UPPER = np.array([-0.56, -0.26]), np.array([0.56, 0.42])
+TASK, HOLD = "NarrowPassage", 5  # control steps of an action, unless a figure says otherwise
+METHODS = ("residual", "safe_residual", "kgrl")
+CONNECTOR = (
+    "in simulation, on rails; a hidden offset of 1.0 to 1.5 mm per run and a few tenths per episode; the robust "
+    "preset, actions in x and y held ten control steps; the thesis's reward and 5 per millimetre of depth"
+)
+
+
+def synthetic_demonstrations(seed: int = 0, count: int = 6) -> Demonstrations:
+    """Two-dimensional motions over an arch that agree at both ends and once between, and differ most at the top."""
+    random = np.random.default_rng(seed)
+    times = np.linspace(0, DURATION, STEPS)
+    phase = times / DURATION
+    path = np.column_stack([phase - 0.5, 0.45 * np.sin(np.pi * phase) ** 2 - 0.2 * phase])
+    spread = 0.01 + 0.07 * np.exp(-(((phase - 0.54) / 0.13) ** 2)) + 0.03 * np.exp(-(((phase - 0.15) / 0.07) ** 2))
+    smooth = np.linalg.cholesky(np.exp(-0.5 * ((phase[:, None] - phase) / 0.2) ** 2) + 1e-8 * np.eye(STEPS))
+    return Demonstrations(
+        times, [path + spread[:, None] * (smooth @ random.standard_normal((STEPS, 2))) for _ in range(count)]
+    )
+
+
+def explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> np.ndarray:
+    """A motion (N, O) with a normally distributed null-space action at every step."""
+    random = np.random.default_rng(seed)
+    return np.array(
+        [primitive.predict(n, gain * random.standard_normal(2) / np.sqrt(3)).output for n in range(primitive.num_steps)]
+    )
+
+
+def figure_4_2(out: Path) -> dict[str, Any]:
+    """Demonstrations with their mixture, the effect of one action, and of random ones, inside a rectangle.
+
+    The table has how far each motion is from the one without actions: at `MODULATED_AT`, and more than `NEARBY` away
+    from it at most.
+    """
+    demonstrations = synthetic_demonstrations()
+    reference = ReferenceTrajectory.from_demonstrations(demonstrations, components=COMPONENTS)
+    primitive = LcNsKmp(reference, constraints=LinearConstraints.box(LOWER, UPPER))
+    gain = rms_gains(primitive)
+    step = int(np.argmin(np.abs(reference.times - MODULATED_AT)))
+    unmodulated = primitive.modified_trajectory([], []).trajectory
+
+    def row(panel: str, case: str, path: np.ndarray) -> dict[str, Any]:
+        away = np.linalg.norm(path - unmodulated, axis=1)
+        elsewhere = np.abs(reference.times - reference.times[step]) > NEARBY
+        moved = {"moved_at_3.2_s": float(away[step]), MOVED_ELSEWHERE: float(away[elsewhere].max())}
+        return {"panel": panel, "case": case, "worst_violation": _violation(primitive, path), **moved}
+
+    figure, ((first, second, third),) = new_figure(1, 3, (15, 4.2))
+    for outputs in demonstrations.outputs:
+        first.plot(*outputs.T, color="0.6", linewidth=0.8)
+    _draw_mixture(first, demonstrations)
+    rows: list[dict[str, Any]] = []
+    for angle in np.linspace(0, 2 * np.pi, 8, endpoint=False):
+        action = 3 * gain * np.array([np.cos(angle), np.sin(angle)])
+        path = primitive.modified_trajectory([step], [action]).trajectory
+        second.plot(*path.T, linewidth=1)
+        rows.append(row("A2, one action at 3.2 s", f"{np.degrees(angle):.0f}°", path))
+    second.plot(*unmodulated.T, color="black", linewidth=1.5)
+    second.plot(*unmodulated[step], "ko", markersize=5)
+    paths = np.stack([explore(primitive, gain, seed) for seed in range(5)])
+    for path in paths:
+        third.plot(*path.T, linewidth=0.5, alpha=0.7)
+        rows.append(row("A3, random actions", f"motion {len(rows) - 7}", path))
+    for axis, title in zip((first, second, third), ("demonstrations and mixture", "one action", "random"), strict=True):
+        if axis is not first:
+            axis.add_patch(Rectangle(tuple(LOWER), *(UPPER - LOWER), fill=False, color="firebrick", linestyle="--"))
+        axis.set(title=title, xlabel="x", ylabel="y", aspect="equal", xlim=(-0.65, 0.65), ylim=(-0.35, 0.6))
+    explored = np.sqrt(((paths - paths.mean(0)) ** 2).mean((0, 2)))
+    agreement = float(np.corrcoef(explored, np.sqrt((reference.standard_deviations**2).mean(1)))[0, 1])
+    return {
+        **leave(out, "figure_4_2", figure, rows),
+        "worst_violation": max(row["worst_violation"] for row in rows),
+        "exploration_follows_the_demonstrated_spread": agreement,
+    }
+
+
+def _violation(primitive: LcNsKmp, path: np.ndarray) -> float:
+    return max(primitive.constraints.violation(point) for point in path)
+
+
+def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:
+    """Two standard deviations of each component, in the plane."""
+    mixture = fit_mixture(demonstrations.times[0], np.stack(demonstrations.outputs), COMPONENTS, 0)
+    scale = mixture.scale[1:]
+    for mean, covariance in zip(mixture.means, mixture.covariances, strict=True):
+        values, vectors = np.linalg.eigh(covariance[1:, 1:] * scale[:, None] * scale)
+        width, height = 4 * np.sqrt(values)
+        angle = np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0]))
+        centre = mean[1:] * scale + mixture.center[1:]
+        axis.add_patch(Ellipse(tuple(centre), width, height, angle=angle, color="tab:blue", alpha=0.25, linewidth=0))
+
+
+def figure_4_3(out: Path, name: str = "figure_4_3") -> dict[str, Any]:
+    """The plane: walls, zone, obstacle, goal and demonstrations."""
+    figure, ((axis,),) = new_figure(1, 1, (4.6, 6.0))
+    draw_world(axis)
+    world = PassageGeometry()
+    for words, place in {
+        "restricted\nzone": (world.zone_x + 0.02, 0.1),
+        "obstacle": (world.obstacle[0] + world.obstacle_radius, world.obstacle[1]),
+        "goal": (world.goal[0] + world.goal_radius, world.goal[1]),
+    }.items():
+        axis.annotate(words, place, xytext=(4, 0), textcoords="offset points", fontsize=8, va="center")
+    fields = ("start", "goal", "goal_radius", "gap_x", "obstacle", "obstacle_radius", "zone_x")
+    rows = [{"what": field.replace("_", " "), "metres": str(getattr(world, field))} for field in fields]
+    return leave(out, name, figure, rows)
+
+
+def table_4_1(out: Path) -> dict[str, Any]:
+    """TQC's settings: the thesis's, and those of the presets that are named after it."""
+    return settings_table(out / "table_4_1", TABLE_4_1, ("quick", "robust"))
+
+
+def random_episodes(env: Any, seed: int, episodes: int) -> list[dict[str, Any]]:
+    """Rows, with paths, of episodes of uniformly random actions."""
+    random = np.random.default_rng(seed)
+    size = env.action_space.shape
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        return random.uniform(-1, 1, size).astype(np.float32)
+
+    return [rollout(env, act, Paths(env), index=index) for index in range(episodes)]
+
+
+def figure_4_4(out: Path, seeds: int = 3, episodes: int = 10) -> dict[str, Any]:
+    """Where random exploration takes the robot, and how that depends on how long an action lasts.
+
+    Args:
+        out: the folder.
+        seeds: of the random actions.
+        episodes: of each seed.
+    """
+    figure, (axes,) = new_figure(1, 3, (11, 5.2))
+    rows: list[dict[str, Any]] = []
+    for axis, kind in zip(axes, METHODS, strict=True):
+        draw_world(axis)
+        axis.set_title(label(kind))
+        for hold in (HOLD, 1):
+            env: Any = make_environment(TASK, {"guidance": kind, "hold": hold})
+            explored: list[dict[str, Any]] = []
+            for seed in range(seeds):
+                env.reset(seed=seed)
+                explored += random_episodes(env, seed, episodes)
+            env.close()
+            counted = summary(pd.DataFrame(explored), COUNTED)
+            rows.append({"method": label(kind), "hold": hold, **counted})
+            for row in explored if hold == HOLD else ():
+                axis.plot(*row["measured"].T, ".", markersize=1.5, color=colour(kind), alpha=0.35)
+    return {
+        **leave(out, "figure_4_4", figure, rows),
+        **{f"{row['method']}, an action lasts {row['hold']}": f"{row['success_rate']:.0%} succeed" for row in rows},
+    }
+
+
+COUNTED = (
+    "episodes", "success_rate", "ended_blocked", "collisions", "measured_violating_episodes", "worst_violation",
+    "worst_measured_violation",
+)  # fmt: skip
+
+
+def figure_4_5(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
+    """Success, return and its two costs while learning."""
+    rows = run_study(figure_study("narrow_passage", seeds=seeds, episodes=episodes), out)
+    columns = {
+        "success": "success",
+        "return": "return",
+        "reward_obstacle_cost": "obstacle cost",
+        "reward_action_cost": "action cost",
+    }
+    figure, _ = learning_curves(rows, columns, (2, 2), (10, 7))
+    return {
+        **leave(out, "figure_4_5", figure, rows),
+        **said(rows, {"training_success_rate": ("success of each seed", "{:.0%}")}),
+        "condition": f"an action lasts {HOLD} control steps, and walls do not let the robot slide; figure 4.4 "
+        "shows the other case",
+    }
+
+
+def figure_4_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
+    """Collisions with the walls and violations of the constraint, per episode of learning."""
+    rows = run_study(figure_study("narrow_passage", seeds=seeds, episodes=episodes), out)
+    columns = {"collisions": "wall collisions per episode", "worst_measured_violation": "worst violation [m]"}
+    figure, axes = learning_curves(rows, columns, (1, 2), (10, 4), window=1)
+    axes[0, 1].axhline(0, color="firebrick", linewidth=0.8)
+    counts = ["training_collisions", "training_measured_violating_episodes", "training_episodes"]
+    total = rows.groupby("method", sort=False)[counts].sum()
+    return {
+        **leave(out, "figure_4_6", figure, rows),
+        **{
+            label(kind): f"{collisions} collisions, {violating} episodes in the zone, of {number}"
+            for kind, collisions, violating, number in total.itertuples()
+        },
+    }
+
+
+def figure_4_7(out: Path, seeds: int = 3, episodes: int = 30) -> dict[str, Any]:
+    """Return, obstacle cost and success over 30 episodes, where all that the policy sees is a picture."""
+    study = figure_study(
+        "narrow_passage",
+        seeds=seeds,
+        episodes=episodes,
+        methods=["kgrl"],
+        env={"hold": HOLD, "observation": "image"},
+        folder="runs/NarrowPassage/{method}-hold-5-observation-image-quick-{episodes}-{seed}",
+    )
+    rows = run_study(study, out)
+    columns = {"return": "return", "reward_obstacle_cost": "obstacle cost", "success": "success"}
+    figure, _ = learning_curves(rows, columns, (1, 3), (13, 3.8))
+    words = {
+        "training_success_rate": ("success of each seed", "{:.0%}"),
+        "training_avoids_obstacle_from": ("obstacle avoided from episode", "{}"),
+    }
+    return {
+        **leave(out, "figure_4_7", figure, rows),
+        **said(rows, words),
+        "condition": f"an action lasts {HOLD} control steps; pixels are averaged five by five",
+    }
+
+
+def figure_4_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
+    """KGRL: success, return, interaction force and episode length."""
+    rows = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes, methods=["kgrl"]), out)
+    columns = {"success": "success", "return": "return", "mean_force": FORCE, "steps": "control steps"}
+    figure, _ = learning_curves(rows, columns, (2, 2), (10, 7))
+    return {**leave(out, "figure_4_8", figure, rows), **said(rows, LEARNED), "condition": CONNECTOR}
+
+
+FORCE = "mean contact force [N]"
+LEARNED = {
+    "training_converged_after": ("converged after episode", "{}"),
+    "success_rate": ("held-out success", "{:.0%}"),
+}

@@ -1,0 +1,422 @@
+"""Figures 5.2 to 5.10: how smoothly KGRL and sKGRL explore, and what they learn."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from guiderail.diagrams.envs.make import known
+from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT
+from guiderail.models.common.errors import InputError
+from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.primitives import LcNsKmp
+from guiderail.models.primitives.gains import rms_gains
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.baselines import NullPolicy, white
+from guiderail.tools.evaluation.metrics import summary
+from guiderail.tools.evaluation.rollout import Paths, rollout
+from guiderail.tools.experiments.declaration import LearnerChoice
+from guiderail.tools.experiments.study import each, run_study
+from guiderail.tools.visualization.curves import draw_world
+from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.film import draw_frames, watch
+from guiderail.tools.visualization.style import colour, label, new_figure
+from research.figures.chapter_4 import CONNECTOR, FORCE, HOLD, LEARNED, TASK, figure_4_3, random_episodes
+from research.figures.runs import episodes_of, figure_study, learning_curves, leave, mean_of_last, said
+
+METHODS = ("kgrl", "skgrl")
+VARIANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # ρ, m²
+SHOWN = 1e-6  # ρ of the thesis
+HOLDS = (1, 5)  # control steps of an action: the thesis's, and what is learned with here
+EPISODES = 10  # tried at most, until one fails or succeeds as figure 5.7 shows
+# Where the robot is when it is pushed (y, m), and by how much in x (m). The last of each kind leads into the zone.
+PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10), (0.20, 0.15), (0.78, 0.20))
+
+
+def primitive_of(kind: str, variance: float = SHOWN) -> LcNsKmp:
+    """The narrow passage's primitive, with a history for sKGRL."""
+    skill = known("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
+    assert skill is not None
+    return skill.primitive(history=kind == "skgrl")
+
+
+def figure_5_2(out: Path) -> dict[str, Any]:
+    """Reference windows, modified windows and the executed path of one exploring motion, both with the same RMS."""
+    figure, (axes,) = new_figure(1, 2, (11, 6))
+    rows: list[dict[str, Any]] = []
+    for axis, kind in zip(axes, ("kgrl", "skgrl"), strict=True):
+        primitive = primitive_of(kind)
+        steps, windows, executed = _explore(primitive, rms_gains(primitive), seed=0)
+        draw_world(axis, demonstrations=False)
+        _draw_spread(axis, primitive)
+        for n in range(60, 200, 12):
+            reference = primitive.reference.means[np.minimum(n + np.arange(primitive.horizon + 1), len(steps) - 1)]
+            past = executed[max(n - primitive.history, 0) : n]
+            axis.plot(*np.vstack([past, reference]).T, ":", color="tab:blue", linewidth=0.9)
+            axis.plot(*windows[n].T, color="tomato", linewidth=0.8, alpha=0.8)
+        axis.plot(*executed[:300].T, color="firebrick", linewidth=1.6)
+        axis.set(title=f"{label(kind)} exploration", xlim=(0.2, 0.65), ylim=(0.03, 0.5))
+        # Where the last window said the robot would go next, and where it was then sent.
+        jumps = np.linalg.norm(executed[1:] - np.array([window[1] for window in windows[:-1]]), axis=1)
+        rows.append(
+            {
+                "method": label(kind),
+                "history_variance": primitive.history_variance if primitive.history else None,
+                "mean_jump_between_windows": float(jumps.mean()),
+                "largest_jump_between_windows": float(jumps.max()),
+                "rms_deviation": float(np.sqrt(((executed - _quiet(primitive)) ** 2).mean())),
+            }
+        )
+    smaller = rows[0]["mean_jump_between_windows"] / rows[1]["mean_jump_between_windows"]
+    return {
+        **leave(out, "figure_5_2", figure, rows),
+        "sKGRL's mean jump from window to window is smaller by": f"{smaller:.0f} times, at the same RMS",
+    }
+
+
+def _explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> tuple[range, list[np.ndarray], np.ndarray]:
+    """Uniformly random actions at every step: the modified windows (H+1, 2), and the executed motion (N, 2)."""
+    random = np.random.default_rng(seed)
+    steps = range(primitive.num_steps)
+    past = [primitive.reference.means[0]] * primitive.history
+    windows, executed = [], []
+    for n in steps:
+        history = np.array(past[-primitive.history :]) if primitive.history else None
+        prediction = primitive.predict(n, gain * random.uniform(-1, 1, primitive.num_outputs), history)
+        windows.append(prediction.trajectory)
+        executed.append(prediction.output)
+        past.append(prediction.output)
+    return steps, windows, np.array(executed)
+
+
+def _quiet(primitive: LcNsKmp) -> np.ndarray:
+    """The same motion without actions."""
+    return _explore(primitive, np.zeros(primitive.num_outputs), 0)[2]
+
+
+def _draw_spread(axis: Axes, primitive: LcNsKmp) -> None:
+    """One and two standard deviations of the demonstrations in x."""
+    means, deviation = primitive.reference.means, primitive.reference.standard_deviations[:, 0]
+    for width in (1, 2):
+        axis.fill_betweenx(
+            means[:, 1],
+            means[:, 0] - width * deviation,
+            means[:, 0] + width * deviation,
+            color="tab:blue",
+            alpha=0.08,
+            linewidth=0,
+        )
+
+
+def figure_5_3(out: Path) -> dict[str, Any]:
+    """The plane again."""
+    return figure_4_3(out, "figure_5_3")
+
+
+def figure_5_4(out: Path) -> dict[str, Any]:
+    """Pushes where demonstrations differ and where they agree, some of them into the restricted zone."""
+    env: Any = make_environment(TASK, {"guidance": "skgrl", "hold": 1, "history": 1, "history_source": "measured"})
+    nominal, _, _ = _run(env, None)
+    figure, ((plane, time),) = new_figure(1, 2, (11, 5.6))
+    draw_world(plane)
+    plane.plot(*nominal.T, color="black", linewidth=1.4, label="not pushed")
+    period = env.unwrapped.trace.period
+    time.plot(period * np.arange(len(nominal)), nominal[:, 0], color="black")
+    rows: list[dict[str, Any]] = []
+    for index, (height, push) in enumerate(PUSHES):
+        step = int(np.argmax(nominal[:, 1] > height))
+        path, commanded, row = _run(env, (step, np.array([push, 0.0])))
+        colour = f"C{index}"
+        pushed = nominal[step - 1] + [push, 0.0]
+        plane.plot(*np.vstack([pushed, path[step:]]).T, color=colour, linewidth=1.1)
+        plane.plot(*np.vstack([nominal[step - 1], pushed]).T, "--", color="firebrick", linewidth=1.2)
+        time.plot(
+            period * np.arange(step, len(path)), path[step:, 0], color=colour, label=f"{push:+.2f} m at y {height}"
+        )
+        rows.append(_recovery(height, push, step, nominal, path, commanded, row))
+    env.close()
+    time.axhline(PassageGeometry().zone_x, color="firebrick", linewidth=0.8)
+    time.set(xlabel="time [s]", ylabel="x [m]")
+    time.legend(frameon=False, fontsize=8)
+    plane.legend(frameon=False, fontsize=8, loc="upper left")
+    half = {height: [row["steps_to_half"] for row in rows if row["y"] == height] for height in (0.20, 0.54)}
+    return {
+        **leave(out, "figure_5_4", figure, rows),
+        "all reach the goal": bool(all(row["success"] for row in rows)),
+        "worst commanded violation": max(row["worst_commanded_violation"] for row in rows),
+        "steps until half recovered, where demonstrations differ": str(half[0.20]),
+        "steps until half recovered, in the passage": str(half[0.54]),
+        "condition": "the history is the measured pose (P = 1), the action zero",
+    }
+
+
+def _run(env: Any, push: tuple[int, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """One episode without actions, pushed just before a step: measured and commanded path, and its row."""
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        if push is not None and len(env.unwrapped.trace) == push[0]:
+            env.unwrapped.push(push[1])
+        return np.zeros(env.action_space.shape, np.float32)
+
+    row = rollout(env, act, Paths(env), seed=0)
+    return row["measured"], row["commanded"], row
+
+
+def _recovery(
+    height: float,
+    push: float,
+    step: int,
+    nominal: np.ndarray,
+    path: np.ndarray,
+    commanded: np.ndarray,
+    row: dict[str, Any],
+) -> dict[str, Any]:
+    """How fast, and how safely, the robot is back on its course."""
+    length = min(len(nominal), len(path))
+    away = np.abs(path[step:length, 0] - nominal[step:length, 0])
+
+    def steps_until(share: float) -> int | None:
+        below = np.flatnonzero(away < share * abs(push))
+        return int(below[0]) + 1 if len(below) else None
+
+    return {
+        "y": height,
+        "push": push,
+        "steps_to_half": steps_until(0.5),
+        "steps_to_a_tenth": steps_until(0.1),
+        "largest_command_step": float(np.abs(np.diff(commanded[step:length, 0])).max()),
+        "worst_commanded_violation": float((commanded[:, 0] - PassageGeometry().zone_x).max()),
+        "steps_measured_in_the_zone": int((path[step:, 0] > PassageGeometry().zone_x + 1e-6).sum()),
+        "collisions": row["collisions"],
+        "fallbacks": row["fallbacks"],
+        "success": row["success"],
+    }
+
+
+def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
+    """One motion of KGRL and five of sKGRL; jerk at the same exploration RMS over ρ, commanded and measured.
+
+    Args:
+        out: the folder.
+        seeds: of the random actions.
+        episodes: of each seed.
+    """
+    figure, (axes,) = new_figure(1, 3, (14, 5.4))
+    rows: list[dict[str, Any]] = []
+    for hold in HOLDS:
+        rough = _smoothness("kgrl", SHOWN, hold, _wander("kgrl", SHOWN, hold, range(seeds), episodes))
+        rows.append(rough | {"times_below_kgrl_commanded": 1.0, "times_below_kgrl_measured": 1.0})
+        for variance in VARIANCES:
+            row = _smoothness("skgrl", variance, hold, _wander("skgrl", variance, hold, range(seeds), episodes))
+            for column in ("commanded", "measured"):
+                row[f"times_below_kgrl_{column}"] = rough[f"jerk_{column}"] / row[f"jerk_{column}"]
+            rows.append(row)
+    for axis, kind, count, words in ((axes[0], "kgrl", 1, "one motion"), (axes[1], "skgrl", 5, "five motions")):
+        draw_world(axis)
+        for row in _wander(kind, SHOWN, HOLDS[0], range(1), count):
+            axis.plot(*row["commanded"].T, linewidth=1, color=colour(kind) if count == 1 else None)
+        axis.set_title(f"{label(kind)}, {words}")
+    for hold, shade in zip(HOLDS, ("tab:blue", "tab:orange"), strict=True):
+        for column, style in (("commanded", "o-"), ("measured", "x--")):
+            times = [
+                row[f"times_below_kgrl_{column}"]
+                for row in rows
+                if row["hold"] == hold and row["method"] != label("kgrl")
+            ]
+            words = f"{column}, an action lasts {hold} control step{'s' if hold > 1 else ''}"
+            axes[2].loglog(VARIANCES, times, style, color=shade, label=words)
+    axes[2].axhline(1.0, color="0.6", linewidth=0.8)
+    axes[2].set(xlabel="history variance ρ [m²]", ylabel="KGRL's mean jerk / sKGRL's, at the same exploration RMS")
+    axes[2].legend(frameon=False, fontsize=8)
+    return {
+        **leave(out, "figure_5_5", figure, rows),
+        **{
+            f"jerk below KGRL's at ρ = {row['history_variance']:.0e}, action held {row['hold']}": (
+                f"{row['times_below_kgrl_commanded']:.0f} times commanded, "
+                f"{row['times_below_kgrl_measured']:.0f} times measured"
+            )
+            for row in rows
+            if row["method"] != "KGRL"
+        },
+        "condition": "gains give every method the same RMS for its hold, one demonstration deviation",
+    }
+
+
+def _wander(kind: str, variance: float, hold: int, seeds: Sequence[int], episodes: int) -> list[dict[str, Any]]:
+    """Episodes of random actions in the simulated plane, gains calibrated to an RMS of one standard deviation."""
+    gains = tuple(rms_gains(primitive_of(kind, variance), hold=hold).tolist())
+    arguments = {"guidance": kind, "hold": hold, "history_variance": variance, "gains": gains}
+    env = make_environment(TASK, arguments)
+    explored = [row for seed in seeds for row in random_episodes(env, seed, episodes)]
+    env.close()
+    return explored
+
+
+def _smoothness(kind: str, variance: float, hold: int, explored: list[dict[str, Any]]) -> dict[str, Any]:
+    primitive, rows = primitive_of(kind, variance), pd.DataFrame(explored)
+    quiet = _quiet(primitive)
+    deviation = np.sqrt((primitive.reference.standard_deviations**2).mean(0))
+    moved = [((path - quiet[: len(path)]) / deviation) ** 2 for path in rows["commanded"]]
+    return {
+        "method": label(kind),
+        "hold": hold,
+        "history_variance": variance if kind == "skgrl" else None,
+        "rms_in_deviations": float(np.sqrt(np.mean(np.concatenate(moved)))),
+        "jerk_commanded": float(np.mean(rows["jerk_commanded_linear"])),
+        "jerk_measured": float(np.mean(rows["jerk_measured_linear"])),
+        **summary(rows, ("episodes", "success_rate", "collisions", "worst_violation")),
+    }
+
+
+def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
+    """Return and its two costs, and jerk while learning.
+
+    Drawn for runs whose first ten episodes each keep to one random action; the table also has those that explore anew
+    at every decision, as sKGRL then depends on the seed.
+    """
+    groups = {}
+    for words, preset in (("first ten episodes constant", "steady"), ("exploring anew at every decision", "quick")):
+        study = figure_study(
+            "narrow_passage",
+            seeds=seeds,
+            episodes=episodes,
+            methods=METHODS,
+            learner=LearnerChoice(preset=preset, episodes=60),
+            folder=f"runs/NarrowPassage/{{method}}-hold-5-observation-state-{preset}-{{episodes}}-{{seed}}",
+        )
+        groups[words] = run_study(study, out)
+    columns = {
+        "return": "return",
+        "reward_obstacle_cost": "obstacle cost",
+        "reward_action_cost": "action cost",
+        "jerk_commanded_linear": "commanded jerk [m/s³]",
+    }
+    figure, axes = learning_curves(next(iter(groups.values())), columns, (2, 2), (10, 7))
+    axes[1, 1].set_yscale("log")
+    found: dict[str, Any] = {}
+    for words, rows in groups.items():
+        for kind in METHODS:
+            avoided = each(rows[rows["method"] == kind], "training_avoids_obstacle_from")
+            found[f"{label(kind)}, {words}: obstacle avoided from episode"] = avoided
+            found[f"{label(kind)}, {words}: return of the last ten"] = mean_of_last(rows, kind, "return")
+            found[f"{label(kind)}, {words}: action cost"] = mean_of_last(rows, kind, "reward_action_cost")
+        kgrl, skgrl = (mean_of_last(rows, kind, "return") for kind in METHODS)
+        higher = "yes" if skgrl > kgrl else "no, not here"
+        found[f"sKGRL has the higher return, as in the thesis ({words})"] = higher
+    return {
+        **leave(out, "figure_5_6", figure, pd.concat([t.assign(exploration=words) for words, t in groups.items()])),
+        **found,
+        "condition": f"an action lasts {HOLD} control steps; the obstacle's cost is part of the return",
+    }
+
+
+def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
+    """sKGRL at the connector: an episode before anything is learned, that fails, and one after; four moments each."""
+    found = run_study(
+        figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], judged=False), out
+    )
+    learned = Shown.of_run(Path(found["folder"].iloc[0]))
+    unlearned = replace(learned, policy=partial(NullPolicy, white), acting="before learning")
+    figure, axes = new_figure(2, 4, (13, 6.2))
+    rows = []
+    for shown, panels, letter in ((unlearned, axes[0], "A"), (learned, axes[1], "B")):
+        row, frames = watch(_first(shown, success=shown is learned), len(panels))
+        draw_frames(panels, frames, letter)
+        kept = ("success", "termination", "steps", "peak_force", "worst_violation")
+        rows.append({"episode": shown.acting} | {key: row[key] for key in kept})
+    return {
+        **leave(out, "figure_5_7", figure, rows),
+        **{f"{row['episode']}, the episode ends in": row["termination"] for row in rows},
+        "condition": CONNECTOR,
+    }
+
+
+def _first(shown: Shown, *, success: bool) -> Shown:
+    """The first held-out episode that ends as is meant: white actions find the hole now and then. Nothing is drawn."""
+    env = make_environment(shown.task, shown.environment)
+    env.reset(seed=shown.run_seed)
+    try:
+        for k in range(EPISODES):
+            act = shown.policy(env)  # anew, as where it is shown: who acts at random goes on in his stream otherwise
+            if bool(rollout(env, act, seed=shown.seed + k, held_out=True)["success"]) == success:
+                return replace(shown, seed=shown.seed + k)
+    finally:
+        env.close()
+    raise InputError(f"{EPISODES} episodes {shown.acting} all ended alike: take more --episodes")
+
+
+def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
+    """Where exploring motions go: x and y over time, commanded and measured."""
+    figure, axes = new_figure(2, 2, (11, 6.4))
+    rows: list[dict[str, Any]] = []
+    for index, kind in enumerate(METHODS):
+        environment = {"guidance": kind, "uncertainty": "calibration", "reward": "shaped"}
+        env: Any = make_environment("BncConnector", environment)
+        for seed in range(seeds):
+            env.reset(seed=seed)
+            for row in random_episodes(env, seed, episodes):
+                time = env.unwrapped.trace.period * np.arange(1, len(row["commanded"]) + 1)
+                for output, name in enumerate("xy"):
+                    axis = axes[output, index]
+                    axis.plot(time, 1e3 * row["commanded"][:, output], color=colour(kind), linewidth=0.8)
+                    axis.plot(time, 1e3 * row["measured"][:, output], color="0.5", linewidth=0.8)
+                    axis.set(ylabel=f"{name} [mm]", xlabel="time [s]")
+                numbers = {key: row[key] for key in row if key.startswith(("jerk", "worst", "peak"))}
+                rows.append({"method": kind, **numbers})
+        env.close()
+        axes[0, index].set_title(f"{label(kind)}: commanded, and measured in grey")
+    for axis in axes.flat:
+        for bound in (-1e3 * ALIGNMENT, 1e3 * ALIGNMENT):
+            axis.axhline(bound, color="firebrick", linewidth=0.8)
+        axis.set_ylim(-1.2e3 * ALIGNMENT, 1.2e3 * ALIGNMENT)
+    return {
+        **leave(out, "figure_5_8", figure, rows),
+        "demonstrations": len(bnc_connector.load().outputs),
+        "condition": "random actions in x and y, held ten control steps, gains calibrated by authority",
+    }
+
+
+def figure_5_9(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
+    """Success and return of both while learning, and held-out success afterwards."""
+    rows = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes), out)
+    columns = {"success": "success", "return": "return", "mean_force": FORCE}
+    figure, _ = learning_curves(rows, columns, (1, 3), (13, 4))
+    return {**leave(out, "figure_5_9", figure, rows), **said(rows, LEARNED), "condition": CONNECTOR}
+
+
+def figure_5_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
+    """Mean jerk of the first ten training episodes, linear and angular, commanded and measured."""
+    found = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes, judged=False), out)
+    figure, (axes,) = new_figure(1, 2, (10, 4.4))
+    rows: list[dict[str, Any]] = []
+    for axis, part, unit in zip(axes, ("linear", "angular"), ("m/s³", "rad/s³"), strict=True):
+        boxes, labels = [], []
+        for kind in METHODS:
+            for which in ("commanded", "measured"):
+                values = np.concatenate([run[f"jerk_{which}_{part}"].head(10) for run in episodes_of(found, kind)])
+                boxes.append(values)
+                labels.append(f"{label(kind)}\n{which}")
+                numbers = {"median": np.median(values), "lowest": np.min(values), "highest": np.max(values)}
+                rows.append({"part": part, "method": kind, "which": which, **numbers})
+        axis.boxplot(boxes, tick_labels=labels)
+        axis.set(yscale="log", ylabel=f"mean {part} jerk [{unit}]")
+    median = {(row["part"], row["which"], row["method"]): row["median"] for row in rows}
+    return {
+        **leave(out, "figure_5_10", figure, rows),
+        **{
+            f"sKGRL's {part} jerk below KGRL's, {which}": (
+                f"{median[part, which, 'kgrl'] / max(median[part, which, 'skgrl'], 1e-12):.1f} times"
+            )
+            for part in ("linear", "angular")
+            for which in ("commanded", "measured")
+        },
+        "condition": CONNECTOR
+        + "; each of the first eight episodes keeps to one action, which is smooth through either; gains calibrated by "
+        "authority, not by RMS (figure 5.5 and the study smoothness compare white actions at the same RMS)",
+    }

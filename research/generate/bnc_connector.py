@@ -1,0 +1,81 @@
+"""Records the BNC connector's demonstrations in simulation, those that insert and those that search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.diagrams.envs.recording import drive_along
+from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
+from guiderail.models.objects.bnc_connector import search_demonstrations as bnc_search
+from guiderail.models.objects.bnc_connector.demonstrations import NAMES, NUM_STEPS
+from guiderail.systems.recorder import Recording
+
+TIMES = CONTROL_PERIOD * np.arange(NUM_STEPS + 1)
+# [s] with which the demonstrations in this package were recorded.
+TIME_STEP = CONTROL_PERIOD / 4
+
+
+@dataclass(frozen=True)
+class Session:
+    """What is demonstrated, and where it is kept."""
+
+    motions: Callable[[int, np.ndarray], np.ndarray]
+    path: Path
+
+
+INSERT_SESSION = Session(bnc_connector.demonstrator_motions, bnc_connector.PATH)
+SEARCH_SESSION = Session(bnc_search.demonstrator_motions, bnc_search.PATH)
+
+
+def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
+    """One motion (N, 6) through the rails' impedance, and whether the plug was locked in the end."""
+    workcell = BncWorkcell()
+    driven, recording = drive_along(RailsStation(workcell, time_step=TIME_STEP), TIMES, motion)
+    return recording, workcell.is_locked(workcell.plug_in_locked_frame(driven.station.plant, driven.plant_context))
+
+
+def record_session(session: Session, seed: int) -> list[Recording] | None:
+    """All demonstrations of a session; None if one of them doesn't end locked."""
+    recorded = [record_one(motion) for motion in session.motions(seed, TIMES)]
+    return [recording for recording, _ in recorded] if all(is_locked for _, is_locked in recorded) else None
+
+
+def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
+    """The arrays of the demonstrations' file: the first session in which every demonstration ends locked."""
+    for seed in seeds:
+        if (recordings := record_session(session, seed)) is not None:
+            break
+    else:
+        raise InputError(f"no session of the seeds {seeds} ends locked every time: give more seeds")
+
+    def stacked(name: str) -> np.ndarray:
+        return np.stack([recording[name] for recording in recordings])
+
+    return {
+        "times": recordings[0].times,
+        "outputs": stacked("desired_pose"),
+        "names": np.array(NAMES),
+        # What was measured is kept to single precision: a nanometre.
+        "measured": stacked("pose").astype(np.float32),
+        "wrench": stacked("wrench").astype(np.float32),
+        "contact_force": stacked("contact_force")[..., 0].astype(np.float32),
+        "seed": np.array(seed),
+        "stiffness": np.array(Impedance().stiffness),
+        "frame": np.array("T: the locked plug on the nominal jack; [x y z Rz Ry Rx], R = Rz Ry Rx"),
+        "source": np.array("scripted demonstrator on the rails station, through its impedance; outputs are commands"),
+    }
+
+
+def main(folder: Path | None = None, session: Session = INSERT_SESSION) -> None:
+    """Writes the file of a session into a folder, its own unless given."""
+    arrays: dict[str, Any] = record(session, range(100))
+    np.savez_compressed((folder or session.path.parent) / session.path.name, **arrays)

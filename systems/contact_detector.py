@@ -1,0 +1,115 @@
+"""Contact between two sets of bodies, checked at every step of the plant."""
+
+from collections.abc import Sequence
+
+from pydrake.common.value import Value
+from pydrake.multibody.plant import ContactResults, MultibodyPlant
+from pydrake.multibody.tree import RigidBody
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
+
+from guiderail.models.common.errors import InputError
+from guiderail.systems.support.sampling import check_period
+
+
+class ContactWatch(LeafSystem):
+    """Detects contact between bodies and obstacles, at the present plant step and since the episode began.
+
+    The plant's contact results are evaluated at every plant step: a collision that is shorter than a control step
+    counts. All outputs are state: they are one plant step old and never feed through.
+
+    .. pydrake_system::
+
+        name: ContactWatch
+        input_ports:
+        - contact_results
+        output_ports:
+        - collision
+        - touched
+        - contact_force
+
+    ``contact_results`` is the plant's. ``collision`` is (1,): 1 while they are in contact; ``touched`` is (1,): 1 from
+    the first contact on; ``contact_force`` is (1,), the norm of the largest force between the two sets [N]. Point
+    contact and hydroelastic contact both count.
+    """
+
+    def __init__(
+        self, plant: MultibodyPlant, bodies: Sequence[RigidBody], obstacles: Sequence[RigidBody], period: float
+    ):
+        """
+        Args:
+            plant: finalized.
+            bodies: that must not touch `obstacles`.
+            obstacles: that must not be touched; no body may be in both.
+            period: of the plant's step [s], positive.
+
+        Raises:
+            InputError: if the period is not positive, or a body is its own obstacle.
+        """
+        super().__init__()
+        check_period(period)
+        self._bodies = {int(body.index()) for body in bodies}
+        self._obstacles = {int(body.index()) for body in obstacles}
+        if self._bodies & self._obstacles:
+            raise InputError("a body can't collide with itself: bodies and obstacles overlap")
+        self._body_of = {
+            geometry: int(body.index())
+            for body in (*bodies, *obstacles)
+            for geometry in plant.GetCollisionGeometriesForBody(body)
+        }
+        self._contact_results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
+        self._collision, self._touched, self._contact_force = (self.DeclareDiscreteState(1) for _ in range(3))
+        self._collision_port = self.DeclareStateOutputPort("collision", self._collision)
+        self._touched_port = self.DeclareStateOutputPort("touched", self._touched)
+        self._contact_force_port = self.DeclareStateOutputPort("contact_force", self._contact_force)
+        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def get_contact_results_input_port(self) -> InputPort:
+        """The plant's contact results."""
+        return self._contact_results_port
+
+    def get_collision_output_port(self) -> OutputPort:
+        """1 while they are in contact, (1,)."""
+        return self._collision_port
+
+    def get_touched_output_port(self) -> OutputPort:
+        """1 from the first contact of the episode on, (1,)."""
+        return self._touched_port
+
+    def get_contact_force_output_port(self) -> OutputPort:
+        """The largest force between the two sets, (1,) [N]."""
+        return self._contact_force_port
+
+    def _force(self, context: Context) -> float | None:
+        """The largest force [N] between the two sets; None where they are not in contact."""
+        results: ContactResults = self._contact_results_port.Eval(context)
+        largest: float | None = None
+        for i in range(results.num_point_pair_contacts()):
+            pair = results.point_pair_contact_info(i)
+            if self._is_collision(int(pair.bodyA_index()), int(pair.bodyB_index())):
+                f = pair.contact_force()
+                largest = max(largest or 0.0, float(f @ f) ** 0.5)
+        for i in range(results.num_hydroelastic_contacts()):
+            info = results.hydroelastic_contact_info(i)
+            surface = info.contact_surface()
+            bodies = [self._body_of.get(geometry, -1) for geometry in (surface.id_M(), surface.id_N())]
+            if self._is_collision(*bodies):
+                f = info.F_Ac_W().translational()
+                largest = max(largest or 0.0, float(f @ f) ** 0.5)
+        return largest
+
+    def _is_collision(self, a: int, b: int) -> bool:
+        return (a in self._bodies and b in self._obstacles) or (b in self._bodies and a in self._obstacles)
+
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        for index in (self._collision, self._touched, self._contact_force):
+            discrete_state.set_value(index, [0.0])
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        force = self._force(context)
+        discrete_state.set_value(self._collision, [float(force is not None)])
+        discrete_state.set_value(self._contact_force, [force or 0.0])
+        if force is not None:
+            discrete_state.set_value(self._touched, [1.0])
+        return EventStatus.Succeeded()

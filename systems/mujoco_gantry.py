@@ -1,0 +1,321 @@
+"""A workcell on six rails, stepped by MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from pydrake.common.value import AbstractValue, Value
+from pydrake.geometry import FramePoseVector
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex, RigidBody
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import POSE_SIZE, pose_to_transform
+from guiderail.systems.support.sampling import check_period
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+from importlib import import_module
+from types import ModuleType
+
+
+def mujoco_engine() -> ModuleType:
+    """The module `mujoco`.
+
+    Raises:
+        InputError: if it isn't installed.
+    """
+    try:
+        return import_module("mujoco")
+    except ModuleNotFoundError:
+        raise InputError(
+            "station='mujoco' needs the package mujoco, which is not installed: pip install 'guiderail[mujoco]'"
+        ) from None
+
+
+class DivergedError(RuntimeError):
+    """An engine's state is nothing that the physics could have led to."""
+
+
+class MovedBodies(NamedTuple):
+    """Bodies of a plant that the engine moves, or places anew: the fixture, the tool, and what is fixed to the tool."""
+
+    fixture: RigidBody
+    tool: RigidBody
+    workpiece: RigidBody
+
+
+class _Nominal(NamedTuple):
+    """What `set_contact` multiplies, as the model was given; the names are MuJoCo's."""
+
+    timestep: float
+    geom_friction: np.ndarray
+    jnt_stiffness: np.ndarray
+    dof_damping: np.ndarray
+    geom_solref: np.ndarray
+
+
+class MujocoRails(LeafSystem):
+    """Steps a MuJoCo model whose first six joints are x, y, z, Rz, Ry, Rx of a tool in a target frame T.
+
+        M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
+
+    with the engine's own contact forces f; w is their wrench on the tool at its centre, in the axes of T. A plant
+    that doesn't move says where the fixture stands and how the workpiece sits in the tool, offsets included: the
+    model's own bodies are put there before every step.
+
+    .. pydrake_system::
+
+        name: MujocoRails
+        input_ports:
+        - desired_pose
+        - nominal_body_poses
+        output_ports:
+        - pose
+        - wrench
+        - impedance_wrench
+        - body_poses
+        - geometry_poses
+
+    ``desired_pose`` and ``pose`` are (6,), X_TP as [x y z Rz Ry Rx]. ``nominal_body_poses`` is the plant's,
+    ``body_poses`` the same with tool and workpiece where they are, ``geometry_poses`` those of all frames with
+    geometry. ``wrench`` is the filtered y, (6,), force first, in N and Nm; ``impedance_wrench`` is (6,), what the six
+    motors push with, in the order of the pose. All that changes is declared state: the engine's positions, velocities
+    and warm start, and the filter.
+
+    Where the engine diverges an update raises a `DivergedError`; the engine's own way, to go on from its zero, would
+    put the tool at the target.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        plant: MultibodyPlant,
+        moved: MovedBodies,
+        X_WT: RigidTransform,
+        period: float,
+        time_constant: float,
+    ):
+        """
+        Args:
+            model: with bodies of the names in `MovedBodies`; this system writes to it.
+            plant: finalized, without joints, and registered as a source of geometry.
+            moved: which of its bodies are the model's.
+            X_WT: the target frame in the plant's world; it is the model's world.
+            period: of an update [s], positive, a whole number of the model's steps.
+            time_constant: τ of the wrench's filter [s]; 0 disables it.
+
+        Raises:
+            InputError: if a number is out of range, or the model's step does not divide the period.
+        """
+        super().__init__()
+        check_period(period)
+        if not 0.0 <= time_constant < np.inf:
+            raise InputError(f"a wrench sensor's time constant must not be negative, not {time_constant} s")
+        step = float(model.opt.timestep)
+        self._num_steps = round(period / step)
+        if abs(self._num_steps * step - period) > 1e-9:
+            raise InputError(f"MuJoCo's step of {step} s does not divide the period of {period} s")
+        self._mujoco = mujoco_engine()
+        model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        # Scratch: every update writes all that it depends on, so that nothing in it outlives one.
+        self.model, self._data = model, self._mujoco.MjData(model)
+        # Diverged; or out of memory, where the engine goes on without the contacts that it has no room for.
+        failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
+        self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
+        # With the solver's warm start, so that a state that is restored goes on identically.
+        self._parts = self._mujoco.mjtState.mjSTATE_INTEGRATION
+        self._time_constant = time_constant
+        self._X_WT, self._X_TW = X_WT, X_WT.inverse()
+        self._fixture, self._workpiece = (model.body(name).id for name in ("fixture", "workpiece"))
+        self._moved = MovedBodies(*(int(body.index()) for body in moved))
+        self._frames = _geometry_frames(plant)
+        size = self._mujoco.mj_stateSize(model, self._parts)
+        self._physics = slice(0, size)
+        self._filtered = slice(size, size + 6)
+        # The engine's state begins with its time, the positions and the velocities.
+        self._positions = slice(1, 1 + POSE_SIZE)
+        self._velocities = slice(1 + model.nq, 1 + model.nq + POSE_SIZE)
+        poses = plant.get_body_poses_output_port()
+        self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
+        self._nominal_body_poses_port = self.DeclareAbstractInputPort("nominal_body_poses", poses.Allocate())
+        self._nominal = _Nominal(step, *(getattr(model, name).copy() for name in _Nominal._fields[1:]))
+        self._factors = self.DeclareNumericParameter(BasicVector(np.ones(2)))
+        self._state = self.DeclareDiscreteState(self._at_rest(np.zeros(POSE_SIZE)))
+        state = {self.discrete_state_ticket(self._state)}
+        placed = state | {self._nominal_body_poses_port.ticket()}
+
+        def part(name: str, which: slice) -> OutputPort:
+            def calc(context: Context, output: BasicVector) -> None:
+                output.SetFromVector(self._values(context)[which])
+
+            return self.DeclareVectorOutputPort(name, 6, calc, prerequisites_of_calc=state)
+
+        self._pose_port = part("pose", self._positions)
+        self._wrench_port = part("wrench", self._filtered)
+        self._impedance_wrench_port = self.DeclareVectorOutputPort(
+            "impedance_wrench",
+            6,
+            self._calc_impedance_wrench,
+            prerequisites_of_calc=state | {self._desired_pose_port.ticket()},
+        )
+        self._body_poses_port = self.DeclareAbstractOutputPort(
+            "body_poses", poses.Allocate, self._calc_body_poses, prerequisites_of_calc=placed
+        )
+        self._geometry_poses_port = self.DeclareAbstractOutputPort(
+            "geometry_poses",
+            lambda: Value(FramePoseVector()),
+            self._calc_geometry_poses,
+            prerequisites_of_calc=placed,
+        )
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def get_desired_pose_input_port(self) -> InputPort:
+        """Where the tool centre shall be, (6,)."""
+        return self._desired_pose_port
+
+    def get_nominal_body_poses_input_port(self) -> InputPort:
+        """The body poses of the plant that doesn't move."""
+        return self._nominal_body_poses_port
+
+    def get_pose_output_port(self) -> OutputPort:
+        """Where the tool centre is, (6,)."""
+        return self._pose_port
+
+    def get_wrench_output_port(self) -> OutputPort:
+        """The filtered wrench of the surroundings on the tool, (6,), force first."""
+        return self._wrench_port
+
+    def get_impedance_wrench_output_port(self) -> OutputPort:
+        """What the six motors push with, (6,)."""
+        return self._impedance_wrench_port
+
+    def get_body_poses_output_port(self) -> OutputPort:
+        """The poses of all bodies of the plant, those that moved included."""
+        return self._body_poses_port
+
+    def get_geometry_poses_output_port(self) -> OutputPort:
+        """The poses of all frames with geometry, for a scene graph."""
+        return self._geometry_poses_port
+
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Puts the tool at rest at `pose`, (6,); `context` is this system's own."""
+        context.SetDiscreteState(self._state, self._at_rest(pose))
+
+    def set_contact(self, context: Context, friction: float, modulus: float) -> None:
+        """Multiplies all friction, and the stiffness of contacts and springs; `context` is this system's own.
+
+        What is stiffer is stepped more finely: √modulus times, or the next whole number of times.
+        """
+        context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
+
+    def _at_rest(self, pose: np.ndarray) -> np.ndarray:
+        self._mujoco.mj_resetData(self.model, self._data)
+        self._data.qpos[:POSE_SIZE] = pose
+        return np.concatenate([self._engine_state(), np.zeros(6)])
+
+    def _engine_state(self) -> np.ndarray:
+        state = np.empty(self._physics.stop)
+        self._mujoco.mj_getState(self.model, self._data, state, self._parts)
+        return state
+
+    def _values(self, context: Context) -> np.ndarray:
+        return context.get_discrete_state(self._state).value()
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        model, data = self.model, self._data
+        state = self._values(context)
+        self._place(self._nominal_body_poses_port.Eval(context))
+        finer = self._soften(*context.get_numeric_parameter(self._factors).value())
+        self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
+        data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
+        for warning in self._failures:
+            data.warning[warning].number = 1  # of the first one the engine would write a file in the working directory
+        filtered = state[self._filtered]
+        decay = np.exp(-model.opt.timestep / self._time_constant) if self._time_constant > 0.0 else 0.0
+        for _ in range(finer * self._num_steps):
+            self._mujoco.mj_step(model, data)
+            self._check_warnings()
+            newest = self._contact_wrench()
+            filtered = newest + decay * (filtered - newest)
+        following = np.concatenate([self._engine_state(), filtered])
+        if not np.isfinite(following).all():
+            raise DivergedError("the simulation failed in MuJoCo: its state is not finite")
+        discrete_state.set_value(self._state, following)
+        return EventStatus.Succeeded()
+
+    def _check_warnings(self) -> None:
+        numbers = self._data.warning.number[self._failures]
+        if numbers.max() > 1:
+            warning = self._failures[int(numbers.argmax())]
+            about = int(self._data.warning[warning].lastinfo)
+            raise DivergedError(f"the simulation failed in MuJoCo: {self._mujoco.mju_warningText(warning, about)}")
+
+    def _place(self, poses: list[RigidTransform]) -> None:
+        X_TFixture = self._X_TW @ poses[self._moved.fixture]
+        X_PWorkpiece = poses[self._moved.tool].InvertAndCompose(poses[self._moved.workpiece])
+        for body, X in ((self._fixture, X_TFixture), (self._workpiece, X_PWorkpiece)):
+            self.model.body_pos[body] = X.translation()
+            self.model.body_quat[body] = X.rotation().ToQuaternion().wxyz()
+
+    def _soften(self, friction: float, modulus: float) -> int:
+        """Sets the model's contact; returns how many steps take the place of one.
+
+        A spring's natural frequency times the step, and a contact's time constant in steps, stay what the engine
+        integrates; a spring that is stiffer keeps its damping ratio.
+        """
+        model, nominal = self.model, self._nominal
+        finer = max(math.ceil(math.sqrt(modulus) - 1e-9), 1)
+        model.opt.timestep = nominal.timestep / finer
+        model.geom_friction[:] = nominal.geom_friction * friction
+        model.jnt_stiffness[:] = nominal.jnt_stiffness * modulus
+        model.dof_damping[:] = nominal.dof_damping * math.sqrt(max(modulus, 1.0))
+        constants = nominal.geom_solref[:, 0] / math.sqrt(modulus)
+        model.geom_solref[:, 0] = np.maximum(constants, 2.0 * model.opt.timestep)
+        return finer
+
+    def _contact_wrench(self) -> np.ndarray:
+        """What the contacts do to the joints, turned back: slides are T's axes, about hinges a torque t does a · t."""
+        generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
+        return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
+
+    def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:
+        """What the motors push with now, by the law that the engine's actuators follow."""
+        model, state = self.model, self._values(context)
+        springs, dampers = model.actuator_gainprm[:POSE_SIZE, 0], -model.actuator_biasprm[:POSE_SIZE, 2]
+        pull = springs * (self._desired_pose_port.Eval(context) - state[self._positions])
+        limits = model.actuator_forcerange[:POSE_SIZE]
+        output.SetFromVector(np.clip(pull - dampers * state[self._velocities], limits[:, 0], limits[:, 1]))
+
+    def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
+        poses = list(self._nominal_body_poses_port.Eval(context))
+        X_PWorkpiece = poses[self._moved.tool].InvertAndCompose(poses[self._moved.workpiece])
+        X_WP = self._X_WT @ pose_to_transform(self._values(context)[self._positions])
+        poses[self._moved.tool], poses[self._moved.workpiece] = X_WP, X_WP @ X_PWorkpiece
+        output.set_value(poses)
+
+    def _calc_geometry_poses(self, context: Context, output: AbstractValue) -> None:
+        poses, vector = self._body_poses_port.Eval(context), FramePoseVector()
+        for body, frame in self._frames:
+            vector.set_value(frame, poses[body])
+        output.set_value(vector)
+
+
+def _geometry_frames(plant: MultibodyPlant) -> list[tuple[int, object]]:
+    """Bodies and the frames that their geometry is on; the world's needs no pose."""
+    frames = [(i, plant.GetBodyFrameIdIfExists(BodyIndex(i))) for i in range(1, plant.num_bodies())]
+    return [(body, frame) for body, frame in frames if frame is not None]

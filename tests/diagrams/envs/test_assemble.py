@@ -1,0 +1,51 @@
+"""What is known about a task, and on which stations."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from guiderail import make_env
+from guiderail.diagrams.envs.assemble import known_of
+from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.stations.arm import ArmStation
+from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import ReferenceTrajectory
+
+PERIOD = 0.02
+
+
+def known(turn, station, period=PERIOD):
+    """Of a motion that turns by so much [rad] about z."""
+    means = np.zeros((30, 6))
+    means[:, 3] = np.linspace(0.0, turn, 30)
+    reference = ReferenceTrajectory(PERIOD * np.arange(30), means, np.tile(1e-6 * np.eye(6), (30, 1, 1)))
+    task = SimpleNamespace(
+        knows=lambda: {"demonstrations"}, reference=lambda: reference, constraints=lambda: None, isotropic_groups=None
+    )
+    where = SimpleNamespace(
+        wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=period, nominal_period=period
+    )
+    return known_of(task, where, {}, {})
+
+
+@pytest.mark.parametrize("period", [0.01, 0.1])
+def test_a_motion_keeps_the_speed_at_which_it_was_demonstrated(period):
+    with pytest.raises(InputError, match="of another speed than was demonstrated"):
+        known(1.0, RailsStation, period)
+
+
+def test_a_clock_that_is_disturbed_is_no_other_demonstration():
+    env = make_env("BncConnector", control_period=0.01)
+    assert env.unwrapped.task.diagram.GetSubsystemByName("station").control_period == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
+def test_a_half_turn_is_for_stations_whose_angles_do_not_jump(turn):
+    """From −180° to 180° a measured angle jumps by a full turn, and a history of it would lead all the way round."""
+    assert known(turn, RailsStation).demonstrations is not None
+    for station in (ArmStation, HardwareStation):
+        with pytest.raises(InputError, match="jumps by a full turn at 180°"):
+            known(turn, station)
+        assert known(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None

@@ -1,0 +1,34 @@
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import pytest
+from pydrake.geometry import SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import DiagramBuilder
+
+from guiderail.diagrams.envs.cameras import Camera, add_camera
+
+RENDERS = """
+import gymnasium
+env = gymnasium.make("guiderail.diagrams:guiderail/NarrowPassage-v0", guidance="kgrl", observation="image")
+env.reset(seed=0)
+import torch._dynamo
+env.step(env.action_space.sample())
+"""
+
+
+def test_what_has_an_llvm_of_its_own_is_there_before_anything_is_rendered(tmp_path, monkeypatch):
+    (tmp_path / "triton.py").write_text("")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "triton", raising=False)
+    builder, scene_graph = DiagramBuilder(), SceneGraph()
+    builder.AddSystem(scene_graph)
+    camera = Camera((8, 8), 1.0, RigidTransform())
+    add_camera(builder, scene_graph, scene_graph.get_query_output_port(), "camera", camera)
+    assert sys.modules.pop("triton").__file__ == str(tmp_path / "triton.py")
+
+
+@pytest.mark.skipif(find_spec("triton") is None, reason="only PyTorch with CUDA brings Triton")
+def test_pytorch_can_import_its_compiler_after_a_render():
+    assert subprocess.run([sys.executable, "-c", RENDERS], timeout=300).returncode == 0

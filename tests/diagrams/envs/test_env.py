@@ -1,0 +1,329 @@
+"""What `DrakeGymEnv` gets wrong, on a task so small that every number is known."""
+
+import gymnasium
+import numpy as np
+import pytest
+from pydrake.gym import DrakeGymEnv
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from guiderail.diagrams.envs.env import SAID, GuidedEnv
+from guiderail.diagrams.envs.task_diagram import TaskDiagram, exact_period
+from guiderail.models.common.errors import InputError
+
+TICK = exact_period(0.02)
+SUBSTEPS = 5
+PERIOD = SUBSTEPS * TICK
+SOLVER_FAILURE = "The SAP solver failed to converge at simulation time = 0.1."
+
+
+class Toy(LeafSystem):
+    """A position that the held action moves by a tenth per control step; it says what an environment must know.
+
+    State: position, what initialization saw, fast ticks so far, the action of this control step.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.error: Exception | None = None
+        self.action = self.DeclareVectorInputPort("action", 1)
+        self.state = self.DeclareDiscreteState(4)
+        self.DeclareInitializationDiscreteUpdateEvent(self.initialize)
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self.control)
+        self.DeclarePeriodicDiscreteUpdateEvent(TICK, 0.0, self.tick)
+
+        def port(name, size, value):
+            self.DeclareVectorOutputPort(
+                name,
+                size,
+                lambda context, output: output.SetFromVector(np.atleast_1d(value(self.x(context)))),
+                prerequisites_of_calc={self.xd_ticket()},
+            )
+
+        port("observation", 4, lambda x: x)
+        port("reward", 1, lambda x: 2 * x[0] + 1)
+        port("double", 1, lambda x: 2 * x[0])
+        port("one", 1, lambda x: 1.0)
+        port("termination", 1, lambda x: float(x[0] >= 0.95))
+        port("commanded_violation", 1, lambda x: x[0] - 1)
+        port("measured_violation", 1, lambda x: x[0] - 2)
+        port("contact_force", 1, lambda x: 10 * x[0])
+        port("ledger", 2, lambda x: [x[0], x[2]])
+        port("desired_pose", 1, lambda x: x[0] + x[3])
+        port("pose", 1, lambda x: x[0])
+        port("fallback", 1, lambda x: float(abs(x[0] - 0.3) < 1e-9))
+
+    def x(self, context):
+        return context.get_discrete_state(self.state).value()
+
+    def initialize(self, context, state):
+        x = self.x(context).copy()
+        x[1] = x[0]
+        state.set_value(x)
+
+    def control(self, context, state):
+        if self.error is not None:
+            raise self.error
+        x = state.value().copy()
+        x[3] = self.action.Eval(context)[0]
+        x[0] += 0.1 * x[3]
+        state.set_value(x)
+
+    def tick(self, context, state):
+        x = state.value().copy()
+        x[2] += 1
+        state.set_value(x)
+
+
+def make(num_steps=20, **arguments):
+    builder = DiagramBuilder()
+    toy = builder.AddNamedSystem("toy", Toy())
+    builder.ExportInput(toy.get_input_port(), "action")
+    for i in range(toy.num_output_ports()):
+        builder.ExportOutput(toy.get_output_port(i), toy.get_output_port(i).get_name())
+
+    def randomize(context, rng, options):
+        start = options.get("start", rng.uniform(-0.5, -0.4))
+        toy.GetMyMutableContextFromRoot(context).get_mutable_discrete_state(toy.state).SetAtIndex(0, start)
+        return {"start": start}
+
+    task = TaskDiagram(
+        diagram=builder.Build(),
+        control_period=PERIOD,
+        num_steps=num_steps,
+        observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float32),
+        reward_terms=("double", "one"),
+        ledger_fields=("position", "ticks"),
+        randomize=randomize,
+    )
+    env = GuidedEnv(task, **arguments)
+    env.toy = toy
+    return env
+
+
+def test_info_says_everything_at_reset_and_at_every_step():
+    env = make()
+    expected = {*SAID, "double", "one"} - {"ledger", "simulation_failure"}  # of an episode that is over
+    _, info = env.reset(options={"start": 0.0})
+    assert set(info) == expected | {"start"}
+    assert info["constraint_violation"] == -1.0
+    _, reward, _, _, info = env.step([1.0])
+    assert set(info) == expected
+    assert info["contact_force"] == pytest.approx(1.0)
+    assert reward == pytest.approx(info["double"] + info["one"])
+
+
+def test_initialization_sees_the_new_episode():
+    env = make()
+    env.reset(options={"start": 0.5})
+    env.step([1.0])
+    observation, _ = env.reset(options={"start": -0.25})
+    np.testing.assert_array_equal(observation, np.float32([-0.25, -0.25, 0, 0]))
+
+
+def test_the_last_action_does_not_survive_a_reset():
+    env = make()
+    env.reset(options={"start": 0.0})
+    env.step([1.0])
+    env.reset(options={"start": 0.0})
+    env.simulator.AdvanceTo(PERIOD)
+    assert env.trace.measured.size == 0
+    assert env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context()) == [0.0]
+
+
+def test_same_seed_same_episodes_other_seed_other_ones():
+    def starts(seed):
+        env = make()
+        return [env.reset(seed=seed)[1]["start"], *(env.reset()[1]["start"] for _ in range(3))]
+
+    assert starts(3) == starts(3)
+    assert not set(starts(3)) & set(starts(4))
+    # Unseeded environments don't repeat each other, as a generator with a constant seed would make them.
+    assert starts(None) != starts(None)
+
+
+def test_takes_the_same_number_of_plant_steps_every_time():
+    env = make(num_steps=1000)
+    env.reset(options={"start": -1.0})
+    ticks = [0.0]
+    for _ in range(1000):
+        observation, *_ = env.step([0.0])
+        ticks.append(observation[2])
+    assert set(np.diff(ticks)) == {SUBSTEPS}
+
+
+def test_a_time_limit_truncates():
+    env = make(num_steps=3)
+    env.reset(options={"start": 0.0})
+    results = [env.step([0.0])[2:] for _ in range(3)]
+    assert [(terminated, truncated) for terminated, truncated, _ in results] == [(False, False)] * 2 + [(False, True)]
+    assert results[-1][2]["termination"] == "time_limit"
+    assert not results[-1][2]["is_success"]
+    assert results[-1][2]["ledger"] == {"position": 0.0, "ticks": 15.0}
+
+
+def test_a_success_in_the_last_step_is_no_time_limit():
+    env = make(num_steps=2)
+    env.reset(options={"start": 0.8})
+    env.step([1.0])
+    _, _, terminated, truncated, info = env.step([1.0])
+    assert (terminated, truncated, info["termination"], info["is_success"]) == (True, False, "success", True)
+
+
+def test_a_held_action_sums_the_reward_takes_the_worst_and_stops_early():
+    env = make(hold=4)
+    env.reset(options={"start": 0.0})
+    _, reward, terminated, _, info = env.step([1.0])
+    assert reward == pytest.approx(4 + 2 * (0.1 + 0.2 + 0.3 + 0.4))
+    assert info["one"] == 4
+    assert info["contact_force"] == pytest.approx(4.0)
+    _, _, _, _, info = env.step([-1.0])
+    assert info["constraint_violation"] == pytest.approx(0.3 - 1)  # the worst of the step, not its last
+    env.reset(options={"start": 0.75})
+    *_, terminated, _, info = env.step([1.0])
+    assert terminated
+    assert info["control_steps"] == 2
+
+
+def test_the_trace_has_every_control_step():
+    env = make(hold=3)
+    env.reset(options={"start": 0.0})
+    env.step([0.5])
+    env.step([-0.5])
+    np.testing.assert_allclose(env.trace.measured[:, 0], [0.05, 0.1, 0.15, 0.1, 0.05, 0.0], atol=1e-12)
+    np.testing.assert_allclose(env.trace.commanded[:3], env.trace.measured[:3] + 0.5)
+    np.testing.assert_allclose(env.trace.force, 10 * env.trace.measured[:, 0])
+    assert len(env.trace) == 6
+    env.reset()
+    assert len(env.trace) == 0
+
+
+@pytest.mark.parametrize("action", [[np.nan], [np.inf], [-np.inf], [0.5 + 1j], [0.0, 0.0], 0.0, "up", [[0.0]], None])
+def test_a_bad_action_is_refused_before_anything_moves(action):
+    env = make()
+    env.reset(options={"start": 0.0})
+    with pytest.raises(InputError, match="action"):
+        env.step(action)
+    assert env.simulator.get_context().get_time() == 0
+    observation, *_ = env.step([1.0])
+    assert observation[0] == np.float32(0.1)
+
+
+def test_a_finite_action_is_clipped():
+    env = make()
+    env.reset(options={"start": 0.0})
+    observation, *_ = env.step([1e9])
+    assert observation[0] == np.float32(0.1)
+
+
+@pytest.mark.parametrize("kind", [RuntimeError, ValueError, SystemExit, KeyboardInterrupt])
+def test_a_bug_in_the_wiring_is_not_mistaken_for_the_end_of_an_episode(kind):
+    env = make()
+    env.reset()
+    env.toy.error = kind("InputPort::Eval(): required InputPort[0] (u0) is not connected")
+    with pytest.raises(kind, match="not connected"):
+        env.step([0.0])
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError(SOLVER_FAILURE),
+        RuntimeError("Actuation input port for model instance robot contains NaN."),
+        SystemExit("Failure in SetPositionsAndVelocities(): condition 'AllFinite(q_v)' failed."),
+    ],
+)
+def test_a_simulation_failure_truncates_with_the_last_sound_observation(error):
+    env = make()
+    env.reset(options={"start": 0.0})
+    before, *_ = env.step([1.0])
+    env.toy.error = error
+    after, reward, terminated, truncated, info = env.step([1.0])
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info["simulation_failure"] == str(error)
+    assert info["termination"] == ""
+    assert info["constraint_violation"] == pytest.approx(0.1 - 1)
+    np.testing.assert_array_equal(after, before)
+    env.toy.error = None
+    env.reset(options={"start": 0.0})
+    assert env.step([1.0])[0][0] == np.float32(0.1)
+
+
+@pytest.mark.parametrize("options", ["x", "", 3, [], [("start", 0.0)]])
+def test_options_of_a_reset_that_are_no_mapping_are_a_sentence(options):
+    env = make()
+    with pytest.raises(InputError, match="the options of a reset are values by name"):
+        env.reset(options=options)
+    assert env.reset(options={"start": 0.0})[1]["start"] == 0.0
+    env.reset(options=None)
+
+
+def test_what_info_says_of_every_task_is_listed():
+    env = make(num_steps=2)
+    _, info = env.reset()
+    said = set(info) - set(env.drawn)
+    said |= set(env.step([0.0])[4])
+    env.toy.error = RuntimeError(SOLVER_FAILURE)
+    said |= set(env.step([0.0])[4])
+    env.toy.error = None
+    env.reset()
+    env.step([0.0])
+    said |= set(env.step([0.0])[4])
+    assert said - set(env.task.reward_terms) == set(SAID)
+
+
+def test_stepping_on_after_the_end_is_refused():
+    env = make(num_steps=1)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step([0.0])
+    env.reset()
+    env.step([0.0])
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step([0.0])
+
+
+def test_metadata_is_nobody_elses():
+    before = dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)
+    first, second = make(hold=1), make(hold=5)
+    assert (dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)) == before
+    assert (first.metadata["render_fps"], second.metadata["render_fps"]) == (10, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"render_mode": "rgb_array"}, "camera"),
+        ({"render_mode": "human"}, "Meshcat"),
+        ({"render_mode": "ascii"}, "render mode"),
+        ({"hold": 0}, "hold"),
+        ({"hold": 2.5}, "hold"),
+        ({"hold": True}, "hold"),
+    ],
+)
+def test_refuses_what_the_task_can_not_do(arguments, message):
+    with pytest.raises(InputError, match=message):
+        make(**arguments)
+
+
+def test_a_push_needs_a_robot_that_can_be_pushed():
+    with pytest.raises(InputError, match="pushed"):
+        make().push([1.0])
+
+
+def test_a_task_that_lacks_a_port_is_refused_by_name():
+    builder = DiagramBuilder()
+    toy = builder.AddNamedSystem("toy", Toy())
+    builder.ExportInput(toy.get_input_port(), "action")
+    builder.ExportOutput(toy.GetOutputPort("reward"), "reward")
+    with pytest.raises(ValueError, match="observation"):
+        TaskDiagram(builder.Build(), PERIOD, 3, gymnasium.spaces.Box(-1, 1, (4,)), (), ())
+
+
+def test_multiples_of_an_exact_period_are_exact():
+    period = exact_period(0.002)
+    assert period == pytest.approx(0.002, rel=1e-9)
+    k = np.arange(1, 10000)
+    assert all(10 * n * period == n * (10 * period) for n in range(1, 10000))
+    np.testing.assert_array_equal(np.cumsum(np.full(len(k), period)), k * period)
+    for nonsense in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError):
+            exact_period(nonsense)

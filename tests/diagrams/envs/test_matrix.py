@@ -1,0 +1,76 @@
+"""Every task with every guidance: what has all it needs runs an episode, the rest says what is missing."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.envs.make import make_env, make_skill, resolve
+from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS
+from guiderail.diagrams.guidance.registry import GUIDANCE, INGREDIENTS, possible_guidance
+from guiderail.diagrams.stations.registry import STATIONS, stations_for
+from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
+from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.models.common.errors import InputError
+
+OWN = [name for name in TASKS.names() if TASKS.get(name).__module__.startswith("guiderail.")]
+PAIRS = [(task, guidance) for task in OWN for guidance in GUIDANCE.names()]
+
+
+@pytest.mark.parametrize(("task", "guidance"), PAIRS)
+def test_a_pair_runs_or_says_what_is_missing(task, guidance):
+    knows = TASKS.get(task).knows()
+    if guidance not in possible_guidance(knows):
+        with pytest.raises(InputError) as error:
+            make_env(task, guidance=guidance)
+        message = str(error.value)
+        assert any(words in message for words in INGREDIENTS.values()), message
+        assert "\n" not in message
+        return
+    env = make_env(task, guidance=guidance, hold=25)
+    rng = np.random.default_rng(0)
+    _, info = env.reset(seed=0)
+    assert not info["fallback"]
+    for _ in range(4):
+        *_, terminated, truncated, info = env.step(rng.uniform(-0.3, 0.3, env.action_space.shape))
+        assert {"is_success", "termination", "control_steps", "fallback"} <= set(info)
+        if terminated or truncated:
+            break
+    assert info["control_steps"] == len(env.trace)
+    assert np.isfinite(env.trace.measured).all()
+
+
+@pytest.mark.parametrize("task", OWN)
+def test_both_contracts_hold_in_every_tasks_diagram(task):
+    for name in stations_for(TASKS.get(task).world_kind):
+        if STATIONS.get(name).simulated:
+            diagram = make_env(task, station=name).task.diagram
+        else:
+            with pytest.raises(InputError, match="guiderail run"):
+                make_env(task, station=name)
+            diagram = make_skill(task, lambda observation: observation, station=name, lcm_url="memq://").diagram
+        station, guidance = (diagram.GetSubsystemByName(part) for part in ("station", "guidance"))
+        assert all(station.HasInputPort(port) for port in STATION_INPUTS), name
+        assert all(station.HasOutputPort(port) for port in STATION_OUTPUTS), name
+        assert station.GetOutputPort("contact_force").size() == station.GetOutputPort("holding").size() == 1
+        assert station.GetInputPort("desired_pose").size() == station.GetOutputPort("pose").size()
+        assert all(guidance.HasInputPort(port) for port in INPUTS)
+        assert all(guidance.HasOutputPort(port) for port in OUTPUTS)
+
+
+@pytest.mark.parametrize("task", OWN)
+def test_resolved_options_resolve_to_themselves(task):
+    """What a run stores makes the same environment again."""
+    values = resolve(task, {}).values
+    assert resolve(task, values).values == values
+
+
+@pytest.mark.parametrize("task", OWN)
+def test_every_task_can_be_held_out(task):
+    env = make_env(task)
+    drawn = []
+    for options in ({}, {"held_out": True}, {"held_out": True}):
+        _, info = env.reset(seed=3, options=options)
+        drawn.append({key: np.array(value) for key, value in info.items() if isinstance(value, np.ndarray)})
+    usual, held_out, again = drawn
+    assert any((usual[key] != held_out[key]).any() for key in usual)
+    assert all((held_out[key] == again[key]).all() for key in usual)

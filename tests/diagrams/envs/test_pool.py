@@ -1,0 +1,142 @@
+"""What an environment leaves behind: nothing, and no trace of itself in the next one."""
+
+import gc
+import pickle
+
+import numpy as np
+import psutil
+import pytest
+
+from guiderail.diagrams.envs.make import make_env
+from guiderail.models.common.errors import InputError
+
+CASES = [
+    ("NarrowPassage", {"guidance": "safe_residual"}),
+    ("BncConnector", {"guidance": "kgrl", "adaptive_history": False}),
+    ("GridClamp", {"guidance": "sct"}),
+    ("Pouring", {"mug_offset": 0.02}),
+]
+
+
+def episode(env, seed):
+    """What a dozen random actions lead to, to the last bit."""
+    observation, info = env.reset(seed=seed)
+    seen, rng = [observation.tobytes(), repr(env.drawn)], np.random.default_rng(seed)
+    for _ in range(12):
+        observation, reward, terminated, truncated, info = env.step(rng.uniform(-1, 1, env.action_space.shape))
+        seen += [observation.tobytes(), reward, repr({k: v for k, v in info.items() if k != "ledger"})]
+        if terminated or truncated:
+            break
+    return [*seen, env.trace.commanded.tobytes(), env.trace.measured.tobytes(), env.trace.signals["wrench"].tobytes()]
+
+
+@pytest.mark.parametrize(("task", "options"), CASES)
+def test_an_episode_is_the_same_in_a_diagram_that_was_used_before(task, options):
+    first = make_env(task, **options, hold=2)
+    diagram = first.task.diagram
+    expected = episode(first, 3)
+    episode(first, 4)
+    first.close()
+    second = make_env(task, **options, hold=2)
+    assert second.task.diagram is diagram
+    # The first reset hides what is constant in a run: nothing of the run before is left.
+    assert episode(second, 3) == expected
+    third = make_env(task, **options, hold=2)
+    assert third.task.diagram is not diagram
+    assert episode(third, 3) == expected
+    second.close()
+    third.close()
+
+
+def test_two_environments_never_share_a_diagram():
+    env = make_env("NarrowPassage")
+    other, different = make_env("NarrowPassage"), make_env("NarrowPassage", kappa=2.0)
+    assert len({id(one.task.diagram) for one in (env, other, different)}) == 3
+    env.close()
+    env.close()  # gives back once
+    again, more = make_env("NarrowPassage"), make_env("NarrowPassage")
+    assert again.task.diagram is not more.task.diagram
+    assert {id(again.task.diagram), id(more.task.diagram)}.isdisjoint({id(other.task.diagram)})
+    for one in (other, different, again, more):
+        one.close()
+
+
+def test_a_diagram_whose_view_can_not_be_opened_is_free_again(monkeypatch):
+    env = make_env("NarrowPassage")
+    diagram = env.task.diagram
+    env.close()
+    with monkeypatch.context() as patch:
+        patch.setattr("guiderail.diagrams.envs.env.View", lambda query: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            make_env("NarrowPassage", render_mode="human")
+    again = make_env("NarrowPassage")
+    assert again.task.diagram is diagram
+    again.close()
+
+
+def test_a_closed_environment_stays_closed():
+    env = make_env("NarrowPassage")
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+    assert len(env.trace) > 0, "what it recorded stays"
+    with pytest.raises(InputError, match="is closed"):
+        env.reset()
+
+
+@pytest.mark.parametrize(("render_mode", "close"), [(None, False), ("human", False), ("human", True)])
+def test_nothing_grows(close, render_mode):
+    process, after = psutil.Process(), []
+    make_env("NarrowPassage", guidance="safe_residual").close()  # what the process starts once, and keeps
+    before = held(process)
+    for index in range(6):
+        env = make_env("NarrowPassage", guidance="safe_residual", render_mode=render_mode)
+        env.simulator.set_target_realtime_rate(0.0)
+        env.reset(seed=index)
+        env.step(env.action_space.sample())
+        if render_mode == "human":
+            assert env.task.meshcat.HasPath("/drake/visualizer/robot")
+            assert held(process)[:2] > before[:2]
+        if close:
+            env.close()
+        del env
+        gc.collect()
+        after.append((*held(process), process.memory_info().rss / 1e6))
+    assert {one[:3] for one in after} == {before}, "threads, descriptors and ports that are listened at"
+    assert after[-1][3] - after[1][3] < 5.0, "a diagram of its own each would be 9 MB"
+
+
+def held(process):
+    """How many threads, descriptors and ports a process has."""
+    listening = [one for one in process.net_connections() if one.status == psutil.CONN_LISTEN]
+    return process.num_threads(), process.num_fds(), len(listening)
+
+
+def test_a_view_shows_the_scene_as_it_moves_and_changes_nothing():
+    def motion(render_mode):
+        env = make_env("NarrowPassage", guidance="safe_residual", render_mode=render_mode)
+        env.simulator.set_target_realtime_rate(0.0)
+        env.reset(seed=0)
+        meshcat, shown = env.task.meshcat, []
+        for moves in (True, True, False):
+            if moves:
+                env.step(np.ones(2))
+            if meshcat is not None:
+                env.render()
+                shown.append(meshcat.StaticHtml())
+        poses = env.trace.measured.copy()
+        env.close()
+        assert env.task.meshcat is None
+        return poses, shown
+
+    poses, shown = motion("human")
+    assert shown[0] != shown[1] == shown[2]
+    np.testing.assert_array_equal(poses, motion(None)[0])
+
+
+def test_pickling_says_what_to_do_instead():
+    env = make_env("NarrowPassage")
+    with pytest.raises(InputError, match=r"cannot be pickled: call gymnasium.make in the worker") as error:
+        pickle.dumps(env)
+    assert "\n" not in str(error.value)
+    env.close()

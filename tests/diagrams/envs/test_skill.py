@@ -1,0 +1,74 @@
+"""A learned skill as a plain diagram does bit for bit what the environment does with the same policy."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import PassThrough
+
+from guiderail.diagrams.envs.make import make_env, make_skill
+from guiderail.models.common.errors import InputError
+
+CASES = {
+    "NarrowPassage": {"guidance": "skgrl", "hold": 5},
+    "BncConnector": {"guidance": "kgrl", "hold": 10, "uncertainty": "disc"},
+    "GridClamp": {"guidance": "sct", "hold": 5},
+    "Pouring": {"guidance": "sct", "hold": 10},
+}
+DECISIONS = 8
+
+
+def policy(size):
+    """Something that depends on every observed number, and on nothing else."""
+    return lambda observation: np.tanh(np.outer(np.arange(1, size + 1), np.sin(observation)).sum(axis=1)).astype(float)
+
+
+@pytest.mark.parametrize("task", CASES)
+def test_a_simulator_gives_bit_for_bit_what_the_environment_gives(task):
+    env = make_env(task, **CASES[task])
+    act = policy(env.action_space.shape[0])
+    observation, _ = env.reset(seed=3)
+    for _ in range(DECISIONS):
+        observation, *_ = env.step(act(observation))
+
+    skill = make_skill(task, act, **CASES[task])
+    simulator = Simulator(skill.diagram)
+    context = simulator.get_mutable_context()
+    skill.randomize(context, np.random.Generator(np.random.PCG64(np.random.SeedSequence(3))), {})
+    simulator.Initialize()
+    desired, measured = [], []
+    for step in range(1, DECISIONS * env.hold + 1):
+        simulator.AdvanceTo(step * skill.control_period)
+        desired.append(skill.diagram.GetOutputPort("desired_pose").Eval(context).copy())
+        measured.append(skill.diagram.GetOutputPort("pose").Eval(context).copy())
+    np.testing.assert_array_equal(desired[: len(env.trace)], env.trace.commanded)
+    np.testing.assert_array_equal(measured[: len(env.trace)], env.trace.measured)
+
+
+def test_its_parts_have_names_and_it_needs_no_reward():
+    skill = make_skill("NarrowPassage", policy(2), guidance="kgrl")
+    assert all(skill.diagram.HasSubsystemNamed(name) for name in ("observation", "policy", "guidance", "station"))
+    assert not skill.diagram.HasOutputPort("reward")
+
+
+def test_an_image_reaches_the_policy():
+    seen = []
+
+    def act(image):
+        seen.append(image.shape)
+        return np.zeros(2)
+
+    skill = make_skill("NarrowPassage", act, guidance="kgrl", observation="image")
+    simulator = Simulator(skill.diagram)
+    skill.randomize(simulator.get_mutable_context(), np.random.default_rng(0), {})
+    simulator.AdvanceTo(0.05)
+    assert seen == [(110, 144, 3)]
+
+
+def test_a_system_of_another_size_is_refused():
+    builder = DiagramBuilder()
+    system = builder.AddSystem(PassThrough(3))
+    builder.ExportInput(system.get_input_port(), "observation")
+    builder.ExportOutput(system.get_output_port(), "action")
+    with pytest.raises(InputError, match="sees 1 numbers and gives 2, this one 3 and 3"):
+        make_skill("NarrowPassage", builder.Build(), guidance="kgrl")

@@ -1,0 +1,35 @@
+"""An environment whose diagram was built for an earlier one is the same as if it were the first."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.envs.make import make_env
+
+CASES = {
+    "passage": ("NarrowPassage", {"difficulty": "hard", "guidance": "kgrl"}),
+    "pouring": ("Pouring", {"difficulty": "hard"}),
+    "connector": ("BncConnector", {"uncertainty": "disc"}),
+}
+
+
+def begun(task, options):
+    """What a policy sees at first and after a decision, and what was drawn, in two episodes."""
+    env = make_env(task, **options)
+    diagram, found = env.task.diagram, []
+    for seed in (1, 2):
+        observation, drawn = env.reset(seed=seed)
+        after = env.step(env.action_space.low)
+        found.append((observation, after[0], after[1], {k: v for k, v in drawn.items() if isinstance(v, np.ndarray)}))
+    env.close()
+    return diagram, found
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_a_reset_draws_reaches_a_diagram_that_is_used_again(case):
+    first, expected = begun(*CASES[case])
+    again, found = begun(*CASES[case])
+    assert again is first
+    for one, other in zip(expected, found, strict=True):
+        np.testing.assert_equal(other, one)
+    (*_, before), (*_, after) = expected
+    assert not all(np.array_equal(before[name], after[name]) for name in before)

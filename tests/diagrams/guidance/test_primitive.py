@@ -1,0 +1,234 @@
+"""All guidance made of a primitive: the same ports, and what sets each kind apart."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
+from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
+from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.registry import build_guidance, check_guidance
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
+from guiderail.models.primitives.gains import authority
+
+PERIOD, STEPS = 0.02, 60
+PRIMITIVE_GUIDANCE = ("kmp", "residual", "safe_residual", "kgrl", "skgrl")
+START = np.array([0.0, 0.0])
+
+
+def reference():
+    phase = np.linspace(0, 1, STEPS)
+    means = np.column_stack([0.1 * np.sin(3 * phase), 0.3 * phase])
+    deviations = np.column_stack([0.02 + 0.03 * np.sin(np.pi * phase), np.full(STEPS, 0.01)])
+    return ReferenceTrajectory(PERIOD * np.arange(STEPS), means, deviations[:, :, None] ** 2 * np.eye(2))
+
+
+@pytest.fixture(scope="module")
+def skill():
+    constraints = LinearConstraints([[-1.0, 0.0]], [-0.11])
+    wall = KeepOut([[0.13, -1.0]], [[0.2, 1.0]], constraints, margin=0.01)
+    return PrimitiveSkill(reference(), constraints, PERIOD, history=5, horizon=10, keep_out=wall, wrench_size=2)
+
+
+def build(kind, skill, task="this task"):
+    return build_guidance(kind, Known(skill.control_period, demonstrations=skill), task)
+
+
+def rollout(guidance, actions, pose=START, track=True):
+    """Commands and fallbacks of every control step; with `track` the robot is where it was commanded."""
+    simulator = Simulator(guidance)
+    context = simulator.get_mutable_context()
+    action = guidance.GetInputPort("action").FixValue(context, np.zeros(guidance.GetInputPort("action").size()))
+    measured = guidance.GetInputPort("pose").FixValue(context, pose)
+    guidance.GetInputPort("wrench").FixValue(context, np.zeros(guidance.GetInputPort("wrench").size()))
+    simulator.Initialize()
+    commands, fallbacks = [], []
+    for n, a in enumerate(actions):
+        action.GetMutableData().set_value(a)
+        simulator.AdvanceTo((n + 0.5) * PERIOD)
+        commands.append(guidance.GetOutputPort("desired_pose").Eval(context).copy())
+        fallbacks.append(guidance.GetOutputPort("fallback").Eval(context)[0])
+        if track:
+            measured.GetMutableData().set_value(commands[-1])
+    return np.array(commands), np.array(fallbacks)
+
+
+def constant(value):
+    return np.tile(value, (STEPS, 1))
+
+
+@pytest.mark.parametrize("kind", PRIMITIVE_GUIDANCE)
+def test_all_guidance_has_the_same_ports(skill, kind):
+    guidance = build(kind, skill)
+    inputs = [guidance.get_input_port(i).get_name() for i in range(guidance.num_input_ports())]
+    outputs = [guidance.get_output_port(i).get_name() for i in range(guidance.num_output_ports())]
+    assert (tuple(inputs), tuple(outputs)) == (INPUTS, OUTPUTS)
+    check_guidance_ports(guidance, pose_size=2, wrench_size=2)
+    with pytest.raises(InputError, match="port wrench of guidance 'guidance' has size 2, where 6 is needed"):
+        check_guidance_ports(guidance, pose_size=2, wrench_size=6)
+
+
+@pytest.mark.parametrize("kind", PRIMITIVE_GUIDANCE)
+def test_doing_nothing_follows_the_demonstrations(skill, kind):
+    commands, fallbacks = rollout(build(kind, skill), constant([0.0, 0.0]))
+    means = skill.reference.means
+    # Where the safe variants are not already avoiding what lies at x = 0.1.
+    free = means[:, 0] < 0.09
+    assert (np.abs(commands - means) < skill.reference.standard_deviations)[free].all()
+    assert not fallbacks[free].any()
+
+
+def test_the_demonstrations_alone_ignore_the_action(skill):
+    still, _ = rollout(build("kmp", skill), constant([0.0, 0.0]))
+    moved, _ = rollout(build("kmp", skill), constant([1.0, -1.0]))
+    np.testing.assert_array_equal(still, moved)
+
+
+def test_a_residual_is_alike_at_any_time_and_in_any_direction(skill):
+    still, _ = rollout(build("residual", skill), constant([0.0, 0.0]))
+    moved, _ = rollout(build("residual", skill), constant([1.0, -1.0]))
+    rms = np.sqrt(np.mean(skill.reference.standard_deviations**2))
+    np.testing.assert_allclose(moved - still, constant(np.sqrt(3) * rms * np.array([1, -1])), atol=1e-12)
+
+
+def test_null_space_actions_go_as_far_as_the_demonstrations_varied(skill):
+    free = replace(skill, constraints=LinearConstraints.none(2), keep_out=None)
+    still, _ = rollout(build("kgrl", free), constant([0.0, 0.0]))
+    moved, _ = rollout(build("kgrl", free), constant([1.0, 0.0]))
+    offset = np.abs(moved - still)[:, 0]
+    deviation = skill.reference.standard_deviations[:, 0]
+    assert np.corrcoef(offset, deviation)[0, 1] > 0.95
+    primitive = free.primitive(history=False)
+    np.testing.assert_allclose(authority(primitive, free.null_space_gains(primitive)), np.sqrt(3), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["kgrl", "skgrl"])
+def test_null_space_guidance_keeps_the_constraints_whatever_the_action(skill, kind):
+    rng = np.random.default_rng(0)
+    for actions in (constant([1.0, 1.0]), rng.uniform(-1, 1, (STEPS, 2)), rng.choice([-1.0, 1.0], (STEPS, 2))):
+        commands, _ = rollout(build(kind, skill), actions)
+        assert commands[:, 0].max() <= 0.11 + 1e-9
+
+
+def test_the_safe_residual_stops_before_walls_and_says_so(skill):
+    commands, fallbacks = rollout(build("safe_residual", skill), constant([1.0, 0.0]))
+    unsafe, _ = rollout(build("residual", skill), constant([1.0, 0.0]))
+    assert unsafe[:, 0].max() > 0.13
+    assert commands[:, 0].max() <= 0.10 + 1e-9
+    assert set(fallbacks) <= {0.0, 1.0}
+
+
+def test_smooth_guidance_starts_where_the_robot_is(skill):
+    elsewhere = START + [0.02, -0.01]
+    jump = {}
+    for kind in ("kgrl", "skgrl"):
+        commands, _ = rollout(build(kind, skill), constant([0.0, 0.0]), pose=elsewhere, track=False)
+        jump[kind] = np.linalg.norm(commands[0] - elsewhere)
+    assert jump["kgrl"] > 0.02
+    assert jump["skgrl"] < 0.005
+
+
+def test_a_measured_history_follows_the_robot_and_a_commanded_one_does_not(skill):
+    pushed = np.array([-0.05, 0.1])
+
+    def command_after(source):
+        guidance = build("skgrl", replace(skill, history_source=source))
+        return rollout(guidance, constant([0.0, 0.0])[:20], pose=pushed, track=False)[0][-1]
+
+    # Someone holds the robot where the demonstrations are not.
+    assert np.linalg.norm(command_after("measured") - pushed) < 0.02
+    assert np.linalg.norm(command_after("commanded") - skill.reference.means[19]) < 0.02
+
+
+def test_only_explored_outputs_have_an_action(skill):
+    sideways = replace(skill, explored=(0,), constraints=LinearConstraints.none(2))
+    for kind in ("residual", "kgrl", "skgrl"):
+        guidance = build(kind, sideways)
+        assert guidance.GetInputPort("action").size() == 1
+        still, _ = rollout(build(kind, sideways), constant([0.0]))
+        moved, _ = rollout(guidance, constant([1.0]))
+        assert np.abs(moved - still)[:, 0].max() > 0.01
+        assert np.abs(moved - still)[:, 1].max() < 1e-9
+
+
+def test_an_action_is_held_for_a_control_period(skill):
+    guidance = build("residual", skill)
+    simulator = Simulator(guidance)
+    context = simulator.get_mutable_context()
+    action = guidance.GetInputPort("action").FixValue(context, [0.0, 0.0])
+    guidance.GetInputPort("pose").FixValue(context, START)
+    guidance.GetInputPort("wrench").FixValue(context, [0.0, 0.0])
+    simulator.Initialize()
+    simulator.AdvanceTo(0.25 * PERIOD)
+    before = guidance.GetOutputPort("desired_pose").Eval(context).copy()
+    action.GetMutableData().set_value([1.0, 1.0])
+    simulator.AdvanceTo(0.75 * PERIOD)
+    np.testing.assert_array_equal(guidance.GetOutputPort("desired_pose").Eval(context), before)
+    simulator.AdvanceTo(1.25 * PERIOD)
+    assert (guidance.GetOutputPort("desired_pose").Eval(context) > before).all()
+
+
+def test_nothing_is_computed_between_control_steps(skill):
+    """Drake's sources, sums and gains count as depending on time: with one of them this would be 10 a step."""
+    for kind in PRIMITIVE_GUIDANCE:
+        guidance = build(kind, skill)
+        calls = []
+        system = guidance.GetSubsystemByName("kmp" if "kmp" in kind or "residual" in kind else "lc_ns_kmp")
+        predict = system._primitive.predict
+        system._primitive.predict = lambda *a, calls=calls, predict=predict: calls.append(a) or predict(*a)
+        simulator = Simulator(guidance)
+        context = simulator.get_mutable_context()
+        guidance.GetInputPort("action").FixValue(context, [0.5, 0.5])
+        guidance.GetInputPort("pose").FixValue(context, START)
+        guidance.GetInputPort("wrench").FixValue(context, [0.0, 0.0])
+        simulator.Initialize()
+        for k in range(1, 101):
+            simulator.AdvanceTo((k - 0.5) * PERIOD / 10)
+            guidance.GetOutputPort("desired_pose").Eval(context)
+        assert len(calls) == 10, kind
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("magic", "there is no guidance 'magic': .*kgrl, kmp, none, residual, safe_residual, sct, skgrl"),
+        ("kgrll", "did you mean kgrl"),
+        ("sct", "'sct' needs a shared control template.*use kgrl, kmp, residual, safe_residual, skgrl"),
+        ("none", "'none' needs .*kmp"),
+    ],
+)
+def test_a_pairing_that_makes_no_sense_is_refused_with_those_that_do(skill, kind, message):
+    with pytest.raises(InputError, match=message):
+        build(kind, skill)
+
+
+def test_safe_residual_is_not_offered_where_nobody_wrote_down_what_to_avoid(skill):
+    with pytest.raises(InputError, match=r"walls to keep out of, which BncConnector.*use kgrl, kmp, residual, skgrl"):
+        build("safe_residual", replace(skill, keep_out=None), "BncConnector")
+    assert check_guidance("kmp", ("demonstrations",)).label == "demonstration alone"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"history_source": "imagined"},
+        {"kappa": 0.0},
+        {"kappa": np.nan},
+        {"history": 0},
+        {"explored": ()},
+        {"explored": (2,)},
+        {"explored": (0, 0)},
+    ],
+)
+def test_a_skill_that_makes_no_sense_is_refused(skill, change):
+    with pytest.raises(InputError):
+        replace(skill, **change)
+
+
+def test_gains_of_the_wrong_size_are_refused(skill):
+    with pytest.raises(InputError, match="one per output"):
+        build("kgrl", replace(skill, gains=(1.0, 2.0, 3.0)))

@@ -1,0 +1,26 @@
+"""LCM takes any words for a URL, and then nobody hears it."""
+
+import pytest
+
+from guiderail.diagrams.hardware.bus import open_bus
+from guiderail.models.common.errors import InputError
+
+
+@pytest.mark.parametrize("url", ["memq://", "udpm://239.255.76.67:7668?ttl=0"])
+def test_a_bus_is_the_one_that_was_named(url):
+    assert open_bus(url).get_lcm_url() == url
+
+
+def test_without_a_url_it_is_lcms_own(monkeypatch):
+    monkeypatch.delenv("LCM_DEFAULT_URL", raising=False)
+    assert open_bus("").get_lcm_url().startswith("udpm://")
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["nonsense", "udp://239.255.76.67:7667", "memq:", "udpm://999.1.1.1:7667", "udpm://10.0.0.1:7667",
+     "udpm://239.255.76.67:70000", "udpm://239.255.76.67:0", "udpm://host:7667"],
+)  # fmt: skip
+def test_where_nobody_hears_a_word_is_refused(url):
+    with pytest.raises(InputError, match="LCM"):
+        open_bus(url)

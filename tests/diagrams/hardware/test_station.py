@@ -1,0 +1,341 @@
+"""The hardware station against a simulated arm at the other end of LCM."""
+
+import itertools
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
+from pydrake.lcm import DrakeLcm
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from guiderail.diagrams.hardware.clock import StepByStep
+from guiderail.diagrams.hardware.monitor import word_channel
+from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa, find_driver, safety_limits
+from guiderail.diagrams.stations.arm import ArmStation
+from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import Fault
+from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.tools.hardware.sim_driver import START
+
+WORKCELL = BncWorkcell()
+PERIOD = IIWA_DRIVER.period
+ALIASES = ("position_measured", "velocity_estimated", "state_estimated", "torque_external", "torque_commanded")
+
+
+class OneProcess:
+    """Both sides of a bus in memory, stepped in turn."""
+
+    def __init__(self, settled=True):
+        self.lcm = lcm = DrakeLcm("memq://")
+        self.torques = []
+        self.robot = SimulatedIiwa(WORKCELL, lcm)
+        limits = replace(safety_limits(self.robot.known.plant, IIWA_DRIVER), damping_time=0.2, ramp_time=0.1)
+        self.station = HardwareStation(WORKCELL, lcm, robot_timeout=1.0, limits=limits)
+        self.robot_simulator, self.simulator = self.robot.simulator(), Simulator(self.station)
+        self.robot.set_pose(self.robot_simulator.get_mutable_context(), START)
+        self.context = self.simulator.get_mutable_context()
+        self.desired = self.station.get_desired_pose_input_port().FixValue(self.context, START)
+        self.commands = []
+        lcm.Subscribe("IIWA_COMMAND", lambda message: self.commands.append(lcmt_iiwa_command.decode(message)))
+        self.robot_simulator.Initialize()
+        self.station.start(self.simulator)
+        self._steps = 0
+        if settled:
+            self.go(START, 0.4)
+            assert self.phase == Phase.RUNNING
+
+    @property
+    def phase(self):
+        return Phase(int(self["phase"][0]))
+
+    @property
+    def fault(self):
+        return Fault(int(self["fault"][0]))
+
+    def go(self, pose, seconds, robot=True):
+        """Both for some time, or the station alone: then no status comes."""
+        self.desired.GetMutableData().set_value(pose)
+        for _ in range(round(seconds / PERIOD)):
+            self._steps += 1
+            if robot:
+                self.robot_simulator.AdvanceTo(self._steps * PERIOD)
+            self.simulator.AdvanceTo(self._steps * PERIOD)
+            self.torques.append(self["iiwa.torque_commanded"].copy())
+
+    def __getitem__(self, port):
+        return self.station.GetOutputPort(port).Eval(self.context)
+
+
+def test_starts_by_holding_where_the_robot_is():
+    both = OneProcess()
+    np.testing.assert_allclose(both["pose"], START, atol=1e-6)
+    both.go(np.full(6, np.nan), 0.3)  # no command yet
+    np.testing.assert_allclose(both["pose"], START, atol=1e-3)
+
+
+def test_follows_pushes_and_feels_over_messages():
+    both = OneProcess()
+    both.go(START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0], 1.0)
+    np.testing.assert_allclose(both["pose"][:3], START[:3] + [0.01, 0, 0], atol=1e-3)
+    # Turned by 45°, the mouth stands on the lugs: 10 N of push come back as 10 N.
+    lug_top = 0.005975
+    turned = np.array([0.0, 0.0, 0.012, np.pi / 4, 0.0, 0.0])
+    both.go(turned, 1.75)
+    both.go(turned + [0, 0, lug_top - 0.012 - 10.0 / 1500.0, 0, 0, 0], 1.0)
+    assert both["wrench"][2] == pytest.approx(10.0, abs=1.5)
+    assert both["contact_force"][0] == pytest.approx(10.0, abs=1.5)
+    assert both["pose"][2] == pytest.approx(lug_top, abs=5e-4)
+
+
+def test_two_processes_on_one_machine(monkeypatch):
+    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "lcm")  # with a time to live of zero: no message leaves this machine
+    url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
+    call = f"from guiderail.tools.cli.main import main; main(['serve-iiwa', '--url', {url!r}, '--seconds', '1.5'])"
+    command = [sys.executable, "-c", call]
+    with subprocess.Popen(command) as robot:
+        lcm = DrakeLcm(url)
+        station = HardwareStation(WORKCELL, lcm, robot_timeout=30.0)
+        simulator = Simulator(station)
+        context = simulator.get_mutable_context()
+        goal = START + [0.0, 0.008, 0.0, 0.0, 0.0, 0.0]
+        station.get_desired_pose_input_port().FixValue(context, goal)
+        station.start(simulator)
+        before = station.get_pose_output_port().Eval(context).copy()
+        pace = StepByStep(lcm, 5.0, IIWA_DRIVER.status_channel)
+        pace.begin()
+        pace.advance(simulator, station, round(1.4 / PERIOD))
+        after = station.get_pose_output_port().Eval(context)
+        np.testing.assert_allclose(before, START, atol=1e-4)
+        assert np.linalg.norm((after - goal)[:3]) < 0.2 * np.linalg.norm((before - goal)[:3])
+        robot.terminate()
+
+
+def status(both, **changed):
+    """The next status as the robot would send it at rest, with some fields changed."""
+    message = lcmt_iiwa_status()
+    positions = both["iiwa.position_measured"].tolist()
+    message.utime, message.num_joints = round((both.context.get_time() + PERIOD) * 1e6), 7
+    for name in message.__slots__[2:]:
+        setattr(message, name, [0.0] * 7)
+    message.joint_position_measured = positions
+    for name, value in changed.items():
+        setattr(message, name, value)
+    return message.encode()
+
+
+NAN7, THREE = [np.nan] * 7, {name: [0.0] * 3 for name in lcmt_iiwa_status.__slots__[2:]}
+FAULTY = {
+    "NaN in the positions": (Fault.NOT_FINITE, {"joint_position_measured": NAN7}),
+    "three joints": (Fault.WRONG_SIZE, {"num_joints": 3} | THREE),
+    "an old status": (Fault.OUT_OF_ORDER, {"utime": 1000}),
+    "garbage": (Fault.MALFORMED, None),
+}
+
+
+@pytest.fixture(scope="module")
+def pushing():
+    return OneProcess()
+
+
+@pytest.mark.parametrize("name", FAULTY)
+def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told(pushing, name):
+    """The arm is on its way; one wrong status comes, in place of the robot's."""
+    both, (fault, changed) = pushing, FAULTY[name]
+    side = 0.01 * (-1.0) ** list(FAULTY).index(name)
+    goal = START + [side, 0.0, 0.0, 0.0, 0.0, 0.0]
+    both.go(goal, 0.06)
+    wrong = bytes(range(100)) if changed is None else status(both, **changed)
+    both.torques.clear()
+    both.lcm.Publish("IIWA_STATUS", wrong)
+    both.go(goal, PERIOD, robot=False)
+    assert both.fault == fault
+    both.go(goal, 0.1)
+    assert both.phase == Phase.DAMPING
+    assert np.isfinite(both.torques).all()
+    assert (np.abs(both.torques) <= both.station.limits.torque).all()
+    both.go(goal, 0.25)
+    assert (both.phase, both.fault) == (Phase.OFF, fault)
+    np.testing.assert_array_equal(both["iiwa.torque_commanded"], 0.0)
+    assert both.commands[-1].joint_torque == (0.0,) * 7
+    left = np.abs(both["iiwa.velocity_estimated"]).max()
+    before = both["pose"].copy()
+    both.station.resume(both.context)
+    both.go(goal, 0.05)
+    assert np.linalg.norm((both["pose"] - before)[:3]) < 1e-3
+    both.go(goal, 0.4)
+    assert both.phase == Phase.RUNNING
+    assert np.linalg.norm((both["pose"] - goal)[:3]) < 0.5 * np.linalg.norm((before - goal)[:3])
+    assert np.isfinite(both["wrench"]).all()
+    assert left < 0.02
+
+
+def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
+    both = OneProcess()
+    goal = START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
+    both.go(goal, 0.06)
+    moving = both["iiwa.velocity_estimated"].copy()
+    assert np.abs(moving).max() > 0.05
+    both.torques.clear()
+    both.go(goal, 0.5, robot=False)
+    found = next(step for step, torque in enumerate(both.torques) if (torque @ moving < 0.0) or not torque.any())
+    assert found * PERIOD <= 0.05
+    assert (both.phase, both.fault) == (Phase.OFF, Fault.STALE)
+    sent = len(both.commands)
+    assert both.commands[-1].joint_torque == (0.0,) * 7
+    both.go(goal, 1.0, robot=False)
+    assert len(both.commands) == sent
+    # The robot is back: nothing is sent to it before it has settled, and then no torque.
+    back = len(both.torques)
+    both.robot_simulator.AdvanceTo(both.robot_simulator.get_context().get_time() + PERIOD)
+    both.go(goal, 0.2)
+    assert len(both.commands) == sent
+    both.go(goal, 0.2)
+    assert len(both.commands) > sent
+    np.testing.assert_array_equal(both.torques[back:], 0.0)
+    both.station.resume(both.context)
+    both.go(goal, 1.0)
+    assert both.phase == Phase.RUNNING
+    np.testing.assert_allclose(both["pose"][:3], goal[:3], atol=2e-3)
+
+
+def test_no_command_before_the_drivers_start_up_is_over():
+    both = OneProcess(settled=False)
+    both.go(START, 0.25)
+    assert both.commands == []
+    both.go(START, 0.05)
+    assert both.commands
+
+
+def test_stops_when_asked():
+    both = OneProcess()
+    both.station.stop(both.context)
+    both.go(START, 0.05)
+    assert (both.phase, both.fault) == (Phase.DAMPING, Fault.ASKED)
+    assert both["holding"][0] == 1.0
+
+
+def test_another_station_takes_over_without_letting_go():
+    both = OneProcess()
+    goal = START + [0.005, 0.0, 0.0, 0.0, 0.0, 0.0]
+    both.go(goal, 0.3)
+    other = HardwareStation(WORKCELL, both.lcm)
+    simulator = Simulator(other)
+    context = simulator.get_mutable_context()
+    other.get_desired_pose_input_port().FixValue(context, goal)
+    both.lcm.Publish("IIWA_STATUS", status(both))
+    other.start(simulator)
+    other.take_over(context, both.context)
+    time = both.robot_simulator.get_context().get_time()
+    for step in range(1, 40):
+        both.robot_simulator.AdvanceTo(time + step * PERIOD)
+        simulator.AdvanceTo(step * PERIOD)
+        assert (other.get_phase_output_port().Eval(context)[0], other.get_fault_output_port().Eval(context)[0]) == (
+            2,
+            0,
+        )
+    np.testing.assert_allclose(other.get_pose_output_port().Eval(context)[:3], goal[:3], atol=1.5e-3)
+
+
+def test_an_external_torque_has_the_sign_of_what_the_surroundings_do():
+    """An iiwa's driver says it so; a Franka's says what the arm does to them."""
+    iiwa, panda = lcmt_iiwa_status(), lcmt_panda_status()
+    for message in (iiwa, panda):
+        message.num_joints = 7
+        for name in (name for name in message.__slots__ if name.startswith("joint_")):
+            setattr(message, name, [0.0] * 7)
+        message.joint_torque_external = [1.0] * 7
+    np.testing.assert_array_equal(find_driver("iiwa14").decode(iiwa.encode()).external_torque, [1.0] * 7)
+    np.testing.assert_array_equal(find_driver("panda").decode(panda.encode()).external_torque, [-1.0] * 7)
+    with pytest.raises(InputError, match="nothing here speaks to a robot"):
+        find_driver("ur5e")
+
+
+@pytest.mark.parametrize("robot", ["iiwa14", "panda"])
+def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
+    station = HardwareStation(WORKCELL, DrakeLcm("memq://"), robot=robot)
+    trips = np.array(station.driver.trips)
+    assert (np.array(station.limits.torque) < trips).all()
+    assert (np.array(station.limits.external_torque) < trips).all()
+    assert station.HasOutputPort(f"{station.driver.name}.torque_external")
+
+
+def test_the_full_wrench_at_the_longest_lever_is_clipped_on_the_wrist_alone():
+    """With an outstretched tool the impedance's limits would take more than the driver allows on joints 4 to 6."""
+    station = HardwareStation(WORKCELL, DrakeLcm("memq://"))
+    load = station.load_of_force(station.known.solve(START, station.known.posture))
+    assert (load[[0, 1, 2, 6]] < 0.7).all()
+    assert 1.0 < load[3:6].max() < 1.5
+
+
+def test_no_wrench_within_its_limits_loads_a_joint_more_than_is_read_out():
+    station = HardwareStation(WORKCELL, DrakeLcm("memq://"), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1)))
+    positions = station.known.solve(START, station.known.posture)
+    J = np.roll(station._jacobian(positions), 3, axis=0)  # the force first
+    corners = np.array(list(itertools.product(*((-limit, limit) for limit in (40.0, 30.0, 20.0, 1, 2, 3)))))
+    worst = np.abs(corners @ J).max(axis=0) / np.array(station.limits.torque)
+    np.testing.assert_allclose(station.load_of_force(positions), worst)
+
+
+def test_says_that_no_robot_answers():
+    station = HardwareStation(WORKCELL, DrakeLcm("memq://"), robot_timeout=0.1)
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
+    with pytest.raises(InputError, match="no robot answers"):
+        station.start(simulator)
+
+
+def test_a_real_arm_is_not_put_anywhere():
+    station = HardwareStation(WORKCELL, DrakeLcm("memq://"))
+    with pytest.raises(InputError, match="move it there"):
+        station.set_pose(station.CreateDefaultContext(), START)
+
+
+def test_a_deputy_is_heard_in_a_larger_diagram_too():
+    lcm, builder = DrakeLcm("memq://"), DiagramBuilder()
+    station = builder.AddSystem(HardwareStation(WORKCELL, lcm, robot_timeout=0.0))
+    simulator = Simulator(builder.Build())
+    context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    station.get_desired_pose_input_port().FixValue(context, START)
+    assert not station.has_deputy(context)
+    lcm.Publish(word_channel(IIWA_DRIVER.command_channel), bytes(9))
+    lcm.HandleSubscriptions(0)
+    simulator.AdvancePendingEvents()
+    assert station.has_deputy(context)
+
+
+def test_all_stations_have_the_same_ports():
+    stations = [RailsStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, DrakeLcm("memq://"))]
+    simulated_only = {"query", "body_poses"}
+    robots_own = {"fault", "phase"} | {f"iiwa.{name}" for name in ALIASES}
+    for station in stations:
+        inputs = {station.get_input_port(i).get_name(): station.get_input_port(i).size() for i in range(2)}
+        assert inputs == {"desired_pose": 6, "command_time": 1}
+        ports = [station.get_output_port(i) for i in range(station.num_output_ports())]
+        outputs = {port.get_name(): port.size() for port in ports if port.get_name() not in simulated_only | robots_own}
+        assert outputs == {"pose": 6, "wrench": 6, "contact_force": 1, "saturation": 1, "holding": 1}
+        assert station.num_input_ports() == 2
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"stiffness": (1.0,) * 5}, {"limits": (0.0,) * 6}, {"damping_ratio": 0.0}, {"stiffness": (np.nan,) * 6}]
+)
+def test_refuses_an_impedance_that_makes_no_sense(wrong):
+    with pytest.raises(InputError):
+        Impedance(**wrong)
+
+
+def test_a_pandas_commands_say_the_time_on_the_wall():
+    """Drake's driver for it drops what is older than a tenth of a second, by that clock."""
+    before = time.time_ns() // 1000
+    command = lcmt_panda_command.decode(find_driver("panda").encode(0.005, np.arange(7.0)))
+    assert before <= command.utime <= time.time_ns() // 1000
+    assert list(command.joint_torque) == list(range(7))

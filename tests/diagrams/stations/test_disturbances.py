@@ -1,0 +1,143 @@
+"""What may be other than it should be: each disturbance does what it says, and none is there unless asked for."""
+
+import numpy as np
+import pytest
+
+from guiderail import InputError, make_env
+from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
+from guiderail.models.common.units import MM
+
+DOWN = np.array([0.0, 0.0, -1.0])
+CLAMP = {"uncertainty": "known", "hold": 25}  # where nothing else is drawn that matters
+
+
+def descended(decisions=3, seed=1, **options):
+    """Environment and observations of a clamp that comes down beside its holes, onto the table."""
+    env = make_env("GridClamp", **CLAMP, **options)
+    observation, info = env.reset(seed=seed, options={"offset": (1.5 * MM, 1.5 * MM)})
+    seen = [observation]
+    for _ in range(decisions):
+        observation, _, terminated, truncated, _ = env.step(DOWN)
+        seen.append(observation)
+        if terminated or truncated:
+            break
+    return env, np.array(seen), info
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return descended()
+
+
+def test_nothing_is_between_unless_asked_for(plain):
+    env, _, info = plain
+    assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
+    assert "friction_factor" not in info
+    assert not resolve("GridClamp", {}).models["disturbances"].any
+
+
+def test_drawn_errors_repeat_with_their_seed_and_differ_without_it(plain):
+    options = {"wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.02), "wrench_noise": (0.2, 0.01), "pose_bias": 1e-3}
+    _, first, info = descended(**options)
+    _, again, _ = descended(**options)
+    np.testing.assert_array_equal(again, first)
+    _, other, changed = descended(seed=2, **options)
+    assert not np.array_equal(other, first)
+    assert 0.5 <= info["wrench_scale"] <= 2.0
+    assert np.abs(info["wrench_bias"][:3]).max() <= 1.0
+    assert info["wrench_scale"] != changed["wrench_scale"]
+    assert not np.array_equal(first, plain[1])
+
+
+def test_friction_and_modulus_are_the_plants_own_until_the_next_reset():
+    env, _, info = descended(1, friction_factor=(0.5, 0.5), modulus_factor=(0.1, 0.1))
+    assert info["friction_factor"] == pytest.approx(0.5)
+
+    def surfaces():
+        station = env.task.diagram.GetSubsystemByName("station")
+        query = station.scene_graph.get_query_output_port().Eval(
+            station.scene_graph.GetMyContextFromRoot(env.simulator.get_context())
+        )
+        inspector, found = query.inspector(), {}
+        for body in ("clamp", "table"):
+            for one in station.plant.GetCollisionGeometriesForBody(station.plant.GetBodyByName(body)):
+                found[inspector.GetName(one).split("::")[-1]] = inspector.GetProximityProperties(one)
+        return found
+
+    pad = surfaces()["pad"]
+    assert pad.GetProperty("material", "coulomb_friction").static_friction() == pytest.approx(0.1)
+    assert pad.GetProperty("hydroelastic", "hydroelastic_modulus") == pytest.approx(1e5)
+    env.reset(seed=3)
+    assert surfaces()["pad"].GetProperty("hydroelastic", "hydroelastic_modulus") == pytest.approx(1e5)
+
+
+def test_a_softer_impedance_pushes_less_for_the_same_command(plain):
+    soft, _, _ = descended(stiffness_factor=0.5)
+    assert max(soft.trace.force) < 0.7 * max(plain[0].trace.force)
+
+
+def test_another_clock_is_another_control_period():
+    env, _, _ = descended(1, control_period=3 * PLANT_PERIOD)
+    assert env.task.control_period == pytest.approx(3 * PLANT_PERIOD)
+    assert env.task.control_period != CONTROL_PERIOD
+
+
+def test_lost_and_late_commands_leave_the_tool_behind(plain):
+    late, _, _ = descended(1, late_commands=20)
+    assert late.trace.measured[-1, 2] > plain[0].trace.measured[24, 2] + 1.0 * MM
+
+
+def test_which_commands_are_lost_is_not_read_off_the_stream_of_the_noise():
+    env = make_env("GridClamp", wrench_noise=(0.2, 0.01), lost_commands=0.3, hold=1)
+    station = env.task.diagram.GetSubsystemByName("station")
+    commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))
+    env.reset(seed=1)
+    root = env.simulator.get_context()
+    lost, of_one_stream = [], []
+    for _ in range(60):
+        env.step(np.zeros(env.action_space.shape))
+        count, is_lost = (commands.GetMyContextFromRoot(root).get_discrete_state(i).value()[0] for i in (0, 1))
+        seed = wrench.GetMyContextFromRoot(root).get_numeric_parameter(2).value()[0]
+        stream = np.random.default_rng([int(seed), int(count)])
+        lost.append(is_lost)
+        of_one_stream.append(stream.uniform() < 0.3)
+    assert 0.1 < np.mean(lost) < 0.5
+    assert np.mean(np.equal(lost, of_one_stream)) < 0.8  # of independent ones 0.58
+
+
+def test_a_payload_hangs_from_the_arms_tool_and_its_controller_knows_nothing_of_it():
+    env = make_env("GridClamp", station="arm", payload=0.3)
+    env.reset(seed=0)
+    arm = env.task.diagram.GetSubsystemByName("station").GetSubsystemByName("station")
+    tool = arm.arm.tool[0]
+    mass = tool.get_mass(arm.plant.GetMyContextFromRoot(env.simulator.get_context()))
+    assert mass == pytest.approx(tool.default_mass() + 0.3)
+    assert tool.get_mass(arm.plant.CreateDefaultContext()) == pytest.approx(tool.default_mass())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"payload": 0.5}, "station=arm"),
+        ({"control_period": 0.0123}, "whole number"),
+        ({"friction_factor": (2.0, 1.0)}, "smaller one first"),
+        ({"wrench_bias": (-1.0, 0.0)}, "none negative"),
+        ({"lost_commands": 1.0}, "less than 1"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        make_env("GridClamp", **options)
+
+
+def test_a_robot_is_not_disturbed():
+    from guiderail.diagrams.envs.make import make_skill
+
+    with pytest.raises(InputError, match="real robot"):
+        make_skill("GridClamp", lambda seen: seen, station="hardware", lcm_url="memq://", lost_commands=0.1)
+
+
+def test_every_disturbance_is_off_by_default():
+    assert not Disturbances.model_validate({}).any

@@ -1,0 +1,260 @@
+"""The connector's and the clamp's physics in another engine, held to what Drake's is held to."""
+
+import sys
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from guiderail import InputError, make_env
+from guiderail.diagrams.envs.recording import drive_along
+from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+from guiderail.models.common.units import MM
+from guiderail.models.objects.bnc_connector.motion import CLEAR, insert_and_lock, poses
+
+pytest.importorskip("mujoco")
+import mujoco
+
+from guiderail.diagrams.stations.mujoco import MujocoStation
+
+CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
+STIFFNESS = Impedance().stiffness[2]
+LUG_TOP = CONNECTOR.dimensions.lug_height + CONNECTOR.dimensions.lug_radius - CONNECTOR.dimensions.locked_height
+LOCKED = round(insert_and_lock()[0][-1] / 0.02)
+
+
+def drive(workcell, times, motion, prepare=None):
+    return drive_along(MujocoStation(workcell), times, np.asarray(motion, dtype=float), prepare)
+
+
+def descent(z_mm, x_mm=0.0, y_mm=0.0):
+    motion = np.zeros((len(z_mm), 6))
+    motion[:, 0], motion[:, 1], motion[:, 2] = np.array(x_mm) * MM, np.array(y_mm) * MM, np.array(z_mm) * MM
+    return motion
+
+
+def workpiece_in_fixture(driven, workpiece, fixture):
+    station = driven.station
+    bodies = station.GetOutputPort("body_poses").Eval(station.GetMyContextFromRoot(driven.context))
+    of = {name: bodies[int(station.plant.GetBodyByName(name).index())] for name in (workpiece, fixture)}
+    return of[fixture].InvertAndCompose(of[workpiece])
+
+
+@pytest.fixture(scope="module")
+def locked_and_pulled():
+    """Locked where the pose is known, on a jack that was moved, then pulled at by more than the effort limit gives."""
+    beside = np.array([3.0 * MM, -2.0 * MM, 1.0 * MM])
+    times, motion = insert_and_lock()
+    pull = np.array([0.0, 0.0, 45.0 / STIFFNESS, 0.0, 0.0, 0.0])
+    motion = np.concatenate([motion, [pull, pull]]) + np.array([*beside, 0.0, 0.0, 0.0])
+
+    def move(plant, context):
+        CONNECTOR.set_jack_offset(plant, context, RigidTransform(beside))
+
+    driven, recording = drive(CONNECTOR, np.concatenate([times, times[-1] + [1.0, 1.5]]), motion, move)
+    return driven, recording, beside
+
+
+def test_known_pose_inserts_and_locks(locked_and_pulled):
+    _, recording, beside = locked_and_pulled
+    final = recording["pose"][LOCKED - 1]
+    assert np.abs(final[:3] - beside).max() < 0.3 * MM
+    assert np.abs(np.rad2deg(final[3:])).max() < 1.0
+    assert recording["contact_force"][:LOCKED].max() < 15.0
+    assert not recording["saturation"][1:LOCKED].any()  # before the first command arrives it is told to be at zero
+
+
+def test_the_sensor_feels_what_the_impedance_pushes_with(locked_and_pulled):
+    turning = slice(250, 315)
+    _, recording, _ = locked_and_pulled
+    felt = np.linalg.norm(recording["wrench"][turning, :3], axis=1)
+    # Sliding over facets rattles: the two agree over a tenth of a second, and not in every sample.
+    over = np.ones(5) / 5
+    pushed = np.convolve(recording["contact_force"][turning, 0], over, "valid")
+    np.testing.assert_allclose(np.convolve(felt, over, "valid"), pushed, atol=0.6)
+
+
+def test_pulling_after_locking_holds(locked_and_pulled):
+    driven, recording, beside = locked_and_pulled
+    assert recording["saturation"][-1, 0] == 1.0
+    assert recording["wrench"][-1, 2] == pytest.approx(-40.0, abs=0.5)
+    assert recording["pose"][-1, 2] - beside[2] < 0.5 * MM
+    assert CONNECTOR.is_locked(CONNECTOR.X_JT.inverse() @ workpiece_in_fixture(driven, "plug", "jack"))
+
+
+def test_rotating_before_insertion_is_blocked_by_the_lugs():
+    depth = LUG_TOP - 30.0 / STIFFNESS
+    motion = poses(np.array([CLEAR, LUG_TOP + 1.0 * MM, depth, depth]), np.deg2rad(45.0))
+    _, recording = drive(CONNECTOR, [0.0, 0.8, 1.6, 2.0], motion)
+    assert recording["wrench"][-1, 2] == pytest.approx(30.0, abs=1.5)
+    assert recording["pose"][-1, 2] == pytest.approx(LUG_TOP, abs=0.1 * MM)
+
+
+@pytest.mark.parametrize("axis", [0, 2, 3, 4])
+def test_what_is_commanded_beyond_a_stop_deflects_by_the_inverse_stiffness(axis):
+    """Static displacement under a known load is within 2 % of K⁻¹ f: the load is what the sensor feels."""
+    stiffness = np.array(Impedance().stiffness)
+    beyond = np.array([3.0 * MM, 3.0 * MM, -3.0 * MM, 0.05, 0.05, 0.05])
+    motion = np.tile([0.0, 0.0, 2.0 * MM, np.pi / 2, 0.0, 0.0], (4, 1))
+    motion[1:, 2] = -2.0 * MM  # seated: then something bears a load about any axis
+    motion[2:, axis] += beyond[axis]
+    _, recording = drive(CONNECTOR, [0.0, 0.5, 0.7, 1.0], motion)
+    f, t = np.split(recording["wrench"][-1], 2)
+    load = np.array([*f, t[2], -t[0], t[1]])  # turned by a quarter, the second hinge is −x and the third y
+    deflection = recording["pose"][-1] - recording["desired_pose"][-1]
+    assert abs(load[axis]) > 0.3 * abs(stiffness * beyond)[axis]
+    assert deflection[axis] == pytest.approx(load[axis] / stiffness[axis], rel=0.02)
+
+
+@pytest.fixture(scope="module")
+def inserted():
+    return drive(CLAMP, [0.0, 1.6, 1.9], descent([4.0, -6.0, -6.0]))
+
+
+def test_the_clamp_snaps_in_and_the_snap_gives_way(inserted):
+    driven, recording = inserted
+    tip = workpiece_in_fixture(driven, "clamp", "table")
+    assert np.abs((CLAMP.X_GT.inverse() @ tip).translation()).max() < 0.1 * MM
+    assert recording["contact_force"].max() <= 10.0
+    z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
+    resistance = force[z > 0.85].max()
+    assert 2.0 < resistance < 8.0
+    assert z[np.flatnonzero(z < 0.85)[1]] < 0.1  # past the crest it jumps in
+    assert recording["wrench"][:, 2].max() > resistance  # only then comes the shoulder
+
+
+def test_the_clamps_snap_holds_against_a_light_pull_and_yields_to_a_strong_one():
+    _, recording = drive(CLAMP, [0.0, 0.4, 0.6, 0.9, 1.2, 1.5], descent([2.0, -4.0, 1.0, 1.0, 8.0, 16.0]))
+    z, force = recording["pose"][:, 2], recording["wrench"][:, 2]
+    assert z[44] < 0.6 * MM
+    assert z[-1] > 10.0 * MM
+    assert -12.0 < force.min() < -2.0
+
+
+def test_a_clamp_beside_its_holes_stands_still_on_the_table():
+    """27 N down and 2 N sideways, where 5.4 N would slip."""
+    sideways = 2.0 + 2.0 / STIFFNESS / MM
+    motion = descent([13.0, -6.0, -6.0, -6.0], [2.0, 2.0, sideways, sideways], 1.5)
+    _, recording = drive(CLAMP, [0.0, 0.5, 0.6, 1.6], motion)
+    assert recording["wrench"][-1, 2] == pytest.approx(27.0, abs=0.2)
+    assert recording["wrench"][-1, 0] == pytest.approx(-2.0, abs=0.2)
+    assert abs(recording["pose"][-1, 0] - recording["pose"][-40, 0]) < 0.01 * MM
+
+
+def episode(env, seed):
+    observation, _ = env.reset(seed=seed)
+    seen, rng = [observation], np.random.default_rng(seed)
+    for _ in range(4):
+        observation, reward, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+        seen.append(np.append(observation, reward))
+        if terminated or truncated:
+            break
+    return np.concatenate(seen)
+
+
+@pytest.mark.parametrize(
+    ("task", "options"), [("BncConnector", {"uncertainty": "disc"}), ("GridClamp", {"uncertainty": "disc"})]
+)
+def test_the_same_seed_is_the_same_episode_bit_for_bit(task, options):
+    """With another episode between, and pushed at: nothing of it is left anywhere."""
+    env = make_env(task, station="mujoco", hold=25, **options)
+    first = episode(env, 3)
+    episode(env, 4)
+    env.push(np.array([1.0 * MM, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(episode(env, 3), first)
+    assert not np.array_equal(episode(env, 4), first)
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "modulus", "most"),
+    [
+        ("BncConnector", {"uncertainty": "known", "guidance": "kmp"}, 10.0, 400),
+        ("GridClamp", {}, 10.0, 100),
+        ("GridClamp", {}, 30.0, 100),
+    ],
+    ids=lambda value: None if isinstance(value, dict) else str(value),
+)
+def test_a_stiff_contact_does_not_blow_up(task, options, modulus, most):
+    """Gasket and bead are on springs, which an explicit step as long as the nominal ones' would excite."""
+    env = make_env(task, station="mujoco", modulus_factor=(modulus, modulus), **options)
+    env.reset(seed=2)
+    rng, over = np.random.default_rng(2), False
+    while not over and len(env.trace) < most:
+        _, _, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
+        over = terminated or truncated
+    moved = np.abs(np.diff(env.trace.measured, axis=0))
+    assert info["termination"] != "collision"
+    assert "simulation_failure" not in info
+    assert np.rad2deg(moved[:, 3:]).max() < 3.0
+    assert moved[:, :3].max() < 3.0 * MM
+    assert max(env.trace.force) < 20.0
+
+
+def test_an_engine_that_diverges_ends_the_episode_and_leaves_nothing_for_the_next(tmp_path, monkeypatch):
+    """MuJoCo by itself goes on from its zero, where the connector is locked, and writes a file about it."""
+    monkeypatch.chdir(tmp_path)
+
+    def made():
+        return make_env("BncConnector", station="mujoco", uncertainty="disc", hold=25)
+
+    env = made()
+    episode(env, 4)
+    env.reset(seed=3)
+    sound, *_ = env.step(np.zeros(2))
+    for displacement in (1e11, 1e300):
+        env.reset(seed=3)
+        env.step(np.zeros(2))
+        env.push(np.array([0.0, 0.0, displacement, 0.0, 0.0, 0.0]))
+        observation, _, terminated, truncated, info = env.step(np.zeros(2))
+        assert (terminated, truncated) == (False, True)
+        assert "the simulation failed in MuJoCo" in info["simulation_failure"]
+        assert not info["is_success"]
+        np.testing.assert_array_equal(observation, sound)
+    assert not list(tmp_path.iterdir())
+    np.testing.assert_array_equal(episode(env, 5), episode(made(), 5))
+
+
+@pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
+def test_an_engine_without_room_for_its_contacts_ends_the_episode(warning, monkeypatch):
+    """MuJoCo by itself goes on without the contacts that are too many: a plug would go through a socket."""
+    step = mujoco.mj_step
+
+    def step_and_warn(model, data):
+        step(model, data)
+        data.warning[mujoco.mjtWarning.__members__[f"mjWARN_{warning}"].value].number += 1
+
+    env = make_env("BncConnector", station="mujoco", hold=25)
+    env.reset(seed=3)
+    monkeypatch.setattr(mujoco, "mj_step", step_and_warn)
+    *_, terminated, truncated, info = env.step(np.zeros(2))
+    assert (terminated, truncated) == (False, True)
+    assert "the simulation failed in MuJoCo" in info["simulation_failure"]
+
+
+def test_what_a_task_draws_is_where_the_engine_has_it():
+    env = make_env("BncConnector", station="mujoco", uncertainty="disc", grasp_angle=1.0)
+    _, info = env.reset(seed=2)
+    station = env.task.diagram.GetSubsystemByName("station")
+    env.step(np.zeros(2))
+    model = station.rails.model
+    X_TT = RigidTransform([*info["jack_offset"], 0.0])
+    expected = (X_TT @ CONNECTOR.X_JT.inverse()).translation()
+    np.testing.assert_allclose(model.body("fixture").pos, expected, atol=1e-12)
+    np.testing.assert_allclose(model.body("workpiece").pos[:2], info["grasp_offset"][:2], atol=1e-12)
+
+
+class Unknown:
+    """A workcell of somebody who never wrote its surfaces down."""
+
+
+def test_a_world_that_nobody_described_gets_a_sentence():
+    with pytest.raises(InputError, match="Unknown doesn't say which"):
+        MujocoStation(Unknown())
+
+
+def test_without_the_engine_there_is_a_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r"pip install 'guiderail\[mujoco\]'"):
+        MujocoStation(CONNECTOR)

@@ -1,0 +1,153 @@
+"""What a person types, made at random: `--set`, `--env` and reset options mean what they say, or one sentence."""
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from fuzz.tally import attempt
+from guiderail.diagrams.envs.make import make_env, option_models, resolve
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import as_value, check_environment
+from guiderail.tools.learning.config import PRESETS, Preset
+from guiderail.tools.learning.train import configure
+
+TASK_NAMES = ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"]
+NUMBERS = st.integers(-3, 300).map(str) | st.floats().map(repr) | st.integers().map(str)
+WORDS = st.sampled_from(
+    ["", " ", "inf", "-inf", "nan", "1e20", "1e-20", "1e400", "-0", "0x10", "1_0", "010", "1,000", "1000000,1000000"]
+    + ["true", "True", "yes", "null", "None", "~", "auto", "auto_", "auto_inf", "auto_0", "auto_1e-3", "auto_nan"]
+    + ["[1, 2]", "[0.1]", "[]", "{}", "{a: 1}", "[[0, 1]]", "2001-99-99", "2001-01-01", "1:30", "!!int 3", "&a [*a]"]
+    + [
+        "[" * 200,
+        "9" * 5000,
+        "*",
+        "&a",
+        "'",
+        '"',
+        "%s",
+        "$x$",
+        "\n",
+        "\x00",
+        "١",
+        "é",
+        "a: b: c",
+        "x" * 400,
+        "7",
+        "0.5",
+    ]
+    + ["sparse", "shaped", "skgrl", "kgrl", "kmp", "sct", "none", "rails", "arm", "image", "hard", "disc", "tqc", "sac"]
+)
+WHAT_IS_TYPED = NUMBERS | WORDS | st.lists(NUMBERS, min_size=1, max_size=3).map(",".join) | st.text(max_size=8)
+BOMB = (
+    "{a: &a [1,1,1,1,1,1,1,1,1], b: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a], c: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b], d: [*c,*c,*c]}"
+)
+SETTINGS = [name for name in Preset.__dataclass_fields__ if name != "algorithm"]
+
+
+@given(
+    st.sampled_from(sorted(PRESETS)),
+    st.lists(st.tuples(st.sampled_from(SETTINGS) | st.text(max_size=5), WHAT_IS_TYPED), min_size=1, max_size=2),
+)
+@example("robust", [("entropy", "inf")])
+@example("robust", [("units", "1000000,1000000")])
+@example("robust", [("batch_size", "1e20")])
+@example("robust", [("layer_norm", "7")])
+def test_settings_of_a_learner(preset, pairs):
+    given = dict(pairs)
+    config = attempt("--set", InputError, lambda: configure("NarrowPassage", {}, preset=preset, settings=given))
+    if config is None:
+        return
+    for name, said in given.items():
+        found = getattr(config.learner, name)
+        if isinstance(found, bool):
+            assert str(said).lower() in (
+                ("1", "true", "yes", "on", "t", "y") if found else ("0", "false", "no", "off", "f", "n")
+            )
+        elif isinstance(found, str):
+            assert found == said
+        elif isinstance(found, tuple):
+            assert found == tuple(int(float(one)) for one in said.split(","))
+        else:
+            assert found == float(said)
+    for name, other in PRESETS[preset].__dict__.items():
+        assert name in given or name == "algorithm" or getattr(config.learner, name) == other
+
+
+def options_of(task):
+    """All options that its environments can have, with their defaults as they are typed."""
+    resolved = resolve(task, {})
+    models = option_models(TASKS.get(task), resolved.task.choice.guidance, resolved.station.name).values()
+    return {name: str(field.default) for model in models for name, field in model.model_fields.items()}
+
+
+OPTIONS = {task: options_of(task) for task in TASK_NAMES}
+
+
+@st.composite
+def environments(draw):
+    task, typed = draw(st.sampled_from(TASK_NAMES)), {}
+    for _ in range(draw(st.integers(1, 3))):
+        name = draw(st.sampled_from([*OPTIONS[task]] * 3 + ["guidance", "uncertainty", "x", "", "render_mode"]))
+        sound = st.just(OPTIONS[task].get(name) or "kmp") | st.floats(0, 1).map(repr) | st.integers(1, 50).map(str)
+        typed[name] = draw(sound | sound | WHAT_IS_TYPED)
+    return task, typed
+
+
+@given(environments())
+@example(("NarrowPassage", {"hold": BOMB}))
+@example(("NarrowPassage", {"hold": "2001-99-99"}))
+def test_options_of_an_environment(chosen):
+    task, typed = chosen
+    found = attempt("--env", InputError, lambda: check_environment(task, {k: as_value(v) for k, v in typed.items()}))
+    if found is None:
+        return
+    for name, said in typed.items():
+        value, read = found[name], yaml.safe_load(said) if said.strip() else None
+        if isinstance(value, bool):
+            assert said.strip().lower() in (
+                ("1", "true", "yes", "on", "1.0") if value else ("0", "false", "no", "off", "0.0", "-0")
+            )
+        elif isinstance(value, tuple):
+            numbers = read if isinstance(read, list) else [one for one in str(said).split(",") if one.strip()]
+            assert list(value) == [float(one) for one in numbers]
+        elif isinstance(value, int | float):
+            assert value == float(said)
+        else:
+            assert value == read or (value is None and read is None) or str(value) == said.strip()
+
+
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3)
+VALUES = SCALARS | st.lists(SCALARS, max_size=3) | st.lists(st.floats(-0.3, 0.3), min_size=2, max_size=3)
+RESETS = {task: sorted(TASKS.get(task).Reset.model_fields) for task in TASK_NAMES}
+MADE = {
+    "NarrowPassage": {"guidance": "kmp"}, "BncConnector": {"guidance": "kmp"}, "GridClamp": {}, "Pouring": {},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=TASK_NAMES)
+def env(request):
+    env = make_env(request.param, **MADE[request.param])
+    yield env
+    env.close()
+
+
+@given(st.data())
+def test_options_of_a_reset(env, data):
+    task = env.task.declaration.name
+    names = st.sampled_from(RESETS[task]) | st.sampled_from(RESETS[task]) | st.text(max_size=3)
+    options = data.draw(st.dictionaries(names, VALUES | st.floats(-0.1, 0.1).map(lambda x: [x, -x]), max_size=2))
+    seed = data.draw(st.integers(0, 99))
+    begun = attempt(f"reset, {task}", InputError, lambda: env.reset(seed=seed, options=options))
+    if begun is None:
+        return
+    observation, info = begun
+    assert np.isfinite(observation).all()
+    assert info["fallback"] in (False, 0, None) if "fallback" in info else True
+    for name, said in options.items():
+        if name in info and said is not None:
+            # A position is asked for where a thing is believed to be, and told where it is.
+            believed = np.asarray(info[name], float) + (info.get("mug_error", 0.0) if name == "mug_position" else 0.0)
+            np.testing.assert_allclose(believed, [float(one) for one in said], rtol=0, atol=1e-15)

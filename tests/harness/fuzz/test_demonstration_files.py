@@ -1,0 +1,260 @@
+"""Files of demonstrations, made and mutated at random: exactly what they say, or one sentence.
+
+`python -m pytest tests/fuzz --hypothesis-profile=long` tries thousands, and says what came of them.
+"""
+
+import io
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from fuzz.changes import edited, edits
+from fuzz.tally import attempt
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from oracles.files import csv_demonstrations, npz_demonstrations
+
+FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=12).filter(
+    lambda name: name.isprintable() and name == name.strip()
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@st.composite
+def demonstrations(draw):
+    outputs = draw(st.integers(1, 4))
+    times, values = [], []
+    for _ in range(draw(st.integers(1, 4))):
+        clock = sorted(draw(st.sets(FLOATS, min_size=2, max_size=8)))
+        times.append(clock)
+        values.append(draw(hnp.arrays(float, (len(clock), outputs), elements=FLOATS)))
+    names = draw(st.lists(NAMES, min_size=outputs, max_size=outputs))
+    return Demonstrations(times, values, names)
+
+
+def same(loaded: Demonstrations, parts) -> None:
+    assert loaded.num_demonstrations == len(parts)
+    for t, y, (expected_t, expected_y) in zip(loaded.times, loaded.outputs, parts, strict=True):
+        np.testing.assert_array_equal(t, expected_t)
+        np.testing.assert_array_equal(y, expected_y)
+
+
+@pytest.mark.parametrize("ending", ["npz", "csv"])
+@given(demonstrations())
+def test_a_round_trip_gives_every_bit_that_was_saved(folder, ending, saved):
+    path = folder / f"round.{ending}"
+    saved.save(path)
+    loaded = attempt(f"{ending}, round trip", (), lambda: Demonstrations.load(path))
+    assert loaded.names == saved.names
+    same(loaded, list(zip(saved.times, saved.outputs, strict=True)))
+    for a, b in zip(loaded.outputs, saved.outputs, strict=True):
+        np.testing.assert_array_equal(np.signbit(a), np.signbit(b))
+
+
+KINDS = ["<f8", ">f8", "<f4", "<f2", "<i8", "<u8", "<i4", "|u1", "|b1", "<c16", "<U3", "|S3", "<M8[s]", "|O"]
+
+
+@st.composite
+def members(draw):
+    """The arrays of a file, one after the other or stacked, with a few of them replaced or missing."""
+    counts = draw(st.lists(st.integers(2, 4), min_size=1, max_size=3))
+    width, stacked = draw(st.integers(1, 3)), draw(st.booleans())
+    if stacked:
+        counts = [counts[0]] * len(counts)
+    clocks = [draw(st.sampled_from([0.0, 0.1, -3.0])) + np.arange(n) for n in counts]
+    values = draw(hnp.arrays(float, (sum(counts), width), elements=st.integers(-3, 9) | FLOATS))
+    arrays = {"times": np.concatenate(clocks), "outputs": values}
+    if stacked:
+        arrays = {"times": np.stack(clocks), "outputs": values.reshape(len(counts), counts[0], width)}
+    else:
+        arrays["lengths"] = np.array(counts)
+    for _ in range(draw(st.integers(0, 2))):
+        key = draw(st.sampled_from(["times", "outputs", "lengths", "names", "other"]))
+        shape = np.shape(arrays.get(key, np.zeros(width)))
+        if draw(st.integers(0, 3)) == 0:
+            shape = draw(hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=4))
+        if draw(st.integers(0, 9)) == 0:
+            arrays.pop(key, None)
+        else:
+            array = draw(hnp.arrays(int, shape, elements=st.integers(-1, 4)))
+            array = np.cumsum(array, axis=-1) if key == "times" and array.ndim else array
+            arrays[key] = array.astype(draw(st.sampled_from(KINDS)))
+    if draw(st.booleans()) and "names" not in arrays:
+        arrays["names"] = np.array(draw(st.lists(NAMES, min_size=width, max_size=width)))
+    return {key: np.asfortranarray(array) if draw(st.booleans()) else array for key, array in arrays.items()}
+
+
+@given(members(), st.booleans())
+def test_arrays_of_any_kind_and_shape(folder, arrays, compressed):
+    path = folder / "arrays.npz"
+    (np.savez_compressed if compressed else np.savez)(path, **arrays)
+    loaded = attempt("npz, arrays", InputError, lambda: Demonstrations.load(path))
+    if loaded is not None:
+        same(loaded, npz_demonstrations(path))
+
+
+def archive(compression) -> bytes:
+    buffer = io.BytesIO()
+    t = np.linspace(0, 1, 4)
+    write = np.savez_compressed if compression else np.savez
+    write(buffer, lengths=[4, 4], times=np.r_[t, t], outputs=np.cos(np.arange(16.0)).reshape(8, 2), names=["x", "y"])
+    return buffer.getvalue()
+
+
+ARCHIVES = [archive(False), archive(True)]
+
+
+@given(st.sampled_from(ARCHIVES), edits(), st.lists(st.tuples(st.floats(0, 1), st.integers(0, 7)), max_size=4))
+def test_archives_with_bytes_changed(folder, data, changes, flips):
+    """Most of these meet a checksum: what is read nevertheless is what was there."""
+    mutated = bytearray(edited(data, changes) if len(flips) % 2 else data)
+    for where, bit in flips:
+        mutated[min(int(where * len(mutated)), len(mutated) - 1)] ^= 1 << bit
+    path = folder / "bytes.npz"
+    path.write_bytes(mutated)
+    loaded = attempt("npz, bytes changed", InputError, lambda: Demonstrations.load(path))
+    if loaded is not None:
+        same(loaded, npz_demonstrations(path))
+
+
+@given(st.data())
+def test_archives_with_members_changed_and_their_checksums_mended(folder, data):
+    with zipfile.ZipFile(io.BytesIO(ARCHIVES[0])) as file:
+        members = {name: file.read(name) for name in file.namelist()}
+    for name in data.draw(st.lists(st.sampled_from(sorted(members)), min_size=1, max_size=2)):
+        members[name] = edited(members[name], data.draw(edits(2)))
+    path = folder / "members.npz"
+    with zipfile.ZipFile(path, "w") as file:
+        for name, content in members.items():
+            file.writestr(name, content)
+    loaded = attempt("npz, members changed", InputError, lambda: Demonstrations.load(path))
+    if loaded is not None:
+        same(loaded, npz_demonstrations(path))
+
+
+DTYPES = st.sampled_from(["<f8", "<f4", "|b1", "<U2", "|O", "<f99", "f8", "=f8", "<i8", "V8", "", "<m8", "<f8,<f8"])
+LENGTHS = st.integers(-2, 9) | st.sampled_from([2**31, 2**63 - 1, 2**64, 10**30])
+SHAPES = st.sampled_from([[1, 4, 2], [2, 4, 1], [2, 4, 1]]) | st.lists(LENGTHS, max_size=4)
+
+
+@given(
+    st.sampled_from(["<f8", "<i4", "|u1"]) | DTYPES,
+    SHAPES,
+    st.booleans(),
+    st.binary(min_size=64, max_size=64).map(lambda b: b[::-1] + b[:5]),
+    st.sampled_from([64, 32, 8, 63, 69]),
+    st.sampled_from([1, 1, 2, 3, 4]),
+)
+@example("<f8", [10**9, 0, 2], False, b"", 0, 1)
+@example("<f8", [1, 4, 99999999999], False, bytes(64), 64, 1)
+def test_headers_that_claim_anything(folder, kind, shape, fortran_order, content, length, version):
+    header = f"{{'descr': {kind!r}, 'fortran_order': {fortran_order}, 'shape': {tuple(shape)}}}\n".encode()
+    size = struct.pack("<H" if version == 1 else "<L", len(header))
+    t = io.BytesIO()
+    np.save(t, np.linspace(0, 1, 4))
+    path = folder / "header.npz"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("times.npy", t.getvalue())
+        file.writestr("outputs.npy", b"\x93NUMPY" + bytes([version, 0]) + size + header + content[:length])
+    loaded = attempt("npz, headers", InputError, lambda: Demonstrations.load(path))
+    if loaded is not None:
+        same(loaded, npz_demonstrations(path))
+
+
+FIELDS = st.sampled_from(
+    ["0", "1", "2", "3", "-1", "0.5", "1e3", "1e-320", ".5", "5.", "+2", " 1 ", "nan", "inf", "1e999", "", "x", "1_0"]
+    + ["0x10", "1,", '"1"', '"1', '1"', "١", "1 2", "9007199254740993", "-0.0", "\x00", "'1'", "1d3", "1\t", "#1"]
+)
+FIRST_LINES = st.sampled_from(
+    [
+        "t,x",
+        "t,x,y",
+        "time [s],x",
+        "demonstration,time,x",
+        "demonstration,time,x,y",
+        "",
+        "x,y",
+        '"t","x"',
+        "t;x",
+        "T,x,",
+    ]
+)
+
+
+PLAIN = st.sampled_from(["0", "1", "-2.5", "1e-3", " 7"])
+
+
+@given(
+    st.sampled_from(["t,x", "t,x", "time [s],x,y"]) | FIRST_LINES,
+    st.lists(st.lists(PLAIN | PLAIN | PLAIN | FIELDS, min_size=1, max_size=2), max_size=4),
+    st.sampled_from(["\n", "\r\n"]),
+)
+def test_tables_of_odd_fields(folder, first, rows, end):
+    rows = [[str(number), *row] for number, row in enumerate(rows)]
+    path = folder / "fields.csv"
+    path.write_text(end.join([first, *(",".join(row) for row in rows), ""]), encoding="utf-8", newline="")
+    loaded = attempt("csv, odd fields", InputError, lambda: Demonstrations.load(path))
+    if loaded is not None:
+        same(loaded, csv_demonstrations(path))
+
+
+@given(
+    st.sampled_from(["t,x", "demonstration,time,x"]),
+    st.integers(2, 6),
+    st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2), FIELDS | FLOATS.map(repr)), max_size=3),
+)
+def test_sound_tables_with_a_few_odd_fields(folder, first, length, odd):
+    width = first.count(",") + 1
+    rows = [["0"] * (width - 2) + [str(n), repr(n / 3)] for n in range(length)]
+    for row, column, field in odd:
+        rows[row % length][column % width] = field
+    path = folder / "few.csv"
+    path.write_text("\n".join([first, *map(",".join, rows)]), encoding="utf-8", newline="")
+    loaded = attempt("csv, a few odd fields", InputError, lambda: Demonstrations.load(path))
+    if loaded is not None:
+        same(loaded, csv_demonstrations(path))
+
+
+TABLE = b"demonstration,time,x [m],y\n" + b"".join(b"%d,%d,%d.5,-1e-%d\n" % (n // 5, n % 5, n, n) for n in range(10))
+
+
+@given(edits(2))
+def test_tables_with_bytes_changed(folder, changes):
+    path = folder / "bytes.csv"
+    path.write_bytes(edited(TABLE, changes))
+    loaded = attempt("csv, bytes changed", InputError, lambda: Demonstrations.load(path))
+    if loaded is not None:
+        same(loaded, csv_demonstrations(path))
+
+
+SCALARS = (
+    st.none() | st.booleans() | st.integers() | st.floats() | st.complex_numbers() | st.text(max_size=3) | st.binary()
+)
+ANYTHING = st.recursive(
+    SCALARS,
+    lambda inside: st.lists(inside, max_size=3) | st.tuples(inside) | st.dictionaries(st.text(max_size=2), inside),
+    max_leaves=8,
+) | hnp.arrays(st.sampled_from([float, complex, int, "U2", "M8[s]"]), hnp.array_shapes(max_side=3))
+ROWS = st.sampled_from([[[1], [2]], [[1.0, 2.0], [3.0, 4.0]], np.eye(2), np.array([[1], [True]], dtype=object)])
+
+
+@given(
+    st.sampled_from([[0, 1], [[0, 1]], [[0, 1], (0.5, 2)], np.arange(2)]) | ANYTHING,
+    st.lists(ROWS, min_size=1, max_size=2) | st.lists(ROWS | ANYTHING, max_size=2) | ANYTHING,
+    st.none() | st.lists(NAMES, min_size=1, max_size=2) | ANYTHING,
+)
+def test_demonstrations_of_anything(times, outputs, names):
+    made = attempt("arguments", InputError, lambda: Demonstrations(times, outputs, names))
+    if made is not None:
+        for y, given_y in zip(made.outputs, outputs, strict=True):
+            assert y.tolist() == [[float(value) for value in row] for row in given_y]

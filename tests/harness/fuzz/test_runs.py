@@ -1,0 +1,261 @@
+"""What a run leaves, changed at random: each of its files means what it says, or is refused in one sentence."""
+
+import csv
+import io
+import json
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fuzz.changes import changed_texts, changed_trees, edited, edits
+from fuzz.tally import attempt
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import check_environment
+from guiderail.tools.evaluation.metrics import summary
+from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import SUMMARY, configure
+from guiderail.tools.learning.trainer import _resume
+from guiderail.tools.tables import table_text
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return RunFolder(tmp_path_factory.mktemp("fuzz") / "run")
+
+
+def written(config, folder):
+    folder.write_config(config)
+    return (folder.path / "config.yaml").read_text()
+
+
+CONFIGS = [
+    configure("NarrowPassage", {"guidance": "skgrl", "explored": [1], "hold": 3}, episodes=7, seed=3),
+    configure("BncConnector", {"guidance": "kgrl"}, preset="clamp", algorithm="sac", seed=2**31 - 1),
+    configure("Pouring", {}, preset="pouring", settings={"units": "32", "entropy": "0.2"}, ledger=False),
+]
+
+
+@pytest.fixture(scope="module")
+def texts(folder):
+    return [written(config, folder) for config in CONFIGS]
+
+
+def read(folder):
+    """A configuration, and that an environment and a learner can be made of it."""
+    config = folder.config()
+    check_environment(config.task, config.environment)
+    LEARNERS.get(config.learner.algorithm)
+    return config
+
+
+def try_config(target, folder, text):
+    (folder.path / "config.yaml").write_text(text, encoding="utf-8", newline="")
+    config = attempt(target, InputError, lambda: read(folder))
+    if config is None:
+        return
+    said = yaml.safe_load(text)
+    for name in ("task", "seed", "episodes", "preset"):
+        assert getattr(config, name) == said[name]
+        assert type(getattr(config, name)) is type(said[name])
+    for name, value in said["environment"].items():
+        found = config.environment[name]
+        assert (list(found) if isinstance(found, tuple) else found) == value or value != value
+    for name, value in said["learner"].items():
+        found = getattr(config.learner, name)
+        if isinstance(found, bool) or isinstance(value, bool):
+            assert found in (0, 1)
+            assert isinstance(found, bool)
+        elif isinstance(found, str):
+            assert found == str(value)
+        elif isinstance(found, tuple):
+            assert list(found) == [int(n) for n in (value.split(",") if isinstance(value, str) else value)]
+        else:
+            assert found == float(value)
+
+
+@given(st.data())
+def test_configurations_with_entries_changed(folder, texts, data):
+    tree = data.draw(changed_trees([yaml.safe_load(text) for text in texts]))
+    # A file that a run imports is code, and whoever changes that changes what is run.
+    if isinstance(tree, dict):
+        tree.pop("imports", None)
+    try_config("config.yaml, entries changed", folder, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+
+
+@given(st.data())
+def test_configurations_with_characters_changed(folder, texts, data):
+    text = data.draw(changed_texts([text.replace("imports: []\n", "") for text in texts]))
+    try_config("config.yaml, characters changed", folder, text)
+
+
+ROW = {"episode": 0, "return": -1.25, "success": 1, "termination": "success", "steps": 40, "peak_force": 1.5}
+ROW |= {"worst_violation": -1e-3, "collisions": 0, "wall_time": 0.125}
+ROWS = [ROW | {"episode": n, "return": -n / 3, "success": n % 2} for n in range(12)]
+TABLE = table_text(ROWS).encode()
+FIELDS = st.sampled_from(
+    ["", "nan", "inf", "-inf", "1e400", "1e-400", "x", "True", "1_0", "0x10", " 1", "1 ", "9007199254740993", "None"]
+    + ["1" * 30, "-0.0", '"1"', '"', "1,1", "success", "2001-01-01", "١", "\x00", "a\nb", "0.1" + "0" * 400, "1e5"]
+)
+
+
+def try_table(target, folder, content):
+    (folder.path / "episodes.csv").write_bytes(content)
+    table = attempt(target, InputError, lambda: _summarized(folder))
+    if table is None:
+        return
+    header, *rows = csv.reader(io.StringIO(content.decode(), newline=""))
+    assert list(table.columns) == header
+    assert len(table) == len([row for row in rows if row])
+    for row, (_, found) in zip([row for row in rows if row], table.iterrows(), strict=True):
+        for said, value in zip(row, found, strict=True):
+            if isinstance(value, str):
+                assert value == said
+            elif said == "":
+                assert pd.isna(value)
+            elif isinstance(value, bool | np.bool_):
+                assert str(value) == said
+            else:
+                assert float(value) == float(said) or float(said) != float(said)
+
+
+def _summarized(folder):
+    table = folder.episodes()
+    summary(table, SUMMARY)
+    return table
+
+
+@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 8), FIELDS), min_size=1, max_size=3))
+def test_tables_of_episodes_with_odd_fields(folder, odd):
+    rows = [line.split(",") for line in TABLE.decode().splitlines()]
+    for row, column, field in odd:
+        rows[row][column] = field
+    try_table("episodes.csv, odd fields", folder, "\n".join(map(",".join, rows)).encode())
+
+
+@given(edits(3))
+def test_tables_of_episodes_with_bytes_changed(folder, changes):
+    try_table("episodes.csv, bytes changed", folder, edited(TABLE, changes))
+
+
+ARRAYS = {"weights": np.linspace(-1, 1, 6, dtype=np.float32).reshape(2, 3), "count": np.arange(3), "none": np.zeros(0)}
+FLIPS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 7)), max_size=2)
+VALUES = {"rows": ROWS[:2], "learner": {"decisions": 12, "selection": {}}, "environment": {"state": 2**100}}
+
+
+@given(edits(3), FLIPS)
+def test_checkpoints_with_bytes_changed(folder, changes, flips):
+    save_checkpoint(folder.checkpoint, ARRAYS, VALUES)
+    content = bytearray(edited(folder.checkpoint.read_bytes(), [] if flips else changes))
+    for where, bit in flips:
+        content[min(int(where * len(content)), len(content) - 1)] ^= 1 << bit
+    folder.checkpoint.write_bytes(content)
+    loaded = attempt("checkpoint, bytes changed", InputError, lambda: load_checkpoint(folder.checkpoint))
+    if loaded is not None:
+        assert loaded[1] == VALUES
+        assert loaded[0].keys() == ARRAYS.keys()
+        for name, array in ARRAYS.items():
+            np.testing.assert_array_equal(loaded[0][name], array, strict=True)
+
+
+LAYERS = [
+    (np.linspace(-1, 1, 12, dtype=np.float32).reshape(4, 3), np.zeros(4, np.float32)),
+    (np.linspace(1, -1, 8, dtype=np.float32).reshape(2, 4), np.ones(2, np.float32)),
+]
+DESCRIPTION = {"pool": 1, "action_low": [-1.0, -2.0], "action_high": [1.0, 2.0], "activation": "relu", "task": "Bead"}
+DESCRIPTION |= {"observation_shape": [3]}
+SEEN = np.array([0.5, -1.0, 2.0])
+
+
+def try_policy(target, folder, expected):
+    policy = attempt(target, InputError, lambda: Policy.load(folder.path))
+    if policy is None:
+        return
+    action = attempt(f"{target}, acting", InputError, lambda: policy(np.resize(SEEN, policy._shape)))
+    assert np.isfinite(action).all()
+    assert (action >= policy._low).all()
+    assert (action <= policy._high).all()
+    if expected is not None:
+        np.testing.assert_array_equal(action, expected)
+
+
+@given(st.sampled_from(["policy.json", "policy.safetensors"]), edits(3), FLIPS)
+def test_policies_with_bytes_changed(folder, file, changes, flips):
+    policy = Policy(LAYERS, DESCRIPTION)
+    policy.save(folder.path)
+    content = bytearray(edited((folder.path / file).read_bytes(), [] if flips else changes))
+    for where, bit in flips:
+        content[min(int(where * len(content)), len(content) - 1)] ^= 1 << bit
+    (folder.path / file).write_bytes(content)
+    try_policy("policy, bytes changed", folder, policy(SEEN))
+
+
+@given(st.data())
+def test_policies_with_entries_changed_that_have_their_digest(folder, data):
+    """Whoever makes such a file on purpose: it is refused, or acts within its limits."""
+    tree = data.draw(changed_trees([DESCRIPTION | {"format": "guiderail policy 1"}]))
+    Policy(LAYERS, DESCRIPTION).save(folder.path)
+    (folder.path / "policy.json").write_text(json.dumps(tree, default=str))
+    try_policy("policy, entries changed", folder, None)
+
+
+@pytest.fixture(scope="module")
+def resumable(folder):
+    """A small learner that has seen something, and what a checkpoint of it holds."""
+    env = Line()
+    settings = {"units": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_every": 1}
+    learner = LEARNERS.get("tqc")(
+        resolve_preset("robust", "tqc", settings), env, hold=1, seed=0, decisions=12, symmetry=None
+    )
+    arrays, values = learner.state()
+    arrays = {key: array.copy() for key, array in arrays.items()}
+    values = {"rows": ROWS, "learner": values, "environment": env.np_random.bit_generator.state}
+    return env, learner, arrays, json.loads(json.dumps(values))
+
+
+class Line(gymnasium.Env):
+    """The two spaces and the random numbers that a learner and a checkpoint ask for."""
+
+    observation_space = spaces.Box(-1, 1, (3,), np.float32)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+
+@given(st.data())
+def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable, data):
+    env, learner, arrays, values = resumable
+    changed = dict(arrays)
+    for name in data.draw(st.lists(st.sampled_from(sorted(arrays)), max_size=2)):
+        what = data.draw(st.sampled_from(["remove", "reshape", "type", "number", "rename", "longer"]))
+        array = changed.pop(name, arrays[name])
+        if what == "reshape":
+            changed[name] = array.reshape(-1, 1)
+        elif what == "type":
+            changed[name] = array.astype(data.draw(st.sampled_from(["f2", "f8", "i4", "u1"])))
+        elif what == "number":
+            changed[name] = np.full_like(array, data.draw(st.integers(0, 9)))
+        elif what == "rename":
+            changed[data.draw(st.sampled_from(["", "x", "optimizer/x", f"{name}/0"]))] = array
+        elif what == "longer":
+            changed[name] = np.concatenate([array.ravel(), array.ravel()])
+    tree = values if data.draw(st.booleans()) and changed.keys() else data.draw(changed_trees([values]))
+    save_checkpoint(folder.checkpoint, changed, tree)
+    folder.write_episodes(ROWS[: data.draw(st.sampled_from([3, len(ROWS)]))])
+    resumed = attempt("checkpoint, other content", InputError, lambda: _resume(folder, learner, env))
+    if resumed is not None:
+        rows, _ = resumed
+        assert rows == tree["rows"]
+        found, known = learner.state()
+        assert json.loads(json.dumps(known)) == tree["learner"]
+        assert found.keys() == changed.keys()
+        for name, array in changed.items():
+            np.testing.assert_array_equal(found[name], array, strict=True)
+        assert env.np_random.bit_generator.state == tree["environment"]

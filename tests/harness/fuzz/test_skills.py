@@ -1,0 +1,181 @@
+"""Skill files, mutated at random: a skill that means exactly what the file says and works, or one sentence."""
+
+import copy
+import dataclasses
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import yaml
+from hypothesis import example, given
+from hypothesis import strategies as st
+from pydrake.math import RigidTransform, RotationMatrix
+
+import guiderail.models.objects
+from fuzz.changes import changed_texts, changed_trees
+from fuzz.tally import attempt
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.yaml import parse_yaml
+from guiderail.models.templates import parse_skill
+from guiderail.models.templates.transitions import TransitionDistance
+from oracles.files import skill_numbers
+
+TEXTS = [
+    (Path(__file__).parents[2] / "models" / "templates" / "reach.yaml").read_text(),
+    *(file.read_text() for file in sorted(Path(guiderail.models.objects.__path__[0]).glob("*/*.yaml"))),
+    """
+name: every_kind
+inputs: 6
+frames: [a, b]
+max_speed_m_per_s: 1
+max_speed_rad_per_s: 1
+parameters: {p: 0.5, q: 2}
+states:
+  one:
+    input_mapping:
+      - {kind: rotation, inputs: [0, 1], axes: [[0, 0, 1], [1, p, 0]], speed_rad_per_s: q, frame: tool}
+      - {kind: scaled, frame: a, distance_m: [0, p], factor: [0, 1],
+         of: {kind: uneven, above: 0.1, below: 1, of: {kind: translation, inputs: [2, 3, 4], speed_m_per_s: 1}}}
+    active_constraints:
+      - {kind: half_space, frame: a, normal: [0, p, 1], offset_m: -1}
+      - {kind: box, lower_m: [-1, -1, -1], upper_m: [1, q, 1]}
+      - {kind: funnel, frame: b, radius_m: 0.1, height_m: 0.2, slope: 1}
+      - {kind: keep_above, frame: b, height_m: -2, points_m: [[0, 0, 0.1], [0, 0, -0.1]]}
+      - {kind: arc, frame: b, radius_m: p, height_m: 0.1, min_deg: -90, max_deg: 90}
+      - {kind: tilt_limits, frame: a, min_deg: 0, max_deg: 10 * q}
+    transition_distance: {kind: rotation_to_go, rpy_deg: [0, 0, 90], frame: a}
+    starts_at_deg: 90
+    weight_per_deg: 0.1
+    transitions: [{to: two, below_deg: 5 * q}]
+  two:
+    input_mapping: []
+    active_constraints: []
+    transition_distance: {kind: height, frame: b}
+    starts_at_m: 1
+    ends_at_m: -1
+""",
+]
+TREES = [yaml.safe_load(text) for text in TEXTS]
+
+
+def means_what_it_says(skill, text):
+    """Every number of the skill is the one that an independent reader finds at its place in the file."""
+    found = skill_numbers(text)
+    data = parse_yaml(text)
+    for name, value in skill.parameters.items():
+        assert value == found["parameters", name]
+    assert skill.inputs == found["inputs",]
+    assert skill.max_speed_m_per_s == found["max_speed_m_per_s",]
+    assert skill.max_speed_rad_per_s == found["max_speed_rad_per_s",]
+    assert [state.name for state in skill.states] == list(data["states"])
+    for state, entry in zip(skill.states, data["states"].values(), strict=True):
+        place = ("states", state.name)
+        unit = state.transition_distance.unit
+        si = math.pi / 180 if unit == "deg" else 1.0
+        assert state.starts_at == si * found[*place, f"starts_at_{unit}"]
+        if f"ends_at_{unit}" in entry:
+            assert state.ends_at == si * found[*place, f"ends_at_{unit}"]
+        assert state.weight == found.get((*place, f"weight_per_{unit}"), 1.0 * si) / si
+        for number, transition in enumerate(state.transitions):
+            there = (*place, "transitions", str(number))
+            assert transition.below == si * found[*there, f"below_{unit}"]
+            assert transition.hysteresis == _scaled(si, found.get((*there, f"hysteresis_{unit}")))
+        for field in ("input_mapping", "active_constraints"):
+            parts = getattr(state, field)
+            assert len(parts) == len(entry[field])
+            for number, part in enumerate(parts):
+                same_fields(part, entry[field][number], (*place, field, str(number)), found)
+        same_fields(state.transition_distance, entry["transition_distance"], (*place, "transition_distance"), found)
+
+
+def _scaled(si, value):
+    return None if value is None else si * value
+
+
+def same_fields(part, entry, place, found):
+    assert set(entry) - {"kind"} <= {field.name for field in dataclasses.fields(part)}
+    for key, said in entry.items():
+        if key == "of":
+            same_fields(part.of, said, (*place, "of"), found)
+        elif key != "kind":
+            same_value(getattr(part, key), said, (*place, key), found)
+
+
+def same_value(value, said, place, found):
+    if isinstance(value, tuple):
+        assert len(value) == len(said)
+        for number, (inner, inner_said) in enumerate(zip(value, said, strict=True)):
+            same_value(inner, inner_said, (*place, str(number)), found)
+    elif isinstance(value, str | bool):
+        assert value is said or value == said
+    else:
+        assert value == found[place]
+
+
+def works(skill):
+    """Every law of every state gives a pose or a number, near the object and far from it."""
+    X_WF = {
+        name: RigidTransform(RotationMatrix.MakeZRotation(0.3 + i), [0.5, 0.1 * i, 0.1])
+        for i, name in enumerate(skill.frames)
+    }
+    inputs = np.linspace(-1.0, 1.5, skill.inputs)
+    for X_WE in (RigidTransform(RotationMatrix.MakeXRotation(0.4), [0.4, 0.0, 0.3]), RigidTransform()):
+        state = skill.state_at(X_WE, X_WF)
+        assert 0 <= state < len(skill.states)
+        for number in range(len(skill.states)):
+            request = skill.displace(X_WE, skill.map(number, inputs, X_WE, X_WF, 0.01))
+            command = skill.command(number, X_WE, request, X_WF, 0.01)
+            for X in (request, command.X_WE, skill.project(number, X_WE, X_WF)):
+                assert np.isfinite(X.GetAsMatrix34()).all()
+            assert math.isfinite(skill.violation(number, X_WE, X_WF))
+            assert math.isfinite(skill.progress(number, X_WE, X_WF))
+            assert 0 <= skill.next_state(number, X_WE, X_WF) < len(skill.states)
+            assert isinstance(skill.states[number].transition_distance, TransitionDistance)
+
+
+def try_skill(target, text):
+    skill = attempt(target, InputError, lambda: parse_skill(text))
+    if skill is not None:
+        means_what_it_says(skill, text)
+        works(skill)
+
+
+@given(changed_trees(TREES))
+@example(TREES[-1])
+def test_skills_with_entries_changed(tree):
+    try_skill("skill, entries changed", yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+
+
+@given(changed_texts(TEXTS))
+def test_skills_with_characters_changed(text):
+    try_skill("skill, characters changed", text)
+
+
+TOKENS = st.sampled_from(
+    ["p", "q", "1", "2.5", "0", "1e3", "x", "(", ")", "+", "-", "*", "/", " ", "**", "%", "//", ".5"]
+)
+
+
+@given(st.lists(TOKENS, max_size=12).map("".join))
+def test_arithmetic(expression):
+    tree = copy.deepcopy(TREES[-1])
+    tree["max_speed_m_per_s"] = expression
+    try_skill("skill, arithmetic", yaml.safe_dump(tree, sort_keys=False))
+
+
+# PyYAML writes the text "1e3" without quotes: to YAML 1.2 it is a number.
+WORDS = st.text(max_size=12).filter(lambda text: not re.fullmatch(r"[-+]?[0-9]+[eE][-+]?[0-9]+", text))
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | WORDS,
+    lambda inside: st.lists(inside, max_size=4) | st.dictionaries(WORDS, inside, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(VALUES)
+def test_yaml_gives_back_what_was_written(value):
+    text = yaml.safe_dump(value)
+    read = attempt("yaml, round trip", InputError, lambda: (parse_yaml(text),))
+    if read is not None:
+        assert read[0] == value

@@ -1,0 +1,72 @@
+"""Hours of an arm that moves and is stopped now and then, as fast as it goes: is memory flat, is no stop missed?
+
+    python tests/injections/hours.py --seconds 480     # of the wall's clock
+
+An arm moves for twenty seconds of its own clock, then something happens that must stop it, and it goes on. It ends with
+1 if a stop was missed, or if the process has grown by more than a hundredth between the first quarter and the end.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from injections import faults
+from injections.bus import PERIOD, Bus
+
+MOVES = 20.0  # [s]
+GROWTH = 0.01
+PAGE = 4096
+
+
+def resident() -> float:
+    """Memory of this process [MiB]."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 2**20
+
+
+def stops(rng: np.random.Generator) -> Iterator[faults.Injection]:
+    """What must stop an arm, for ever."""
+    while True:
+        yield faults.lost("on_status", 0.2)
+        yield faults.not_finite("joint_position_measured", [int(rng.integers(7))], np.nan, 3)
+        yield faults.loaded(int(rng.integers(7)), 150.0)
+        yield faults.lost("on_command", 0.2)
+        yield faults.controller_held_up(0.2)
+        yield faults.controller_killed(0.1)
+        yield faults.garbage(rng, 3)
+
+
+def main() -> int:
+    """Prints a line now and then; 1 if anything was wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=480.0)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    rng, bus = np.random.default_rng(arguments.seed), Bus()
+    started, said, wrong, number = time.monotonic(), 0.0, 0, 0
+    grown: list[tuple[float, float]] = []
+    for injection in stops(rng):
+        bus.run_in(MOVES)
+        seen = injection.inject(bus)
+        number, wrong = number + 1, wrong + bool(seen.wrong)
+        for words in seen.wrong:
+            print(f"WRONG  {injection.kind}, {injection.words}: {words}", flush=True)
+        wall = time.monotonic() - started
+        grown.append((wall, resident()))
+        if wall - said > 30.0 or wall > arguments.seconds:
+            said, hours = wall, bus.step * PERIOD / 3600.0
+            print(f"{wall:.0f} s: {hours:.2f} h, {number} stops, {wrong} wrong, {resident():.1f} MiB", flush=True)
+        if wall > arguments.seconds:
+            break
+    early = next(size for wall, size in grown if wall > 0.25 * arguments.seconds)
+    growth = grown[-1][1] / early - 1.0
+    print(f"grown by {growth:.2%} since a quarter of the time")
+    return 1 if wrong or growth > GROWTH else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,460 @@
+"""Changes the safety code one place at a time, and asks whether a test notices.
+
+    python tests/harness/mutation/mutate.py                         # everything, some hours
+    python tests/harness/mutation/mutate.py --every 8               # an eighth, chosen by hashes of the names
+    python tests/harness/mutation/mutate.py qp window               # these files
+    python tests/harness/mutation/mutate.py --results mutants.json  # goes on where it was stopped
+
+Every operator below is applied at every place of a file that it fits: comparisons, arithmetic, logic, numbers,
+branches, statements, calls that have a counterpart, slices, keyword arguments. A mutant is tried by the tests that
+execute its line, the quickest first. One that no test notices survives: `survivors.yaml` says of each why that makes no
+difference. A survivor that it does not name is an error, and so is a name in it that no mutant has or that is killed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import hashlib
+import importlib
+import importlib.abc
+import importlib.util
+import json
+import os
+import resource
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+ROOT = Path(__file__).parents[3]
+PRIMITIVES = ["tests/models/primitives"]
+SKILLS = ["tests/models/templates"]
+TARGETS = {
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp", "mixture")},
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "demonstrations")},
+    "models/templates/constraints.py": SKILLS,
+    "models/templates/template.py": SKILLS,
+    "models/templates/geometry.py": SKILLS,
+    "models/control/keep_out.py": [
+        "tests/models/control/test_keep_out.py",
+        "tests/models/control/test_keep_out_properties.py",
+    ],
+    "models/control/cartesian_impedance.py": [
+        "tests/models/control/test_cartesian_impedance.py",
+        "tests/models/control/test_cartesian_impedance_law.py",
+    ],
+    **{
+        f"systems/{path.name}": [f"tests/systems/test_{path.name}"]
+        for path in sorted((ROOT / "systems").glob("*.py"))
+        if path.stem != "__init__"
+    },
+    "systems/support/command_watch.py": [
+        "tests/systems/test_command_watchdog.py",
+        "tests/systems/test_torque_safety_limiter.py",
+    ],
+}
+SURVIVORS = ROOT / "tests" / "harness" / "mutation" / "survivors.yaml"
+# Imported once, before a process is forked for each mutant: what takes seconds and is never mutated.
+HEAVY = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
+HEAVY += ("scipy.optimize", "scipy.sparse", "scipy.spatial.transform", "sklearn.mixture", "yaml", "matplotlib.figure")
+HEAVY += (
+    "pydrake.multibody.plant",
+    "pydrake.systems.analysis",
+    "pydrake.systems.framework",
+    "pydrake.systems.primitives",
+)
+
+
+# --- what is changed ---
+
+ORDER = {
+    ast.Lt: (ast.LtE, ast.Gt),
+    ast.LtE: (ast.Lt, ast.Gt),
+    ast.Gt: (ast.GtE, ast.Lt),
+    ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,),
+    ast.NotIn: (ast.In,),
+}
+ARITHMETIC = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult,
+    ast.Pow: ast.Mult,
+    ast.BitOr: ast.BitAnd,
+    ast.BitAnd: ast.BitOr,
+}
+COUNTERPART = {
+    **{"min": "max", "any": "all", "minimum": "maximum", "argmin": "argmax", "sin": "cos", "zeros": "ones"},
+    **{"max": "min", "all": "any", "maximum": "minimum", "argmax": "argmin", "cos": "sin", "ones": "zeros"},
+    **{"radians": "degrees", "deg2rad": "rad2deg", "sum": "max", "mean": "max", "asin": "sin", "flatnonzero": "argmin"},
+}
+# Without them the number is another one, or the array is the caller's.
+DROPPED = {"abs", "sqrt", "copy", "sorted", "float", "int", "bool", "round", "array", "asarray", "ascontiguousarray"}
+
+
+def changes(node: ast.AST) -> Iterator[ast.AST | None]:
+    """What may stand in place of a node; None removes a statement."""
+    if isinstance(node, ast.Compare) and len(node.ops) >= 1:
+        for i, operator in enumerate(node.ops):
+            for other in ORDER[type(operator)]:
+                yield _with(node, ops=[*node.ops[:i], other(), *node.ops[i + 1 :]])
+    elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
+        yield _with(node, op=ARITHMETIC[type(node.op)]())
+    elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
+        yield _with(node, left=node.right, right=node.left)
+    elif isinstance(node, ast.AugAssign):
+        if type(node.op) in ARITHMETIC:
+            yield _with(node, op=ARITHMETIC[type(node.op)]())
+        yield None
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+        yield node.operand
+    elif isinstance(node, ast.BoolOp):
+        yield _with(node, op=ast.Or() if isinstance(node.op, ast.And) else ast.And())
+    elif isinstance(node, ast.Constant):
+        yield from (ast.copy_location(ast.Constant(value), node) for value in _other_constants(node.value))
+    elif isinstance(node, ast.If | ast.While | ast.IfExp):
+        yield from (_with(node, test=ast.copy_location(ast.Constant(value), node.test)) for value in (True, False))
+    elif isinstance(node, ast.Call):
+        yield from _other_calls(node)
+    elif isinstance(node, ast.Attribute) and node.attr == "T" and isinstance(node.ctx, ast.Load):
+        yield node.value
+    elif isinstance(node, ast.Slice):
+        yield from (_with(node, **{end: None}) for end in ("lower", "upper", "step") if getattr(node, end))
+    elif isinstance(node, ast.Continue | ast.Break):
+        yield ast.copy_location(ast.Break() if isinstance(node, ast.Continue) else ast.Continue(), node)
+    elif _can_be_left_out(node):
+        yield None
+
+
+def _can_be_left_out(node: ast.AST) -> bool:
+    """A statement without which the others can still be executed."""
+    if isinstance(node, ast.Assign):
+        return not any(isinstance(target, ast.Name | ast.Tuple) for target in node.targets)
+    return isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call))
+
+
+def _other_constants(value):
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, int):
+        return [value + 1, value - 1]
+    if isinstance(value, float):
+        return [100 * value, value / 100] if value else [1.0]
+    return []
+
+
+def _other_calls(node: ast.Call) -> Iterator[ast.AST]:
+    called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+    if called in COUNTERPART:
+        func = copy.deepcopy(node.func)
+        setattr(func, "attr" if isinstance(func, ast.Attribute) else "id", COUNTERPART[called])
+        yield _with(node, func=func)
+    if called in DROPPED and node.args:
+        yield node.args[0]
+    elif called in DROPPED and isinstance(node.func, ast.Attribute):
+        yield node.func.value
+    for i in range(len(node.keywords)):
+        yield _with(node, keywords=node.keywords[:i] + node.keywords[i + 1 :])
+
+
+def _with(node: ast.AST, **fields) -> ast.AST:
+    other = copy.copy(node)
+    for name, value in fields.items():
+        setattr(other, name, value)
+    return other
+
+
+Path_ = tuple[tuple[str, int | None], ...]
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one file; `name` says which, whatever its line number is."""
+
+    file: str
+    name: str
+    line: int
+    last_line: int
+    path: Path_
+    change: int
+
+    def tree(self) -> ast.Module:
+        """The file with the change."""
+        tree = ast.parse((ROOT / self.file).read_text())
+        _replace(tree, self.path, list(changes(_at(tree, self.path)))[self.change])
+        return ast.fix_missing_locations(tree)
+
+    def is_in_sample(self, every: int) -> bool:
+        """Whether it is one of a part of all, which is the same wherever and whenever."""
+        return int.from_bytes(hashlib.sha256(f"{self.file}: {self.name}".encode()).digest()[:8], "big") % every == 0
+
+
+def mutants(file: str) -> list[Mutant]:
+    """Every change of a file, in the order of its lines."""
+    tree = ast.parse((ROOT / file).read_text())
+    found, seen = [], Counter()
+    for path in list(_places(tree)):
+        for i, _ in enumerate(changes(_at(tree, path))):
+            depth = _depth_of_statement(tree, path)
+            before = _at(tree, path[:depth])
+            mutated = ast.Module([copy.deepcopy(before)], [])
+            inside = (("body", 0), *path[depth:])
+            _replace(mutated, inside, list(changes(_at(mutated, inside)))[i])
+            name = f"{_function(tree, path)}: {_difference(_said(before), _said(mutated.body[0]))}"
+            seen[name] += 1
+            if seen[name] > 1:
+                name += f" ({seen[name]})"
+            found.append(Mutant(file, name, before.lineno, before.end_lineno or before.lineno, path, i))
+    return found
+
+
+def _places(node: ast.AST, path: Path_ = ()) -> Iterator[Path_]:
+    """Paths to all nodes that are code: no docstrings, annotations, decorators, messages or imports."""
+    yield path
+    for field, value in ast.iter_fields(node):
+        if field in ("annotation", "returns", "decorator_list", "ctx", "ops", "op", "bases"):
+            continue
+        if isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.JoinedStr):
+            continue
+        if isinstance(value, ast.AST):
+            yield from _places(value, (*path, (field, None)))
+        elif isinstance(value, list):
+            for i, entry in enumerate(value):
+                if isinstance(entry, ast.AST):
+                    yield from _places(entry, (*path, (field, i)))
+
+
+def _at(node, path: Path_):
+    for field, i in path:
+        node = getattr(node, field) if i is None else getattr(node, field)[i]
+    return node
+
+
+def _replace(tree: ast.Module, path: Path_, new: ast.AST | None) -> None:
+    holder, (field, i) = _at(tree, path[:-1]), path[-1]
+    if new is None:
+        new = ast.copy_location(ast.Pass(), _at(tree, path))
+    if i is None:
+        setattr(holder, field, new)
+    else:
+        getattr(holder, field)[i] = new
+
+
+def _depth_of_statement(tree: ast.Module, path: Path_) -> int:
+    """How long the path to the innermost statement around a place is."""
+    return next(n for n in range(len(path), -1, -1) if isinstance(_at(tree, path[:n]), ast.stmt))
+
+
+def _said(statement: ast.stmt) -> str:
+    """A statement's own line: of a block its head alone."""
+    head = copy.copy(statement)
+    if hasattr(head, "body"):
+        head.body = [ast.Pass()]
+        head.orelse = [] if hasattr(head, "orelse") else None
+    if hasattr(head, "decorator_list"):
+        head.decorator_list = []
+    return " ".join(ast.unparse(head).removesuffix("pass").split()).removesuffix(":")
+
+
+def _function(tree: ast.Module, path: Path_) -> str:
+    """The function or class that a place is in."""
+    around = [_at(tree, path[:n]) for n in range(len(path))]
+    return ".".join(node.name for node in around if isinstance(node, ast.FunctionDef | ast.ClassDef)) or "module"
+
+
+def _difference(before: str, after: str, context: int = 30) -> str:
+    """What differs between two lines, with as much around it as tells where it is."""
+    start = _common(before, after)
+    end = _common(before[start:][::-1], after[start:][::-1])
+    left, right = before[max(0, start - context) : start], before[len(before) - end :][:context]
+    return f"`{left}⟨{before[start : len(before) - end]} → {after[start : len(after) - end]}⟩{right}`"
+
+
+def _common(a: str, b: str) -> int:
+    """How many letters two texts begin with alike."""
+    return next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
+
+
+# --- who notices ---
+
+
+class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports the mutated module where the file's own is asked for."""
+
+    def __init__(self, mutant: Mutant):
+        self.name = "guiderail." + mutant.file.removesuffix(".py").replace("/", ".")
+        self.mutant = mutant
+
+    def find_spec(self, fullname, path=None, target=None):
+        return importlib.util.spec_from_loader(fullname, self) if fullname == self.name else None
+
+    def exec_module(self, module):
+        module.__file__ = str(ROOT / self.mutant.file)
+        exec(compile(self.mutant.tree(), module.__file__, "exec"), module.__dict__)
+
+
+class _Coverage:
+    """Which tests execute which lines of the files that can be changed, and how long each takes."""
+
+    def __init__(self):
+        self.files = {str(ROOT / file): file for file in TARGETS}
+        self.own: dict[object, str | None] = {}
+        self.lines: dict[str, dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.test = ""
+
+    def trace(self, frame, event, argument):
+        code = frame.f_code
+        if code not in self.own:
+            self.own[code] = self.files.get(os.path.realpath(code.co_filename))
+        return self._line if self.own[code] else None
+
+    def _line(self, frame, event, argument):
+        self.lines[self.own[frame.f_code]][self.test].add(frame.f_lineno)
+        return self._line
+
+    def pytest_runtest_logstart(self, nodeid):
+        self.test, self.started = nodeid, time.process_time()
+        sys.settrace(self.trace)
+
+    def pytest_runtest_logfinish(self, nodeid):
+        sys.settrace(None)
+        self.seconds[nodeid] += time.process_time() - self.started
+        self.test = ""
+
+
+def _pytest(arguments: list[str], plugins=()) -> int:
+    import pytest
+
+    quiet = ["-q", "-x", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-p", "no:xdist", "-W", "ignore"]
+    return int(pytest.main([*quiet, *arguments], plugins=list(plugins)))
+
+
+def _forked(work, cpu_seconds: float) -> int:
+    """Runs `work` in a process of its own, silent and limited; the exit status that it returns."""
+    child = os.fork()
+    if child == 0:
+        silent = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(silent, 1)
+        os.dup2(silent, 2)
+        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_seconds), int(cpu_seconds) + 5))
+        resource.setrlimit(resource.RLIMIT_AS, (8 * 2**30, 8 * 2**30))
+        status = 3
+        try:
+            status = work()
+        finally:
+            os._exit(status)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status)
+
+
+def coverage(tests: list[str], store: Path) -> dict:
+    """The lines of each file that each test executes, and each test's CPU seconds, with nothing changed.
+
+    It is measured once for tests that several files share; `store` keeps it, as this takes longer than many mutants.
+    """
+    key = f"{' '.join(tests)} {_newest(tests)}"
+    kept = json.loads(store.read_text()) if store.exists() else {}
+    if key not in kept:
+
+        def work():
+            watcher = _Coverage()
+            status = _pytest(tests, [watcher])
+            lines = {file: {test: sorted(n) for test, n in of.items()} for file, of in watcher.lines.items()}
+            store.write_text(json.dumps(kept | {key: {"lines": lines, "seconds": watcher.seconds}}))
+            return status
+
+        status = _forked(work, 3600)
+        if status != 0:
+            raise SystemExit(f"{' '.join(tests)} fails without any change (status {status}): mend it first")
+        kept = json.loads(store.read_text())
+    return kept[key]
+
+
+def _newest(tests: list[str]) -> float:
+    """When what the tests are made of, or what they test, was last changed."""
+    places = [ROOT / test for test in tests] + [ROOT / file for file in TARGETS]
+    files = [file for place in places for file in (place.rglob("*.py") if place.is_dir() else [place])]
+    return max(file.stat().st_mtime for file in files)
+
+
+def survives(mutant: Mutant, covered: dict) -> bool:
+    """True if every test passes that executes the changed line."""
+    here, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
+    lines = covered["lines"].get(mutant.file, {})
+    chosen = {test for test in seconds if any(line in here for line in lines.get(test, ()))}
+    # Of a fixture that several tests share only the first executes the line; what is executed on import, such as a
+    # default or a constant, belongs to no test at all.
+    chosen |= {test for test in seconds if Path(test.split("::")[0]).stem == f"test_{Path(mutant.file).stem}"}
+    chosen = sorted(chosen or seconds, key=lambda test: seconds[test])
+    limit = 10 + 5 * sum(seconds[test] for test in chosen)
+
+    def work():
+        sys.meta_path.insert(0, _Mutated(mutant))
+        return _pytest(chosen)
+
+    return _forked(work, limit) == 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("files", nargs="*", help="names of files, without .py; all unless given")
+    parser.add_argument("--every", type=int, default=1, help="try one of so many mutants")
+    parser.add_argument("--results", type=Path, help="a JSON file that keeps what was tried")
+    parser.add_argument("--again", action="store_true", help="try those again that survived")
+    arguments = parser.parse_args()
+    if unknown := {*arguments.files} - {Path(file).stem for file in TARGETS}:
+        parser.error(f"none of the safety code's files is called {min(unknown)}")
+    os.chdir(ROOT)
+    for name in HEAVY:
+        importlib.import_module(name)
+    with tempfile.TemporaryDirectory() as folder:
+        results = arguments.results.absolute() if arguments.results else Path(folder) / "mutants.json"
+        files = [file for file in TARGETS if not arguments.files or Path(file).stem in arguments.files]
+        wrong, total, killed = np.sum([try_file(file, arguments.every, results, arguments.again) for file in files], 0)
+    print(f"together: {killed} of {total} killed ({killed / max(total, 1):.1%}); {wrong} to be explained or mended")
+    return min(int(wrong), 1)
+
+
+def try_file(file: str, every: int, kept: Path, again: bool) -> tuple[int, int, int]:
+    """How many of a file's survivors are unexplained or wrongly explained, how many were tried and how many killed."""
+    tried = json.loads(kept.read_text()) if kept.exists() else {}
+    results, reasons = tried.setdefault(file, {}), yaml.safe_load(SURVIVORS.read_text()).get(file, {})
+    everything = mutants(file)
+    found = [mutant for mutant in everything if mutant.is_in_sample(every)]
+    for mutant in found:
+        if mutant.name in results and not (again and results[mutant.name] == "survived"):
+            continue
+        covered = coverage(TARGETS[file], kept.with_suffix(".coverage"))
+        results[mutant.name] = "survived" if survives(mutant, covered) else "killed"
+        if results[mutant.name] == "survived" and mutant.name not in reasons:
+            print(f"{file}:{mutant.line}: survives: {mutant.name}", flush=True)
+        kept.write_text(json.dumps(tried, indent=1, ensure_ascii=False))
+    survivors = {mutant.name for mutant in found if results[mutant.name] == "survived"}
+    killed = {mutant.name for mutant in found} - survivors
+    stale = (set(reasons) - {mutant.name for mutant in everything}) | (killed & set(reasons))
+    for name in sorted(stale):
+        print(f"{file}: explained, but no survivor: {name}", flush=True)
+    known = len(survivors & set(reasons))
+    print(f"{file}: {len(killed)} of {len(found)} killed, {known} explained, {len(survivors) - known} not", flush=True)
+    return len(survivors) - known + len(stale), len(found), len(killed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,109 @@
+"""YAML that a person wrote: what it says, and what happens when it says too much."""
+
+import tracemalloc
+
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.yaml import load_yaml, parse_yaml
+
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 0.001),
+        ("-.5", -0.5),
+        ("2.", 2.0),
+        ("+7", 7),
+        ("010", "010"),
+        ("1:30", "1:30"),
+        ("1_000", "1_000"),
+        ("0x10", "0x10"),
+        ("'2001-99-99'", "2001-99-99"),
+        ("yes", "yes"),
+        ("on", "on"),
+        ("true", True),
+        ("~", None),
+        ("", None),
+        (".inf", float("inf")),
+        ("'1'", "1"),
+        ("1e", "1e"),
+    ],
+)
+def test_numbers_are_numbers_and_everything_else_is_text(text, value):
+    read = parse_yaml(f"entry: {text}")["entry"]
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_an_alias_is_what_it_stands_for():
+    assert parse_yaml("a: &x {b: 1, c: 2}\nd: {<<: *x, c: 3}\ne: *x") == {
+        "a": {"b": 1, "c": 2},
+        "d": {"b": 1, "c": 3},
+        "e": {"b": 1, "c": 2},
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (BOMB, "more than 10000 entries"),
+        (
+            "a: &x {k: 1}\n" + "".join(f"b{i}: {{<<: [{', '.join(['*x'] * 50)}]}}\n" for i in range(300)),
+            "more than 10000",
+        ),
+        ("\n".join(["k0: &k0 [1]"] + [f"k{i}: &k{i} [*k{i - 1}]" for i in range(1, 500)]), "inside each other"),
+        ("[" * 50_000, "inside each other"),
+        ("- " * 5_000, "inside each other"),
+        ("{a: " * 5_000, "inside each other"),
+        ("? " * 5_000, "inside each other"),
+        ("&a [*a]", "contains itself"),
+        ("a: &a {b: *a}", "contains itself"),
+        ("- x\n" * 10_001, "more than 10000 entries"),
+        ("x" * 100_001, "longer than"),
+        ("a: 1\na: 2", "'a' is there twice"),
+        ("1: 2", "put it in quotes"),
+        ("? [a]\n: b", "put it in quotes"),
+        ("a: !!python/object/apply:os.system [ls]", "tag"),
+        ("a: !!timestamp 2001-99-99", "tag"),
+        ("a: !!binary abc", "tag"),
+        ("a: 2001-99-99", "is a date"),
+        ("a: 2001-01-01 12:00:00", "is a date"),
+        ("a: " + "9" * 5_000, "thousands of digits"),
+        ("a: \x00", "character"),
+        ("a: *b", "undefined alias"),
+        ("a\n---\nb", "another document"),
+        ("<<: 5", "merging"),
+        ("a: 'x", "end of stream"),
+    ],
+)
+def test_says_in_one_line_what_is_wrong(text, said):
+    tracemalloc.start()
+    with pytest.raises(InputError) as refused:
+        parse_yaml(text, "skill.yaml")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert said in str(refused.value)
+    assert str(refused.value).startswith("skill.yaml")
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 300
+    assert peak < 30e6
+
+
+def test_reads_a_file_with_a_byte_order_mark(tmp_path):
+    (tmp_path / "a.yaml").write_bytes(b"\xef\xbb\xbfname: \xcf\x88")
+    assert load_yaml(tmp_path / "a.yaml") == {"name": "ψ"}
+
+
+def test_refuses_what_is_no_text_file(tmp_path):
+    (tmp_path / "latin.yaml").write_bytes(b"name: \xe9")
+    (tmp_path / "large.yaml").write_bytes(b"#" * 100_001)
+    for name, said in [("latin", "UTF-8"), ("large", "larger"), ("missing", "there is no study"), ("x" * 300, "study")]:
+        with pytest.raises(InputError, match=said):
+            load_yaml(tmp_path / f"{name}.yaml", "study")
+    with pytest.raises(InputError, match="there is no study"):
+        load_yaml("/dev/zero", "study")

@@ -1,0 +1,170 @@
+"""The law of the impedance by mechanics: a gradient, a damping ratio, limits, and a posture that moves no tool."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy.linalg import eigh
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.control.cartesian_impedance import (
+    damping_matrix,
+    impedance_torques,
+    reachable_inertia,
+    spring_wrench,
+)
+
+SEEDS = st.integers(0, 2**32 - 1)
+UNLIMITED = np.full(6, 1e9)
+
+
+def positive(rng, size, scale=1.0):
+    A = rng.standard_normal((size, size))
+    return scale * (A @ A.T + 0.3 * np.eye(size))
+
+
+def quaternion(R):
+    x, y, z, w = R.as_quat()
+    return (w, np.array([x, y, z])) if w >= 0 else (-w, -np.array([x, y, z]))
+
+
+def arm(seed, joints=7, **changes):
+    """An arm in some posture, its tool away from where it should be, and nothing limited."""
+    rng = np.random.default_rng(seed)
+    eta, epsilon = quaternion(Rotation.random(rng=rng) ** 0.3)
+    return {
+        "K": np.diag([1500.0, 1000, 800, 40, 30, 20]) + positive(rng, 6),
+        "damping_ratio": 0.7,
+        "wrench_limits": UNLIMITED,
+        "R_axes": None,
+        "p_error": 0.02 * rng.standard_normal(3),
+        "eta": eta,
+        "epsilon": epsilon,
+        "J": rng.standard_normal((6, joints)),
+        "M": positive(rng, joints),
+        "v": 0.3 * rng.standard_normal(joints),
+        "posture_torque": rng.standard_normal(joints),
+        "gravity_torque": 10 * rng.standard_normal(joints),
+        "torque_limits": np.full(joints, 1e9),
+        **changes,
+    }
+
+
+@given(SEEDS)
+def test_the_spring_is_the_gradient_of_its_potential(seed):
+    """½ eᵀKe with e = [p, 2ε]: what a small motion of the tool costs is the wrench times the motion."""
+    rng = np.random.default_rng(seed)
+    K = positive(rng, 6, 100.0)
+    p, R_error = 0.1 * rng.standard_normal(3), Rotation.random(rng=rng) ** 0.6
+    motion = rng.standard_normal(6)
+
+    def potential(s):
+        # The tool moves by s·motion: the error of the position shrinks, and R_desired Rᵀ is turned back.
+        _, epsilon = quaternion(R_error * Rotation.from_rotvec(-s * motion[3:]))
+        e = np.concatenate([p - s * motion[:3], 2 * epsilon])
+        return 0.5 * e @ K @ e
+
+    eta, epsilon = quaternion(R_error)
+    wrench = spring_wrench(K, p, eta, epsilon)
+    h = 1e-5
+    slope = (potential(h) - potential(-h)) / (2 * h)
+    assert wrench @ motion == pytest.approx(-slope, rel=1e-5, abs=1e-5)
+
+
+def test_a_small_turn_is_the_stiffness_times_the_rotation_vector():
+    K = np.diag([1.0, 2, 3, 40, 50, 60])
+    turn = np.array([1e-4, -2e-4, 3e-4])
+    eta, epsilon = quaternion(Rotation.from_rotvec(turn))
+    wrench = spring_wrench(K, np.array([0.1, 0.2, 0.3]), eta, epsilon)
+    np.testing.assert_allclose(wrench, [0.1, 0.4, 0.9, 4e-3, -1e-2, 1.8e-2], rtol=1e-3)
+
+
+@given(SEEDS, st.floats(0.1, 1.5))
+def test_every_mode_is_damped_alike(seed, ratio):
+    """Λ ẍ + D ẋ + K x = 0: the modes of (K, Λ) decouple, each with ζ."""
+    rng = np.random.default_rng(seed)
+    K, Lambda = positive(rng, 6, 100.0), positive(rng, 6)
+    D = damping_matrix(K, np.linalg.inv(Lambda), ratio)
+    np.testing.assert_allclose(D, D.T, atol=1e-9 * np.abs(D).max())
+    squared, modes = eigh(K, Lambda)
+    in_modes = modes.T @ D @ modes
+    np.testing.assert_allclose(in_modes, np.diag(2 * ratio * np.sqrt(squared)), atol=1e-6 * np.sqrt(squared.max()))
+
+
+@given(SEEDS)
+def test_torques_are_the_wrench_through_the_jacobian_and_gravity(seed):
+    given_ = arm(seed, posture_torque=np.zeros(7))
+    result = impedance_torques(**given_)
+    Lambda_inverse = given_["J"] @ np.linalg.solve(given_["M"], given_["J"].T)
+    spring = spring_wrench(given_["K"], given_["p_error"], given_["eta"], given_["epsilon"])
+    wrench = spring - damping_matrix(given_["K"], Lambda_inverse, 0.7) @ (given_["J"] @ given_["v"])
+    np.testing.assert_allclose(result.wrench, wrench, rtol=1e-5, atol=1e-5 * np.abs(wrench).max())
+    np.testing.assert_allclose(result.torque, given_["J"].T @ result.wrench + given_["gravity_torque"], atol=1e-9)
+    assert not result.is_saturated
+
+
+@given(SEEDS)
+def test_the_posture_accelerates_no_part_of_the_tools_pose(seed):
+    given_ = arm(seed)
+    Lambda_inverse = given_["J"] @ np.linalg.solve(given_["M"], given_["J"].T)
+    # Near a singular posture a part of the posture's torque is let through on purpose, to leave it again.
+    assume(np.allclose(reachable_inertia(Lambda_inverse) @ Lambda_inverse, np.eye(6)))
+    with_posture = impedance_torques(**given_)
+    without = impedance_torques(**arm(seed, posture_torque=np.zeros(7)))
+    np.testing.assert_array_equal(with_posture.wrench, without.wrench)
+    added = with_posture.torque - without.torque
+    acceleration = given_["J"] @ np.linalg.solve(given_["M"], added)
+    assert np.abs(acceleration).max() < 1e-6 * np.abs(given_["posture_torque"]).max() * 100
+    # Yet it does move the joints: seven of them have one direction left.
+    assert np.abs(added).max() > 1e-6
+
+
+@given(SEEDS, st.floats(0.01, 3.0))
+def test_no_axis_pushes_with_more_than_its_limit(seed, share):
+    """Spring and damper together; an axis within its limit is not touched by another's."""
+    free = impedance_torques(**arm(seed))
+    limits = share * np.abs(free.wrench).max() * np.linspace(0.2, 1, 6)
+    result = impedance_torques(**arm(seed, wrench_limits=limits))
+    np.testing.assert_allclose(result.wrench, np.clip(free.wrench, -limits, limits), rtol=1e-12)
+    assert result.is_saturated == bool((np.abs(free.wrench) >= limits).any())
+
+
+@given(SEEDS, st.floats(0.01, 3.0))
+def test_no_motor_is_asked_for_more_than_it_has(seed, share):
+    free = impedance_torques(**arm(seed))
+    limits = share * np.abs(free.torque).max() * np.linspace(0.2, 1, 7)
+    result = impedance_torques(**arm(seed, torque_limits=limits))
+    np.testing.assert_allclose(result.torque, np.clip(free.torque, -limits, limits), rtol=1e-12)
+    assert result.is_saturated == bool((np.abs(free.torque) > limits).any())
+
+
+@given(SEEDS)
+def test_turned_axes_are_the_same_law_seen_from_there(seed):
+    """Stiffness and limits along turned axes: turn everything else into those axes, and nothing differs."""
+    rng = np.random.default_rng([seed, 1])
+    R = Rotation.random(rng=rng).as_matrix()
+    R6 = np.kron(np.eye(2), R)
+    limits = np.abs(impedance_torques(**arm(seed)).wrench).max() * np.array([0.1, 0.5, 2, 0.1, 0.5, 2])
+    given_ = arm(seed, wrench_limits=limits)
+    turned = impedance_torques(
+        **{
+            **given_,
+            "R_axes": R,
+            "p_error": R @ given_["p_error"],
+            "epsilon": R @ given_["epsilon"],
+            "J": R6 @ given_["J"],
+        }
+    )
+    straight = impedance_torques(**given_)
+    scale = np.abs(straight.torque).max()
+    np.testing.assert_allclose(turned.wrench, R6 @ straight.wrench, atol=1e-6 * scale)
+    np.testing.assert_allclose(turned.torque, straight.torque, atol=1e-6 * scale)
+    assert turned.is_saturated == straight.is_saturated
+
+
+def test_a_singular_arm_gets_finite_torques():
+    J = np.zeros((6, 7))
+    J[:5, :5] = np.eye(5)
+    result = impedance_torques(**arm(0, J=J))
+    assert np.isfinite(result.torque).all()
+    assert np.isfinite(result.wrench).all()

@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from guiderail.models.control.damped_inverse import LEVER, REGULAR, damped_joint_velocities, follows
+
+SCALE = np.array([LEVER] * 3 + [1.0] * 3)
+
+
+def jacobian(singular_values, num_joints, rng):
+    """Of the given singular values once rotations count at the lever, (6, n)."""
+    U, _ = np.linalg.qr(rng.standard_normal((6, 6)))
+    W, _ = np.linalg.qr(rng.standard_normal((num_joints, num_joints)))
+    return (U * singular_values) @ W[:, :6].T / SCALE[:, None]
+
+
+@pytest.mark.parametrize("num_joints", [6, 7])
+def test_regular_it_is_the_plain_pseudoinverse(num_joints):
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        J = jacobian(rng.uniform(REGULAR, 1.0, 6), num_joints, rng)
+        V, preferred = rng.standard_normal(6), rng.standard_normal(num_joints)
+        v, is_regular = damped_joint_velocities(J, V, preferred)
+        assert is_regular
+        np.testing.assert_allclose(J @ v, V, atol=1e-9)
+        still = np.eye(num_joints) - np.linalg.pinv(J) @ J
+        np.testing.assert_allclose(still @ (v - preferred), 0.0, atol=1e-9)
+
+
+def test_near_a_singularity_joint_speeds_stay_bounded():
+    """However little is left of a direction: no unit of tool speed takes more than 1/σ₀."""
+    rng = np.random.default_rng(1)
+    for left in (0.05, 0.02, 0.01, 1e-4, 1e-9, 0.0):
+        J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, left]), 6, rng)
+        V = rng.standard_normal(6)
+        V /= np.linalg.norm(SCALE * V)
+        v, is_regular = damped_joint_velocities(J, V, np.zeros(6))
+        assert np.linalg.norm(v) <= 1.0 / REGULAR + 1e-6
+        assert is_regular == (left >= REGULAR)
+
+
+def test_is_continuous_where_damping_begins():
+    rng = np.random.default_rng(2)
+    U, W = (np.linalg.qr(rng.standard_normal((6, 6)))[0] for _ in range(2))
+    V, preferred = rng.standard_normal((2, 6))
+    sides = []
+    for left in (REGULAR * (1 - 1e-9), REGULAR * (1 + 1e-9)):
+        J = (U * [1.0, 0.9, 0.5, 0.3, 0.2, left]) @ W.T / SCALE[:, None]
+        sides.append(damped_joint_velocities(J, V, preferred)[0])
+    np.testing.assert_allclose(*sides, rtol=1e-5)
+
+
+def test_a_lost_direction_is_left_to_what_is_preferred():
+    rng = np.random.default_rng(3)
+    J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, 0.0]), 6, rng)
+    lost = np.linalg.svd(J)[2][-1]
+    v, _ = damped_joint_velocities(J, rng.standard_normal(6), 0.7 * lost)
+    assert v @ lost == pytest.approx(0.7)
+
+
+def test_following_is_going_there():
+    J = np.eye(6)
+    V = np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+    assert follows(J, V, V)
+    assert follows(J, 0.05 * V, V)
+    assert not follows(J, 0.001 * V, V)
+    assert not follows(J, -V, V)
+    assert not follows(J, V + [0, 0, 0, 0, 0.05, 0], V)
+    assert follows(J, np.zeros(6), 1e-3 * V)

@@ -1,0 +1,71 @@
+import numpy as np
+
+from guiderail.models.objects.bnc_connector import demonstrations
+from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
+from guiderail.models.objects.bnc_connector.geometry import MM
+from research.generate.bnc_connector import TIMES as TIMES_RECORDED
+from research.generate.bnc_connector import record_one
+
+TIMES = 0.02 * np.arange(NUM_STEPS)
+
+
+def test_five_times_four_hundred_poses():
+    loaded = demonstrations.load()
+    assert loaded.num_demonstrations == NUM_DEMONSTRATIONS
+    assert all(output.shape == (NUM_STEPS, 6) for output in loaded.outputs)
+    assert loaded.names == demonstrations.NAMES
+    np.testing.assert_allclose(loaded.times[0], TIMES, atol=1e-9)
+
+
+def test_the_file_holds_what_was_measured_too():
+    everything = demonstrations.load_all()
+    shape = (NUM_DEMONSTRATIONS, NUM_STEPS)
+    assert everything["measured"].shape == everything["wrench"].shape == (*shape, 6)
+    assert everything["contact_force"].shape == shape
+    assert "locked plug" in str(everything["frame"])
+
+
+def test_every_demonstration_ends_locked():
+    """The measured poses end at the locked frame's origin."""
+    final = demonstrations.load_all()["measured"][:, -1]
+    assert np.abs(final[:, 2]).max() < 0.6 * MM
+    assert np.abs(np.rad2deg(final[:, 3])).max() < 4.0
+
+
+def test_the_push_lives_in_the_difference():
+    """While the plug is turned, the stiffness times commanded minus measured is the force along z."""
+    everything = demonstrations.load_all()
+    turning = slice(260, 320)
+    command, measured = everything["outputs"][:, turning, 2], everything["measured"][:, turning, 2]
+    push = everything["stiffness"][2] * (measured - command)
+    assert push.mean() > 8.0
+    np.testing.assert_allclose(push.mean(), everything["wrench"][:, turning, 2].mean(), rtol=0.1)
+
+
+def test_the_hand_searches_at_the_rim_and_is_precise_when_seated():
+    outputs = np.stack(demonstrations.load().outputs)
+    spread = outputs.std(axis=0)[:, :2].mean(axis=1)
+    assert spread[80:170].mean() > 4.0 * spread[240:].mean()
+
+
+def test_no_two_demonstrations_are_alike_and_a_seed_repeats_itself():
+    session, again, other = (demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(session, again)
+    assert np.abs(session[0] - session[1])[:, :2].max() > 0.5 * MM
+    assert np.abs(session[0] - other[0])[:, :2].max() > 0.5 * MM
+
+
+def test_their_mean_searches_nowhere_in_particular():
+    """What the demonstrations have in common finds the jack where it is known, and does not search by itself."""
+    mean = np.mean(demonstrations.load().outputs, axis=0)
+    assert np.abs(mean[:, :2]).max() < 0.3 * MM
+
+
+def test_recorded_again_it_is_the_same():
+    """Another machine's arithmetic may differ in the last digits, and contact passes that on."""
+    everything = demonstrations.load_all()
+    recording, is_locked = record_one(demonstrator_motions(int(everything["seed"]), TIMES_RECORDED)[0])
+    assert is_locked
+    np.testing.assert_allclose(recording["desired_pose"], everything["outputs"][0], atol=1e-9)
+    np.testing.assert_allclose(recording["pose"][:60], everything["measured"][0, :60], atol=1e-6)
+    np.testing.assert_allclose(recording["pose"][-1, :3], everything["measured"][0, -1, :3], atol=0.1 * MM)

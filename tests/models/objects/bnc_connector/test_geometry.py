@@ -1,0 +1,121 @@
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    Cylinder,
+    GeometryInstance,
+    ProximityProperties,
+    SceneGraph,
+)
+from pydrake.math import RigidTransform
+
+from guiderail.models.objects.bnc_connector.geometry import (
+    FOLDER,
+    MM,
+    BncDimensions,
+    bore_mesh,
+    ring_mesh,
+    slot_columns,
+    slot_mesh,
+)
+from guiderail.models.objects.bnc_connector.sdf import BARREL, barrel_sides, files, jack_sdf, main
+from guiderail.models.objects.triangle_mesh import TriangleMesh
+
+DIMENSIONS = BncDimensions()
+
+
+def centres(mesh):
+    return mesh.vertices[mesh.triangles].mean(axis=1)
+
+
+@pytest.mark.parametrize("name", files(DIMENSIONS))
+def test_committed_files_are_what_the_drawing_says(name):
+    assert (FOLDER / name).read_text() == files(DIMENSIONS)[name]
+
+
+def test_writing_again_writes_the_same(tmp_path):
+    main(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(files(DIMENSIONS))
+    assert (tmp_path / "bnc_slots.obj").read_bytes() == (FOLDER / "bnc_slots.obj").read_bytes()
+
+
+def test_a_change_of_the_drawing_changes_the_files():
+    wider = dataclasses.replace(DIMENSIONS, slot_clearance=0.2 * MM)
+    assert files(wider)["bnc_slots.obj"] != files(DIMENSIONS)["bnc_slots.obj"]
+    assert files(wider)["bnc_bore.obj"] == files(DIMENSIONS)["bnc_bore.obj"]
+
+
+def test_the_bore_lets_the_true_barrel_through():
+    """The polygon lies around the circle, and its faces look at the barrel."""
+    mesh = bore_mesh(DIMENSIONS)
+    wall = centres(mesh)[:, 2] > DIMENSIONS.mouth_chamfer
+    outward = centres(mesh)[wall] * [1, 1, 0]
+    distance_of_planes = np.abs(np.einsum("ij,ij->i", mesh.normals()[wall], mesh.vertices[mesh.triangles[wall, 0]]))
+    assert distance_of_planes.min() >= DIMENSIONS.bore_radius - 1e-8
+    assert (np.einsum("ij,ij->i", mesh.normals()[wall], outward) < 0).all()
+
+
+def test_polygons_of_equal_area_have_their_circles_area():
+    """The barrel's as Drake makes it: what it touches is drawn that much wider."""
+    bore = bore_mesh(DIMENSIONS, equal_area=True)
+    corners = bore.vertices[bore.vertices[:, 2] > DIMENSIONS.mouth_chamfer + 1e-9, :2]
+    area = 0.5 * len(corners) * np.hypot(*corners.T).max() ** 2 * np.sin(2 * np.pi / len(corners))
+    assert area == pytest.approx(np.pi * DIMENSIONS.bore_radius**2, rel=1e-6)
+
+    radius = float(re.findall(r"<radius>([\d.]+)<", jack_sdf(DIMENSIONS, equal_area=True))[0])
+    sides = len(barrel_circle(radius))
+    assert sides == barrel_sides(DIMENSIONS)
+    area = 0.5 * sides * radius**2 * np.sin(2 * np.pi / sides)
+    assert area == pytest.approx(np.pi * DIMENSIONS.barrel_radius**2, rel=1e-4)
+    assert radius < DIMENSIONS.bore_radius
+
+
+def barrel_circle(radius: float) -> np.ndarray:
+    """The corners of the polygon that Drake makes of a barrel."""
+    scene_graph = SceneGraph()
+    source, properties = scene_graph.RegisterSource(), ProximityProperties()
+    AddCompliantHydroelasticProperties(BARREL.resolution, BARREL.modulus, properties)
+    geometry = GeometryInstance(RigidTransform(), Cylinder(radius, DIMENSIONS.barrel_height), "barrel")
+    geometry.set_proximity_properties(properties)
+    barrel = scene_graph.RegisterAnchoredGeometry(source, geometry)
+    mesh = scene_graph.model_inspector().maybe_get_hydroelastic_mesh(barrel)
+    corners = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
+    return corners[(corners[:, 2] > 0) & np.isclose(np.hypot(*corners[:, :2].T), radius)]
+
+
+def test_a_lug_fits_everywhere_along_its_path():
+    """At every point of the path, the slot is wider than the lug, along z."""
+    columns = slot_columns(DIMENSIONS)
+    width = columns.upper - columns.lower
+    ramp = (columns.angles > 0.2) & (columns.angles < DIMENSIONS.detent_angle)
+    assert width[ramp].min() > 2 * (DIMENSIONS.lug_radius + 0.9 * DIMENSIONS.slot_clearance)
+
+
+def test_slot_walls_look_into_the_slot():
+    mesh = slot_mesh(DIMENSIONS)
+    middle = centres(mesh)
+    angle = np.arctan2(middle[:, 1], middle[:, 0])
+    on_ramp = (np.abs(np.rad2deg(angle) - 45) < 20) & (middle[:, 2] > 1.5 * MM)
+    is_upper = middle[on_ramp, 2] > 4.5 * MM
+    assert (np.sign(mesh.normals()[on_ramp, 2]) == np.where(is_upper, -1, 1)).all()
+    on_mouth = middle[:, 2] < 1e-9
+    np.testing.assert_allclose(mesh.normals()[on_mouth], [[0, 0, -1]] * on_mouth.sum(), atol=1e-9)
+
+
+def test_meshes_repeat_after_half_a_turn():
+    for mesh in (slot_mesh(DIMENSIONS), ring_mesh(DIMENSIONS)):
+        points = {tuple(point) for point in np.round(mesh.vertices, 8) + 0.0}
+        turned = {tuple(point) for point in np.round(mesh.vertices * [-1, -1, 1], 8) + 0.0}
+        assert points == turned
+
+
+def test_quads_share_corners_and_lose_slivers():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    sliver = np.array([[1, 0, 0], [2, 0, 0], [1, 1, 0], [1, 1, 0]], dtype=float)
+    mesh = TriangleMesh.from_quads(np.stack([square, sliver]))
+    assert len(mesh.vertices) == 5
+    assert len(mesh.triangles) == 3
+    np.testing.assert_allclose(mesh.normals(), [[0, 0, 1]] * 3)

@@ -1,0 +1,45 @@
+"""The demonstrations that really search."""
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.models.objects.bnc_connector import search_demonstrations as bnc_search
+from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS
+from guiderail.models.objects.bnc_connector.geometry import MM
+from research.generate.bnc_connector import TIMES, record_one
+
+SEARCHING = slice(0, round(bnc_search.SEARCH[1] / 0.02))
+
+
+def test_five_times_four_hundred_poses_that_end_locked():
+    with np.load(bnc_search.PATH, allow_pickle=False) as file:
+        measured = file["measured"]
+    assert measured.shape == (NUM_DEMONSTRATIONS, NUM_STEPS, 6)
+    assert np.abs(measured[:, -1, 2]).max() < 0.6 * MM
+    assert np.abs(np.rad2deg(measured[:, -1, 3])).max() < 4.0
+
+
+def test_an_action_is_worth_the_same_in_every_direction_until_the_plug_drops_in():
+    reference = reference_trajectory("search")
+    deviations = reference.standard_deviations[SEARCHING, :2]
+    assert deviations.max() < 1.15 * deviations.min()
+    correlation = reference.covariances[SEARCHING, 0, 1] / deviations.prod(axis=1)
+    assert np.abs(correlation).max() < 0.15
+    assert np.abs(reference.means[SEARCHING, :2]).max() < 0.4 * MM
+
+
+def test_the_hand_is_precise_once_the_plug_is_in():
+    reference = reference_trajectory("search")
+    seated = slice(round((bnc_search.IN_BY + 0.4) / 0.02), NUM_STEPS)
+    assert reference.standard_deviations[seated, :2].max() < 0.3 * MM
+
+
+def test_recorded_again_it_is_the_same():
+    with np.load(bnc_search.PATH, allow_pickle=False) as file:
+        everything = dict(file)
+    motion = bnc_search.demonstrator_motions(int(everything["seed"]), TIMES)[0]
+    recording, is_locked = record_one(motion)
+    assert is_locked
+    np.testing.assert_allclose(recording["desired_pose"], everything["outputs"][0], atol=1e-9)
+    assert recording["pose"][-1, :3] == pytest.approx(everything["measured"][0, -1, :3], abs=0.1 * MM)

@@ -1,0 +1,83 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from guiderail.models.objects.grid_clamp.geometry import (
+    FOLDER,
+    MM,
+    GridClampDimensions,
+    bead_mesh,
+    hole_mesh,
+    lip_mesh,
+    peg_mesh,
+    slab_mesh,
+)
+from guiderail.models.objects.grid_clamp.sdf import files, main
+
+DIMENSIONS = GridClampDimensions()
+
+
+def plane_distances(mesh, select):
+    """Distance from the z axis of the planes of the triangles whose centre's height `select` accepts."""
+    corners = mesh.vertices[mesh.triangles]
+    chosen = select(corners[:, :, 2].mean(axis=1))
+    return np.abs(np.einsum("ij,ij->i", mesh.normals()[chosen], corners[chosen, 0]))
+
+
+@pytest.mark.parametrize("name", files(DIMENSIONS))
+def test_committed_files_are_what_the_drawing_says(name):
+    assert (FOLDER / name).read_text() == files(DIMENSIONS)[name]
+
+
+def test_writing_again_writes_the_same(tmp_path):
+    main(tmp_path)
+    for path in tmp_path.iterdir():
+        assert path.read_bytes() == (FOLDER / path.name).read_bytes()
+
+
+def test_a_change_of_the_drawing_changes_the_files():
+    wider = files(dataclasses.replace(DIMENSIONS, hole_radius=4.3 * MM))
+    assert wider["grid_clamp_hole.obj"] != files(DIMENSIONS)["grid_clamp_hole.obj"]
+    assert wider["grid_clamp_peg.obj"] == files(DIMENSIONS)["grid_clamp_peg.obj"]
+
+
+def test_the_polygons_leave_the_full_clearance():
+    """Flat to flat, a peg in its hole has the play that the circles have."""
+    d = DIMENSIONS
+    wall = plane_distances(hole_mesh(d), lambda z: z < -d.hole_chamfer)
+    shaft = plane_distances(peg_mesh(d), lambda z: (z > d.peg_chamfer) & (z < d.peg_length - 1e-6))
+    np.testing.assert_allclose(wall, d.hole_radius, atol=1e-7)
+    np.testing.assert_allclose(shaft, d.peg_radius, atol=1e-7)
+
+
+@pytest.mark.parametrize("mesh", [peg_mesh(DIMENSIONS), bead_mesh(DIMENSIONS)])
+def test_what_is_compliant_is_a_closed_convex_solid(mesh):
+    edges = np.sort(np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]]))
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    heights = np.einsum("tk,vk->tv", mesh.normals(), mesh.vertices)
+    planes = np.einsum("tk,tk->t", mesh.normals(), mesh.vertices[mesh.triangles[:, 0]])
+    assert (heights <= planes[:, None] + 1e-8).all()
+
+
+def test_only_the_bead_has_to_squeeze():
+    """Every peg passes its hole and the lip; the bead's crest doesn't pass the lip without giving way."""
+    d = DIMENSIONS
+    assert d.peg_radius < min(d.hole_radius, d.lip_radius)
+    assert d.bead_radius > d.lip_radius
+    assert d.bead_depth > d.lip_depth + d.lip_land  # beyond the lip when it has snapped in
+    assert np.hypot(*lip_mesh(d).vertices[:, :2].T).min() >= d.lip_radius
+
+
+def test_holes_open_upwards_everywhere_that_pegs_come_down():
+    d = DIMENSIONS
+    mesh = hole_mesh(d)
+    face = np.isclose(mesh.vertices[mesh.triangles][:, :, 2], 0.0).all(axis=1)
+    np.testing.assert_allclose(mesh.normals()[face], [[0, 0, 1]] * face.sum(), atol=1e-9)
+    visible = slab_mesh(d)
+    upper = np.isclose(visible.vertices[visible.triangles][:, :, 2], 0.0).all(axis=1)
+    np.testing.assert_allclose(visible.normals()[upper], [[0, 0, 1]] * upper.sum(), atol=1e-9)
+    a, b, c = (visible.vertices[visible.triangles[upper, i]] for i in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    mouth = 6 * np.sin(np.pi / 6) * (d.hole_radius + d.hole_chamfer) ** 2
+    assert area == pytest.approx(d.table_width**2 - 5 * mouth, rel=1e-6)

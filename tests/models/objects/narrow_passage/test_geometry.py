@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
+
+WORLD = PassageGeometry()
+
+
+def test_obstacle_cost_is_equation_4_24():
+    edge = np.array(WORLD.obstacle) + [WORLD.obstacle_radius, 0.0]
+    assert WORLD.obstacle_distance(edge) == pytest.approx(0.0)
+    assert WORLD.obstacle_cost(edge) == pytest.approx(-4.0)
+    assert WORLD.obstacle_cost(edge + [0.01, 0.0]) == pytest.approx(-3.0)
+    assert WORLD.obstacle_cost(edge + [0.04, 0.0]) == pytest.approx(0.0)
+    assert WORLD.obstacle_cost(edge + [0.5, 0.0]) == 0.0
+
+
+def test_action_cost_is_equation_4_23():
+    assert action_cost(np.array([0.3, -0.4])) == pytest.approx(-2.5)
+
+
+def test_the_zone_is_the_thesis_constraint():
+    np.testing.assert_array_equal(WORLD.constraints.G, [[-1.0, 0.0]])
+    np.testing.assert_array_equal(WORLD.constraints.c, [-0.6])
+    assert WORLD.constraints.violation(np.array([0.7, 0.0])) == pytest.approx(0.1)
+
+
+def test_walls_leave_only_the_gap():
+    lower, upper = WORLD.walls
+    assert upper[0, 0] == WORLD.gap_x[0]
+    assert lower[1, 0] == WORLD.gap_x[1]
+    assert upper[0, 0] - lower[0, 0] >= 5
+    assert upper[1, 0] - lower[1, 0] >= 5
+
+
+def test_start_and_goal_are_on_different_sides():
+    assert not WORLD.at_goal(np.array(WORLD.start))
+    assert WORLD.at_goal(np.array(WORLD.goal))
+    assert not WORLD.in_passage(np.array(WORLD.start))
+    assert WORLD.in_passage(np.array([0.35, 0.55]))

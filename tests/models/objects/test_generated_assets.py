@@ -1,0 +1,63 @@
+"""Objects of other dimensions than those whose files come along."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from guiderail.models.objects.bnc_connector import sdf as write_bnc
+from guiderail.models.objects.bnc_connector.geometry import FOLDER, MM, BncDimensions
+from guiderail.models.objects.bnc_connector.sdf import FRICTION
+from guiderail.models.objects.grid_clamp import sdf as write_grid_clamp
+from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions
+
+
+def vertices(path):
+    return np.array([line.split()[1:] for line in path.read_text().splitlines() if line.startswith("v ")], float)
+
+
+@pytest.mark.parametrize(
+    ("folder_of", "dimensions"),
+    [(write_bnc.folder_of, BncDimensions()), (write_grid_clamp.folder_of, GridClampDimensions())],
+)
+def test_what_is_as_drawn_is_read_from_where_it_lies(folder_of, dimensions):
+    assert folder_of(dimensions) == FOLDER
+    assert folder_of(dataclasses.replace(dimensions)) == FOLDER
+
+
+def test_a_plug_made_to_measure_has_those_measures():
+    dimensions = dataclasses.replace(BncDimensions().with_bore_clearance(0.07 * MM), mouth_chamfer=0.25 * MM)
+    folder = write_bnc.folder_of(dimensions, 0.35)
+    assert write_bnc.folder_of(dimensions, 0.35) == folder != FOLDER
+    bore = vertices(folder / "bnc_bore.obj")
+    inner = np.hypot(*bore[bore[:, 2] > 1.0 * MM, :2].T) * np.cos(np.pi / 24)
+    np.testing.assert_allclose(inner, 4.825 * MM + 0.07 * MM, atol=1e-8)
+    # The chamfer begins where the bore ends, as wide as it is deep.
+    assert np.isclose(bore[:, 2], 0.25 * MM).any()
+    mouth = np.hypot(*bore[bore[:, 2] < 1e-9, :2].T).min() * np.cos(np.pi / 24)
+    assert mouth == pytest.approx(4.825 * MM + 0.07 * MM + 0.25 * MM, abs=1e-8)
+    for name, numbers in (("bnc_jack.sdf", {"0.35", "0.05"}), ("bnc_plug.sdf", {"0.35", "0.05"})):
+        assert set(re.findall(r"<drake:mu_static>([\d.]+)<", (folder / name).read_text())) == numbers
+
+
+def test_a_wider_slot_is_wider():
+    wider = dataclasses.replace(BncDimensions(), slot_clearance=0.2 * MM)
+    made, drawn = (vertices(write_bnc.folder_of(d) / "bnc_slots.obj") for d in (wider, BncDimensions()))
+    assert made[:, 2].max() - drawn[:, 2].max() == pytest.approx(0.075 * MM, abs=1e-6)
+
+
+def test_a_table_and_a_clamp_made_to_measure_have_those_measures():
+    dimensions = dataclasses.replace(
+        GridClampDimensions().with_clearance(0.1 * MM), hole_chamfer=0.3 * MM, peg_chamfer=0.2 * MM
+    )
+    folder = write_grid_clamp.folder_of(dimensions, 0.3)
+    inside = np.cos(np.pi / NUM_SIDES)
+    hole, peg = vertices(folder / "grid_clamp_hole.obj"), vertices(folder / "grid_clamp_peg.obj")
+    assert np.hypot(*hole[:, :2].T).min() * inside == pytest.approx(4.1 * MM, abs=1e-8)
+    assert np.isclose(hole[:, 2], -0.3 * MM).any()
+    tip = peg[(peg[:, 2] < 1e-9) & (np.hypot(*peg[:, :2].T) > 1.0 * MM)]
+    np.testing.assert_allclose(np.hypot(*tip[:, :2].T) * inside, 3.8 * MM, atol=1e-8)
+    assert dimensions.capture_radius == pytest.approx(0.6 * MM)
+    assert "<drake:mu_static>0.3<" in (folder / "grid_table.sdf").read_text()
+    assert FRICTION != 0.3

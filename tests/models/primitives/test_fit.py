@@ -1,0 +1,167 @@
+"""Letters with sharp corners and loops, and outputs that differ together: reproduced with nothing set by hand."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential
+from guiderail.models.primitives.fit import ENOUGH, estimated_share, fit, motion_without_actions, share_within_spread
+from guiderail.models.primitives.mixture import information_criteria
+from oracles.handwriting import LETTERS, correlated, write
+
+
+def share_of_what_was_shown(demonstrations, motion):
+    """The share of steps at which every output is within one standard deviation of the recordings' own mean."""
+    outputs = np.stack(demonstrations.outputs)
+    return float((np.abs(motion - outputs.mean(axis=0)) <= outputs.std(axis=0, ddof=1)).all(axis=1).mean())
+
+
+# In metres and near zero, or in millimetres and far from it: neither may matter.
+PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
+
+
+# `letters.py` beside this file writes down what was chosen for longer ones, and why.
+@pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
+def test_a_letter_stays_within_what_was_shown(letter, page):
+    selection = fit(write(letter, count=4, steps=60, **page))
+    assert selection.stays
+    assert selection.share == share_within_spread(selection.primitive()) >= ENOUGH
+    assert f"{selection.components} components have the least information criterion" in selection.why
+
+
+def test_the_letter_with_most_corners_stays_within_the_recordings_own_deviation():
+    shown = write("B", count=5, steps=100)
+    assert share_of_what_was_shown(shown, motion_without_actions(fit(shown).primitive())) >= ENOUGH
+
+
+@pytest.fixture(scope="module")
+def together():
+    return correlated(count=4, steps=80)
+
+
+@pytest.fixture(scope="module")
+def selection(together):
+    return fit(together)
+
+
+def test_outputs_that_differ_together_are_reproduced_together(together, selection):
+    """At a correlation of 0.98 one standard deviation across is a seventh of one along."""
+    outputs = np.stack(together.outputs)
+    apart = outputs - outputs.mean(axis=0)
+    assert np.corrcoef(apart.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
+    assert selection.stays
+    assert share_of_what_was_shown(together, motion_without_actions(selection.primitive())) >= ENOUGH
+
+
+def test_what_was_chosen_is_among_what_was_tried_and_nothing_smoother_is_as_good(selection):
+    chosen = next(
+        c
+        for c in selection.candidates
+        if (c.inverse_length, c.lambda_) == (selection.kernel.inverse_length, selection.lambda_)
+    )
+    assert chosen.worse <= 1
+    assert chosen.share >= ENOUGH
+    for other in selection.candidates:
+        if other.worse <= 1 and other.share >= ENOUGH:
+            assert (-other.lambda_, other.inverse_length) >= (-chosen.lambda_, chosen.inverse_length)
+    assert min(c.worse for c in selection.candidates) == 0
+    assert selection.beta == selection.lambda_
+    assert selection.components == min(selection.criteria, key=lambda count: selection.criteria[count])
+    for number in (selection.components, f"{selection.share:.1%}", f"{selection.lambda_:.3g}"):
+        assert str(number) in selection.why
+
+
+def test_a_unit_of_length_changes_nothing_but_the_unit(together, selection):
+    """A hundred times the numbers: a hundred times the motion, and λ in the inverse square of the unit."""
+    larger = fit(Demonstrations(together.times, [100 * y for y in together.outputs]))
+    assert larger.components == selection.components
+    assert larger.kernel.inverse_length == selection.kernel.inverse_length
+    assert larger.lambda_ == pytest.approx(selection.lambda_ / 1e4, rel=1e-6)
+    np.testing.assert_allclose(
+        motion_without_actions(larger.primitive()), 100 * motion_without_actions(selection.primitive()), atol=1e-3
+    )
+
+
+def test_a_unit_of_time_changes_the_kernel_alone(together, selection):
+    slower = fit(Demonstrations([10 * t for t in together.times], together.outputs))
+    assert slower.components == selection.components
+    assert slower.kernel.inverse_length == pytest.approx(selection.kernel.inverse_length / 100, rel=1e-9)
+    assert slower.lambda_ == pytest.approx(selection.lambda_, rel=1e-9)
+
+
+def test_other_arguments_of_the_primitive_are_passed_on(selection):
+    primitive = selection.primitive(history=3, history_variance=1e-5, lambda_=7.0)
+    assert (primitive.history, primitive.lambda_, primitive.beta) == (3, 7.0, selection.beta)
+    assert primitive.reference is selection.reference
+    assert share_within_spread(selection.primitive(history=3, history_variance=1e-6)) >= ENOUGH
+
+
+def hook(steps=60, deviation=0.05):
+    """A reference with a corner in the middle."""
+    t = np.linspace(0, 2, steps)
+    means = np.column_stack([np.abs(t - 1), t])
+    return ReferenceTrajectory(t, means, np.tile(deviation**2 * np.eye(2), (steps, 1, 1)))
+
+
+def test_a_primitive_that_leaves_the_spread_says_so():
+    """The share falls where the kernel cuts the corner, and where λ pulls everything to zero."""
+    good = LcNsKmp(hook(), SquaredExponential(50.0), 0.05, 0.05)
+    assert share_within_spread(good) == 1.0
+    too_wide = LcNsKmp(hook(deviation=0.005), SquaredExponential(1e-3), 6.0, 6.0)
+    assert share_within_spread(too_wide) < 0.7
+    too_strong = LcNsKmp(hook(), SquaredExponential(50.0), 1e5, 1e5)
+    assert share_within_spread(too_strong) < 0.2
+    for primitive in (good, too_wide, too_strong):
+        kernel, hbar = primitive.kernel.inverse_length, primitive.lambda_
+        estimate = estimated_share(primitive.reference, kernel, hbar, hbar)
+        assert estimate == pytest.approx(share_within_spread(primitive), abs=0.1)
+
+
+def test_the_share_counts_correlations():
+    """A tenth of a deviation across two outputs that agree to 0.99 is far outside; along them it is not."""
+    t = np.linspace(0, 1, 20)
+    covariance = 0.01 * np.array([[1.0, 0.99], [0.99, 1.0]])
+
+    class Still(LcNsKmp):
+        def predict(self, step, null_space_action=None, history=None):
+            prediction = super().predict(step, null_space_action, history)
+            prediction.output = self.reference.means[step] + self.off
+            return prediction
+
+    primitive = Still(ReferenceTrajectory(t, np.zeros((20, 2)), np.tile(covariance, (20, 1, 1))))
+    for off, share in (((0.05, 0.05), 1.0), ((0.011, -0.011), 0.0), ((0.0995, 0.0995), 1.0), ((0.102, 0.102), 0.0)):
+        primitive.off = np.array(off)
+        assert share_within_spread(primitive) == share
+
+
+def test_with_a_history_the_motion_is_what_its_own_commands_lead_to():
+    reference = hook()
+    primitive = LcNsKmp(reference, history=2, history_variance=1e-4)
+    past = np.tile(reference.means[0], (2, 1))
+    for step, output in enumerate(motion_without_actions(primitive)):
+        np.testing.assert_array_equal(output, primitive.predict(step, None, past).output)
+        past = np.vstack([past[1:], output])
+
+
+def test_the_criterion_stops_where_more_components_are_no_better():
+    """A straight line needs one or two components; nobody has to try sixty."""
+    t = np.linspace(0, 1, 100)
+    rng = np.random.default_rng(0)
+    outputs = np.stack([t[:, None] + 0.05 * rng.standard_normal((100, 1)) for _ in range(4)])
+    found = information_criteria(t, outputs, [1, 2, 3, 4, 8, 16], 0)
+    assert min(found, key=lambda count: found[count]) <= 2
+    assert not {8, 16} & set(found)
+
+
+def test_refuses_too_few_demonstrations():
+    t = np.linspace(0, 1, 50)
+    with pytest.raises(InputError, match="at least three"):
+        fit(Demonstrations(t, [np.sin(t)[:, None], np.cos(t)[:, None]]))
+    with pytest.raises(InputError, match="at least 12 steps"):
+        fit(Demonstrations(t[:5], [t[:5, None], 2 * t[:5, None], 3 * t[:5, None]]))
+
+
+@pytest.mark.parametrize("components", [0, 41, 1000])
+def test_refuses_components_that_there_is_nothing_for(components, together):
+    with pytest.raises(InputError, match="components must be between 1 and half the number of steps, 40"):
+        fit(together, components=components)

@@ -1,0 +1,306 @@
+"""Files of demonstrations, from everywhere: a result, or one sentence, in a bounded time and memory."""
+
+import io
+import os
+import struct
+import subprocess
+import sys
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+
+T = np.linspace(0.0, 1.0, 4)
+Y = np.column_stack([np.sin(T), T**2])
+
+
+def npy(description, shape, data=b"", version=b"\x01\x00", fortran_order=False):
+    """An array as NumPy writes it, with whatever header."""
+    header = f"{{'descr': {description!r}, 'fortran_order': {fortran_order}, 'shape': {shape}, }}".encode() + b"\n"
+    size = struct.pack("<H" if version == b"\x01\x00" else "<L", len(header))
+    return b"\x93NUMPY" + version + size + header + data
+
+
+def archive(path, compression=zipfile.ZIP_DEFLATED, **members):
+    with zipfile.ZipFile(path, "w", compression) as file:
+        for key, value in members.items():
+            file.writestr(f"{key}.npy", value)
+    return path
+
+
+def refused(path):
+    """What is said about a file, with the memory that reading it may take."""
+    tracemalloc.start()
+    with pytest.raises(InputError) as said:
+        Demonstrations.load(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 100e6
+    assert path.name in str(said.value)
+    assert "\n" not in str(said.value)
+    assert len(str(said.value)) < 400
+    return str(said.value)
+
+
+GOOD = {"times": npy("<f8", (4,), T.tobytes()), "outputs": npy("<f8", (1, 4, 2), Y.tobytes())}
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"outputs": npy("<f8", "(1, 4, 9223372036854775807)", Y.tobytes())}, "claims the shape"),
+        ({"outputs": npy("<f8", "(1, 4, 2, -1)", Y.tobytes())}, "claims the shape"),
+        ({"outputs": npy("<f8", "(1, 4, 3)", Y.tobytes())}, "not what it holds"),
+        ({"outputs": npy("<f8", "(1, 4, 1)", Y.tobytes())}, "not what it holds"),
+        ({"outputs": npy("<f8", "(1000000000, 0, 2)")}, "empty"),
+        ({"outputs": npy("<f8", "(1, 4.0, 2)", Y.tobytes())}, "claims the shape"),
+        ({"outputs": npy("<f8", "(1, True, 8)", Y.tobytes())}, "claims the shape"),
+        ({"outputs": npy("<f8", "8", Y.tobytes())}, "no header"),
+        ({"outputs": npy("<f8", "(" * 300, Y.tobytes())}, "no header"),
+        ({"outputs": npy("<f8", "(1, 4, 2), 'shape': __import__('os')", Y.tobytes())}, "no header"),
+        ({"outputs": npy("<f8", "(1, 4, 2)" + " " * 2000, Y.tobytes())}, "header"),
+        ({"outputs": npy("<f8", (1, 4, 2), Y.tobytes(), version=b"\x09\x00")}, "no array"),
+        ({"outputs": b"\x93NUMPY"}, "no array"),
+        ({"outputs": b""}, "no array"),
+        ({"outputs": npy("<c16", (1, 4, 1), Y.tobytes())}, "must hold numbers"),
+        ({"outputs": npy("|O", (1, 4, 2), b"cos\nsystem\n(S'true'\ntR.")}, "Python objects"),
+        ({"outputs": npy([("x", "<f8")], (1, 4, 2), Y.tobytes())}, "must hold numbers"),
+        ({"outputs": npy("<M8[s]", (1, 4, 2), Y.tobytes())}, "must hold numbers"),
+        ({"outputs": npy("<U2", (1, 4, 2), Y.tobytes())}, "must hold numbers"),
+        ({"outputs": npy("<f8", (4, 2), Y.tobytes())}, "must be (M, N, O)"),
+        ({"times": npy("<f8", (), T[:1].tobytes())}, "times (N,)"),
+        ({"times": npy("<i8", (4,), np.array([0, 1, 2, 2**53 + 1]).tobytes())}, "2^53"),
+        ({"times": npy("<f8", (2, 2), T.tobytes())}, "times (N,)"),
+        ({"names": npy("<f8", (2,), T[:2].tobytes())}, "names"),
+        ({"names": npy("<U1", (), "x".encode("utf-32-le"))}, "names"),
+        ({"names": npy("<U1", (2,), b"\xff" * 8)}, "characters"),
+        ({"names": npy("<U1", (2,), "\n\n".encode("utf-32-le"))}, "can't be named"),
+        ({"names": npy("<U1", (3,), "abc".encode("utf-32-le"))}, "3 names for 2 outputs"),
+    ],
+)
+def test_refuses_arrays_that_are_none(tmp_path, changed, said):
+    assert said in refused(archive(tmp_path / "d.npz", **{**GOOD, **changed}))
+
+
+def test_the_archive_that_the_refusals_start_from_is_sound(tmp_path):
+    loaded = Demonstrations.load(archive(tmp_path / "d.npz", **GOOD))
+    np.testing.assert_array_equal(loaded.outputs[0], Y)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "said"),
+    [
+        ([-2, 6], "positive, not -2"),
+        ([0, 4], "positive, not 0"),
+        ([2.0, 2.0], "whole numbers"),
+        ([[2, 2]], "whole numbers"),
+        (4, "whole numbers"),
+        ([True, True], "whole numbers"),
+        ([2**63 - 1, 2**63 - 1, 6], "add up to"),
+        ([2, 3], "add up to 5, but there are 4"),
+        ([1, 3], "1 point"),
+        ([], "empty"),
+        (np.full(1001, 2), "more than 1000"),
+    ],
+)
+def test_refuses_lengths_that_are_none(tmp_path, lengths, said):
+    path = tmp_path / "d.npz"
+    np.savez(path, lengths=np.asarray(lengths), times=np.r_[T[:2], T[:2]], outputs=Y)
+    assert said in refused(path)
+
+
+def test_zeros_are_not_unpacked_to_be_refused(tmp_path):
+    path = tmp_path / "d.npz"
+    np.savez_compressed(path, times=np.arange(2000.0), outputs=np.zeros((1, 2000, 2000)))
+    assert path.stat().st_size < 100_000
+    assert "more than 2000000" in refused(path)
+
+
+def test_an_archive_may_have_other_arrays_too_but_not_thousands(tmp_path):
+    path = archive(tmp_path / "d.npz", **GOOD, force=npy("|O", (), b"x"))
+    assert Demonstrations.load(path).num_outputs == 2
+    path = archive(tmp_path / "e.npz", **GOOD, **{f"a{i}": b"" for i in range(3000)})
+    assert "too many arrays" in refused(path)
+
+
+def test_many_demonstrations_are_refused_before_they_are_cut(tmp_path):
+    path = tmp_path / "d.npz"
+    np.savez(path, times=T, outputs=np.zeros((200_000, 4, 1)))
+    assert "200000 demonstrations" in refused(path)
+    uneven = [2] * 900 + [10_000]
+    np.savez(
+        path, lengths=uneven, times=np.concatenate([np.arange(float(n)) for n in uneven]), outputs=np.ones((11_800, 1))
+    )
+    assert "far more samples than the others" in refused(path)
+
+
+def test_refuses_archives_that_numpy_does_not_write(tmp_path):
+    renamed = tmp_path / "renamed.npz"
+    buffer = io.BytesIO()
+    np.save(buffer, Y)
+    renamed.write_bytes(buffer.getvalue())
+    assert "single array" in refused(renamed)
+
+    good = archive(tmp_path / "good.npz", **GOOD).read_bytes()
+    encrypted = tmp_path / "encrypted.npz"
+    flags = bytearray(good)
+    for at in range(len(good) - 8):
+        if good[at : at + 4] == b"PK\x01\x02":
+            flags[at + 8] |= 1
+        if good[at : at + 4] == b"PK\x03\x04":
+            flags[at + 6] |= 1
+    encrypted.write_bytes(flags)
+    assert "encrypted" in refused(encrypted)
+
+    for compression in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        path = archive(tmp_path / "packed.npz", compression, **GOOD)
+        assert "compressed in a way" in refused(path)
+
+    twice = tmp_path / "twice.npz"
+    with zipfile.ZipFile(twice, "w") as file:
+        for key in ("times.npy", "outputs.npy", "outputs_npy"):
+            file.writestr(key, GOOD[key[:-4]])
+    twice.write_bytes(twice.read_bytes().replace(b"outputs_npy", b"outputs.npy"))
+    assert "two arrays" in refused(twice)
+
+    (tmp_path / "empty.npz").write_bytes(b"")
+    assert "damaged" in refused(tmp_path / "empty.npz")
+    (tmp_path / "text.npz").write_text("demonstration,time,x\n")
+    assert "damaged" in refused(tmp_path / "text.npz")
+
+
+def test_a_bit_that_flipped_is_noticed_wherever_it_is(tmp_path):
+    """One bit at every byte of an archive: what still loads is what was saved."""
+    good = archive(tmp_path / "good.npz", **GOOD).read_bytes()
+    path = tmp_path / "d.npz"
+    loaded = 0
+    for at in range(len(good)):
+        path.write_bytes(good[:at] + bytes([good[at] ^ (1 << at % 8)]) + good[at + 1 :])
+        try:
+            demonstrations = Demonstrations.load(path)
+        except InputError:
+            continue
+        loaded += 1
+        np.testing.assert_array_equal(demonstrations.times[0], T)
+        np.testing.assert_array_equal(demonstrations.outputs[0], Y)
+    assert loaded < len(good) / 3
+
+
+@pytest.mark.parametrize("kind", ["<f4", ">f8", "<f2", "<i4", "|u1", "|b1", ">i8"])
+def test_every_kind_of_number_is_read_as_it_is(tmp_path, kind):
+    values = np.array([[[0, 1], [1, 0], [1, 1]]]).astype(kind)
+    path = tmp_path / "d.npz"
+    np.savez(path, times=np.arange(3, dtype=np.int64), outputs=np.asfortranarray(values))
+    loaded = Demonstrations.load(path)
+    assert loaded.outputs[0].dtype == float
+    np.testing.assert_array_equal(loaded.outputs[0], [[0, 1], [1, 0], [1, 1]])
+
+
+def test_one_demonstration_as_other_programs_write_it(tmp_path):
+    path = tmp_path / "d.csv"
+    for first in ("t", "time", "Time [s]", " timestamp (Sec)", "t/s", "t [ s ]"):
+        path.write_text(f"{first},x,y [m],z\n0,1,2,3\n0.5,4,5,6\n1e0, 7,8,-9.5e-1\n\n", encoding="utf-8-sig")
+        loaded = Demonstrations.load(path)
+        assert loaded.names == ("x", "y [m]", "z")
+        np.testing.assert_array_equal(loaded.times[0], [0, 0.5, 1])
+        np.testing.assert_array_equal(loaded.outputs[0], [[1, 2, 3], [4, 5, 6], [7, 8, -0.95]])
+
+
+@pytest.mark.parametrize("clock", ["t [ms]", "time (us)", "Timestamp/ns", "t [min]", "t []", "t (UTC)"])
+def test_time_in_another_unit_than_seconds_is_refused(clock, tmp_path):
+    (tmp_path / "d.csv").write_text(f"{clock},x\n0,1\n1,2\n")
+    said = refused(tmp_path / "d.csv")
+    assert "time is in seconds" in said
+    assert clock in said
+    assert "guiderail import" in said
+
+
+def test_a_folder_is_as_many_demonstrations_as_it_has_files(tmp_path):
+    for m in range(12):
+        (tmp_path / f"demo_{m}.csv").write_text(f"t,x\n0,{m}\n1,{m + 1}\n2,{m}\n")
+    (tmp_path / "notes.txt").write_text("not read")
+    (tmp_path / "._demo_1.csv").write_bytes(b"\x00\x05")
+    loaded = Demonstrations.load(tmp_path)
+    assert [y[0, 0] for y in loaded.outputs] == list(range(12))
+    (tmp_path / "demo_5.csv").write_text("t,y\n0,1\n1,1\n")
+    assert "demo_5.csv" in refused(tmp_path)
+    (tmp_path / "demo_5.csv").unlink()
+    (tmp_path / "demo_5.csv").symlink_to(tmp_path)
+    assert "demonstration file" in refused(tmp_path)
+
+
+def test_refuses_folders_that_hold_none_or_too_many(tmp_path):
+    assert "no .csv file" in refused(tmp_path)
+    for m in range(1001):
+        (tmp_path / f"{m}.csv").touch()
+    assert "more than 1000" in refused(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "first line"),
+        ("\n", "first line"),
+        ("0,1,2\n1,1,2\n", "first line"),
+        ("t\n0\n1\n", "first line"),
+        ("demonstration,time\n0,0\n", "first line"),
+        ("demonstration,time,x\n", "at least one"),
+        ("t,x\n", "0 point"),
+        ("t,x\n0,1\n", "1 point"),
+        ("t,x\n0,1\n1\n", "line 3 has 1 fields"),
+        ("t,x\n0,1\n1,one\n", "line 3"),
+        ("t,x\n0,1\n1,1_0\n", "line 3"),
+        ("t,x\n0,1\n1,١\n", "line 3"),
+        ("t,x\n0,1\n1,nan\n", "NaN"),
+        ("t,x\n0,1\n1,1e999\n", "infinity"),
+        ("t,x\n0,1\n1,0x10\n", "line 3"),
+        ("demonstration,time,x\nnan,0,1\nnan,1,1\n", "whole numbers"),
+        ("demonstration,time,x\n0.5,0,1\n0.5,1,1\n", "whole numbers"),
+        ("demonstration,time,x\n9007199254740993,0,1\n9007199254740992,1,1\n", "whole numbers"),
+        ("demonstration,time,x\n" + "".join(f"{m},0,1\n{m},1,1\n" for m in range(1001)), "more than 1000"),
+        ("t,x\n0," + "1" * 140_000, "longer than"),
+        ("t,x\n" + "," * 200_000, "longer than"),
+        ('t,x\n0,"' + "\n" * 200_000, "field limit"),
+        ('t,x\n0,1\n"1"5,1\n', "no table"),
+        ("t,x\x00y\n0,1\n1,2\n", "can't be named"),
+        ('t,"x\ny"\n0,1\n1,2\n', "can't be named"),
+        ("t,x\n" + "\n" * 400_001, "more than 400000 lines"),
+    ],
+)
+def test_refuses_tables_that_are_none(tmp_path, text, said):
+    path = tmp_path / "d.csv"
+    path.write_text(text, encoding="utf-8")
+    assert said in refused(path)
+
+
+def test_refuses_bytes_that_are_no_text(tmp_path):
+    (tmp_path / "d.csv").write_bytes(b"t,x\n0,\xff\n")
+    assert "no table" in refused(tmp_path / "d.csv")
+
+
+def test_waits_for_no_pipe_and_reads_no_device(tmp_path):
+    os.mkfifo(tmp_path / "pipe.csv")
+    assert "no demonstration file" in refused(tmp_path / "pipe.csv")
+    os.symlink("/dev/zero", tmp_path / "zero.npz")
+    assert "no demonstration file" in refused(tmp_path / "zero.npz")
+    with pytest.raises(InputError):
+        Demonstrations.load("x" * 5000 + ".npz")
+    with pytest.raises(InputError):
+        Demonstrations.load("a\0b.csv")
+
+
+def test_a_demonstrations_rows_may_be_anywhere(tmp_path):
+    (tmp_path / "d.csv").write_text("demonstration,time,x\n7,0,1\n-3,0,5\n7,1,2\n-3,1,6\n7,2,3\n")
+    loaded = Demonstrations.load(tmp_path / "d.csv")
+    assert [y.ravel().tolist() for y in loaded.outputs] == [[5, 6], [1, 2, 3]]
+
+
+def test_who_reads_a_file_does_not_wait_for_the_learners_of_mixtures():
+    code = (
+        "import sys, guiderail.models.primitives; sys.exit('sklearn' in sys.modules or 'scipy.optimize' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -1,0 +1,101 @@
+"""The quadratic program by its own conditions, whoever solves it; and what is said where nothing solves it."""
+
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import UnsolvableError
+from guiderail.models.primitives.qp import SOLVERS, find_solver, solve_least_norm
+
+# [of the problem's size] how exactly each keeps a bound, and how near its v is to the best.
+VIOLATION = {"daqp": 1e-12, "piqp": 1e-11, "osqp": 2e-9}
+DISTANCE = {"daqp": 1e-10, "piqp": 1e-8, "osqp": 1e-6}
+
+
+@st.composite
+def problems(draw):
+    """Rows of unit length with bounds on either side or both, some of them as narrow as a point, and a scale."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    size, rows = draw(st.integers(1, 8)), draw(st.integers(1, 8))
+    A = rng.standard_normal((rows, size))
+    A /= np.linalg.norm(A, axis=1)[:, None]
+    inside = A @ rng.standard_normal(size)
+    width = rng.choice([0.0, 0.1, 1.0], (2, rows)) if rows <= size else rng.uniform(0.01, 1.0, (2, rows))
+    lower, upper = inside - width[0], inside + width[1]
+    open_ = rng.uniform(size=rows)
+    lower, upper = np.where(open_ < 0.3, -np.inf, lower), np.where(open_ > 0.7, np.inf, upper)
+    if not (lower > 0).any() and not (upper < 0).any():
+        lower[0], upper[0] = abs(inside[0]) + 0.1, np.inf  # or v = 0 would do
+        A[0] = np.eye(size)[0]
+        lower[1:], upper[1:] = -np.inf, np.inf
+    scale = draw(st.sampled_from([1.0, 1e-7, 1e5]))
+    return A, scale * lower, scale * upper
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@given(problem=problems())
+def test_the_solution_is_inside_and_pushed_by_active_bounds_alone(name, problem):
+    A, lower, upper = problem
+    size = max(lower.max(), -upper.min())
+    v, multipliers = solve_least_norm(A, lower, upper, SOLVERS[name])
+    assert np.maximum(lower - A @ v, A @ v - upper).max() <= VIOLATION[name] * size
+    near = 10 * DISTANCE[name] * max(size, np.linalg.norm(v))
+    # The gradient of ½‖v‖² is v: the bounds hold it, each from its own side only, and only where it is reached.
+    np.testing.assert_allclose(v, -A.T @ multipliers, rtol=0, atol=100 * near)
+    pushes_up = multipliers < -100 * near
+    pushes_down = multipliers > 100 * near
+    assert ((A @ v - lower)[pushes_up] <= 100 * near).all()
+    assert ((upper - A @ v)[pushes_down] <= 100 * near).all()
+    assert pushes_up.any() or pushes_down.any() or np.linalg.norm(v) <= 1e4 * near
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_single_bound_is_met_by_the_shortest_way(name):
+    row = np.array([[0.6, 0.8]])
+    for lower, upper, expected in ((2.0, np.inf, 2.0), (-np.inf, -3.0, -3.0), (2.0, 2.5, 2.0), (-9.0, -3.0, -3.0)):
+        v, multipliers = solve_least_norm(row, np.array([lower]), np.array([upper]), SOLVERS[name])
+        np.testing.assert_allclose(v, expected * row[0], atol=1e-6)
+        np.testing.assert_allclose(multipliers, [-expected], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@given(seed=st.integers(0, 2**32 - 1), gap=st.sampled_from([1e-3, 0.1, 10.0]))
+def test_what_has_no_solution_is_never_given_one(name, seed, gap):
+    rng = np.random.default_rng(seed)
+    row = rng.standard_normal(4)
+    row /= np.linalg.norm(row)
+    # The same direction must be above one bound and below another, or three directions can't all be.
+    A, lower, upper = np.array([row, row]), np.array([gap, -np.inf]), np.array([np.inf, 0.0])
+    if seed % 2:
+        angles = np.array([0, 2, 4]) * np.pi / 3
+        A = np.column_stack([np.cos(angles), np.sin(angles)])
+        lower, upper = np.full(3, gap), np.full(3, np.inf)
+    with pytest.raises(UnsolvableError, match="ended with"):
+        solve_least_norm(A, lower, upper, SOLVERS[name])
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_solver_says_nothing_of_its_own(name, capfd):
+    solve_least_norm(np.eye(3), np.ones(3), np.full(3, 2.0), SOLVERS[name])
+    assert capfd.readouterr() == ("", "")
+
+
+def test_daqp_solves_problems_of_many_bounds_at_once():
+    """A thousand nearly parallel directions: degenerate, and what long horizons are made of."""
+    angles = np.linspace(0, 1e-4, 1000)
+    A = np.column_stack([np.cos(angles), np.sin(angles)])
+    v, _ = solve_least_norm(A, np.ones(1000), np.full(1000, np.inf))
+    assert (A @ v >= 1 - 1e-12).all()
+    assert np.linalg.norm(v) <= 1 + 1e-8
+
+
+def test_refuses_solvers_that_are_not_there(monkeypatch):
+    with pytest.raises(InputError, match="choose one of daqp, piqp, osqp"):
+        find_solver("magic")
+    monkeypatch.setitem(sys.modules, "piqp", None)
+    with pytest.raises(InputError, match="not installed"):
+        solve_least_norm(np.eye(1), np.ones(1), np.full(1, 2.0), SOLVERS["piqp"])

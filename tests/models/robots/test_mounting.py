@@ -1,0 +1,144 @@
+"""A robot and a tool in a plant: what is refused, which files may be read, what a controller sees of a tool."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from pydrake.multibody.plant import MultibodyPlant
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.robots.mounting import add_end_effector, add_robot, lighten_rotors
+from guiderail.models.robots.robot import find_end_effector, find_robot
+
+UR5E = find_robot("ur5e")
+GRIPPER = find_end_effector("parallel_gripper")
+
+
+def mounted(end_effector, robot=UR5E, **options):
+    plant = MultibodyPlant(0.005)
+    arm = add_robot(plant, robot)
+    tool = add_end_effector(plant, robot, arm, end_effector, **options)
+    plant.Finalize()
+    return plant, arm, tool
+
+
+def test_joints_are_in_the_robots_order():
+    plant, arm, _ = mounted(find_end_effector("connector_tool"))
+    assert [actuator.joint().name() for actuator in arm.actuators] == list(UR5E.joints)
+    q = np.arange(6) / 10
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, arm.model, q)
+    assert [plant.GetJointByName(name).GetOnePosition(context) for name in UR5E.joints] == list(q)
+
+
+def test_torque_control_makes_rotors_lighter():
+    plant = MultibodyPlant(0.0)
+    robot = find_robot("panda")
+    arm = add_robot(plant, robot)
+    before = [actuator.default_reflected_inertia() for actuator in arm.actuators]
+    assert before == pytest.approx([0.6057] * 2 + [0.4625] * 2 + [0.2055] * 3, rel=1e-3)
+    lighten_rotors(robot, arm)
+    after = [actuator.default_reflected_inertia() for actuator in arm.actuators]
+    assert after == pytest.approx([0.25 * inertia for inertia in before])
+
+
+def test_a_controller_sees_a_gripper_as_one_open_body():
+    plant, _, tool = mounted(GRIPPER)
+    rigid_plant, _, rigid = mounted(GRIPPER, as_rigid=True)
+    assert rigid_plant.num_positions() == 6
+    assert not rigid.actuators
+    context, rigid_context = plant.CreateDefaultContext(), rigid_plant.CreateDefaultContext()
+    bodies = [body.index() for body in tool.bodies]
+    M = plant.CalcSpatialInertia(context, tool.bodies[0].body_frame(), bodies)
+    rigid_M = rigid.bodies[0].CalcSpatialInertiaInBodyFrame(rigid_context)
+    np.testing.assert_allclose(rigid_M.CopyToFullMatrix6(), M.CopyToFullMatrix6(), atol=1e-12)
+    np.testing.assert_allclose(
+        rigid.tool_centre.CalcPoseInWorld(rigid_context).GetAsMatrix4(),
+        tool.tool_centre.CalcPoseInWorld(context).GetAsMatrix4(),
+        atol=1e-12,
+    )
+    # Open, both fingers of it: one of them mimics the other.
+    np.testing.assert_allclose(plant.GetPositions(context, tool.model), [0.04, 0.04])
+
+
+DIRECTIVES = """
+directives:
+- add_model:
+    name: stand
+    file: package://laboratory/stand.urdf
+- add_weld:
+    parent: world
+    child: stand::post
+- add_model:
+    name: arm
+    file: package://laboratory/ur5e.urdf
+- add_weld:
+    parent: stand::top
+    child: arm::ur5e_base
+"""
+STAND = """
+<robot name="stand">
+  <link name="post"/>
+  <link name="top"/>
+  <joint name="height" type="fixed"><parent link="post"/><child link="top"/><origin xyz="0 0 0.4"/></joint>
+</robot>
+"""
+
+
+def test_a_robot_may_be_a_file_of_model_directives(tmp_path):
+    """An arm on a stand of the laboratory's own: its base is welded by the file, not at the world's origin."""
+    (tmp_path / "package.xml").write_text("<package><name>laboratory</name></package>")
+    (tmp_path / "stand.urdf").write_text(STAND)
+    (tmp_path / "ur5e.urdf").write_text(UR5E.model.read_text())
+    (tmp_path / "cell.dmd.yaml").write_text(DIRECTIVES)
+    on_a_stand = dataclasses.replace(UR5E, name="on a stand", model=tmp_path / "cell.dmd.yaml")
+    heights = []
+    for robot in (UR5E, on_a_stand):
+        plant = MultibodyPlant(0.0)
+        arm = add_robot(plant, robot)
+        plant.Finalize()
+        assert plant.num_positions() == 6
+        heights.append(arm.flange.CalcPoseInWorld(plant.CreateDefaultContext()).translation()[2])
+    assert heights[1] == pytest.approx(heights[0] + 0.4)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"base_frame": "foot"}, "has no frame 'foot'"),
+        ({"flange_frame": "hand"}, "has no frame 'hand'"),
+        ({"joints": (*UR5E.joints[:5], "wrist")}, "has no joint 'wrist'"),
+        ({"joints": (*UR5E.joints[:4], UR5E.joints[5], UR5E.joints[4])}, "in its order"),
+    ],
+)
+def test_refuses_data_that_the_model_has_not(wrong, sentence):
+    with pytest.raises(InputError, match=sentence):
+        add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, **wrong))
+
+
+def test_refuses_a_model_that_is_missing_broken_or_without_motors(tmp_path):
+    for text, sentence in (
+        (None, "no model file"),
+        ("<robot", "can't be read"),
+        (UR5E.model.read_text().split("<transmission")[0] + "</robot>", "give its model file a transmission"),
+    ):
+        file = tmp_path / "robot.urdf"
+        if text is not None:
+            file.write_text(text)
+        with pytest.raises(InputError, match=sentence):
+            add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, model=file))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ({"mount_frame": "flange"}, "has no frame 'flange'"),
+        ({"tool_centre": "tip"}, "has no frame 'tip'"),
+        ({"bodies": ("gripper_body", "thumb")}, "has no body 'thumb'"),
+        ({"opening": {"left_finger_joint": 0.0, "thumb_joint": 0.0}}, "has no joint 'thumb_joint'"),
+    ],
+)
+@pytest.mark.parametrize("as_rigid", [False, True])
+def test_refuses_a_tool_that_the_model_has_not(wrong, sentence, as_rigid):
+    with pytest.raises(InputError, match=sentence):
+        mounted(dataclasses.replace(GRIPPER, **wrong), as_rigid=as_rigid)

@@ -1,0 +1,210 @@
+"""A command under any request: inside, no faster than allowed, and as much of the request as that permits."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.templates import Command, Skill, SkillState, Transition
+from guiderail.models.templates import constraints as ac
+from guiderail.models.templates import mappings as im
+from guiderail.models.templates import transitions as td
+from guiderail.models.templates.geometry import angle_between, between
+
+SEEDS = st.integers(0, 2**32 - 1)
+PERIOD = 0.02
+
+
+def state(name="only", constraints=(), to=(), **changes):
+    numbers = {"starts_at": 1.0, "ends_at": 0.0, **changes}
+    return SkillState(
+        name, (im.Translation((0, 1, 2), 0.5),), tuple(constraints), td.Height("f"), transitions=to, **numbers
+    )
+
+
+def skill(*states, speed=0.2, turn=1.0, initial=0):
+    return Skill("s", 3, ("f",), states or (state(),), initial, speed, turn)
+
+
+def pose(rng, spread):
+    R = Rotation.from_rotvec(spread * rng.standard_normal(3))
+    return RigidTransform(RotationMatrix(R.as_matrix()), spread * rng.standard_normal(3))
+
+
+F = {"f": RigidTransform()}
+
+
+def load(s, A, B):
+    distance = np.linalg.norm(B.translation() - A.translation()) / (s.max_speed_m_per_s * PERIOD)
+    return max(distance, angle_between(A.rotation(), B.rotation()) / (s.max_speed_rad_per_s * PERIOD))
+
+
+@given(SEEDS, st.sampled_from([1e-4, 1e-3, 1e-2, 1.0]))
+def test_without_constraints_it_goes_as_far_as_the_speeds_allow(seed, spread):
+    rng = np.random.default_rng(seed)
+    s = skill(speed=rng.uniform(0.01, 1), turn=rng.uniform(0.1, 3))
+    last, request = pose(rng, 0.3), pose(rng, spread)
+    request = RigidTransform(request.rotation() @ last.rotation(), last.translation() + request.translation())
+    command = s.command(0, last, request, F, PERIOD)
+    wanted = load(s, last, request)
+    most = min(1.0, 1.0 / wanted)
+    assert 0.979 * most <= command.fraction <= most * (1 + 1e-12)  # or one step shorter, where rounding exceeds a speed
+    expected = between(last, request, command.fraction)
+    np.testing.assert_allclose(command.X_WE.GetAsMatrix34(), expected.GetAsMatrix34(), atol=1e-7)
+    assert load(s, last, command.X_WE) <= 1 + 1e-9
+
+
+UNDONE = [ac.Cylinder("f", max_radius_m=0.002), ac.KeepAbove(0.0, "f"), ac.Funnel("f", 0.001, 0.006, 1.0)]
+
+
+def wander(s, seed, height=0.02, climb=(-1e-3, 4e-4), steps=300):
+    """Commands, each with the state that it was made in, of requests that go anywhere from above the object."""
+    rng = np.random.default_rng(seed)
+    number, last = 0, RigidTransform([0.0, 0.0, height])
+    for _ in range(steps):
+        to = last.translation() + [*rng.choice([-1e-3, 1e-3], 2), rng.uniform(*climb)]
+        last = s.command(number, last, RigidTransform(to), F, PERIOD).X_WE
+        yield number, last
+        number = s.next_state(number, last, F, PERIOD)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_command_is_inside_where_one_constraint_undoes_another(seed):
+    s = skill(state(constraints=UNDONE[::-1]), speed=0.05)
+    assert s.violation(0, s.project(0, RigidTransform([0.003, 0.0, 0.009]), F), F) > 5e-4
+    pairs = list(wander(s, seed, height=0.006, climb=(-4e-4, 1e-3)))
+    assert max(s.violation(number, X, F) for number, X in pairs) <= 1e-9
+    assert np.ptp([X.translation() for _, X in pairs], axis=0).max() > 0.001  # and it does not stand still for it
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_command_leaves_the_constraints_of_a_next_state_that_are_tighter(seed):
+    wide, narrow = (
+        state(name, [ac.Cylinder("f", max_radius_m=radius), ac.KeepAbove(-0.006, "f")], to)
+        for name, radius, to in (("search", 0.004, (Transition("insert", 0.006, 0.002),)), ("insert", 0.002, ()))
+    )
+    s = skill(wide, narrow, speed=0.05)
+    pairs = list(wander(s, seed))
+    assert max(s.violation(number, X, F) for number, X in pairs) <= 1e-9
+    assert {number for number, _ in pairs} == {0, 1}
+
+
+@given(SEEDS)
+def test_inside_constraints_it_stays_inside_and_within_the_speeds(seed):
+    """Also where the orientation that goes with a position turns quickly."""
+    rng = np.random.default_rng(seed)
+    constraints = [
+        ac.Box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2), "f"),
+        ac.TiltByDistance("f", (0.0, 0.3), (80.0, -80.0), turns_along=bool(seed % 2)),
+    ]
+    s = skill(state(constraints=constraints), speed=rng.uniform(0.05, 1), turn=rng.uniform(0.1, 3))
+    last = s.project(0, pose(rng, 0.3), F)
+    command = s.command(0, last, pose(rng, 0.3), F, PERIOD)
+    assert 0 <= command.fraction <= 1
+    assert load(s, last, command.X_WE) <= 1 + 1e-9
+    assert s.violation(0, command.X_WE, F) <= 1e-9
+
+
+@given(SEEDS)
+def test_from_outside_it_is_led_in_at_no_more_than_the_speeds(seed):
+    rng = np.random.default_rng(seed)
+    s = skill(state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3, "f"), ac.FixedOrientation(frame="f")]))
+    last = pose(rng, 0.5)
+    before = s.violation(0, last, F)
+    command = s.command(0, last, last, F, PERIOD)
+    assert load(s, last, command.X_WE) <= 1 + 1e-9
+    assert s.violation(0, command.X_WE, F) <= before + 1e-9
+    if before > 0.1:
+        assert command.fraction == 0.0
+        assert load(s, last, command.X_WE) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_what_can_be_done_at_once_is_done_whole():
+    s = skill()
+    last, request = RigidTransform(), RigidTransform([0.2 * PERIOD * 0.999, 0, 0])
+    command = s.command(0, last, request, F, PERIOD)
+    assert command == Command(command.X_WE, 1.0)
+    np.testing.assert_array_equal(command.X_WE.translation(), request.translation())
+
+
+def test_a_displacement_turns_about_the_origin_of_the_end_effector_and_adds_up():
+    s = skill()
+    X = RigidTransform(RotationMatrix.MakeXRotation(0.4), [1.0, 2.0, 3.0])
+    d = RigidTransform(RotationMatrix.MakeZRotation(0.3), [0.1, 0.2, 0.3])
+    moved = s.displace(X, d)
+    np.testing.assert_allclose(moved.translation(), [1.1, 2.2, 3.3])
+    expected = RotationMatrix.MakeZRotation(0.3) @ RotationMatrix.MakeXRotation(0.4)
+    np.testing.assert_allclose(moved.rotation().matrix(), expected.matrix(), atol=1e-12)
+    both = SkillState(
+        "b", (im.Translation((0, 1, 2), 0.5), im.Rotation((0,), 2.0, axes=((0, 0, 1),))), (), td.Height("f"), 1, 0
+    )
+    total = skill(both).map(0, np.array([0.5, 9.0, -9.0]), X, F, 0.1)
+    np.testing.assert_allclose(total.translation(), [0.025, 0.05, -0.05])
+    np.testing.assert_allclose(total.rotation().matrix(), RotationMatrix.MakeZRotation(0.1).matrix(), atol=1e-12)
+
+
+def test_constraints_apply_in_their_order():
+    up, down = ac.HalfSpace((0.0, 0.0, 1.0), 0.5), ac.HalfSpace((0.0, 0.0, -1.0), -0.2)
+    for order, height in (((up, down), 0.2), ((down, up), 0.5)):
+        s = skill(state(constraints=order))
+        assert s.project(0, RigidTransform(), {}).translation()[2] == pytest.approx(height)
+        assert s.violation(0, RigidTransform([0.0, 0.0, 0.3]), {}) == pytest.approx(0.2)
+    assert skill().violation(0, RigidTransform([9.0, 9.0, 9.0]), F) == 0.0
+    free = skill(state(constraints=(up,))).without_active_constraints()
+    assert free.states[0].active_constraints == ()
+
+
+def at(height):
+    return RigidTransform([0.0, 0.0, height])
+
+
+def test_the_first_way_that_is_open_is_taken_and_the_way_back_has_hysteresis():
+    s = skill(
+        state("a", to=(Transition("b", 0.5, 0.1), Transition("c", 0.7)), starts_at=1.0, ends_at=0.5),
+        state("b", to=(Transition("c", 0.2, 0.05),), starts_at=0.5, ends_at=0.2),
+        state("c", starts_at=0.2, ends_at=0.0),
+    )
+    for number, height, expected in (
+        (0, 0.7, 0),
+        (0, 0.69, 2),
+        (0, 0.5, 2),
+        (0, 0.49, 1),
+        (1, 0.6, 1),
+        (1, 0.61, 0),
+        (1, 0.2, 1),
+        (1, 0.19, 2),
+        (2, 0.25, 2),
+        (2, 0.26, 1),
+    ):
+        assert s.next_state(number, at(height), F) == expected, (number, height)
+    assert s.state_at(at(0.9), F) == 0
+    assert s.state_at(at(0.4), F) == 1
+    assert s.state_at(at(0.1), F) == 2
+    assert s.distance(1, at(0.3), F) == pytest.approx(0.3)
+
+
+def test_progress_goes_on_where_the_state_before_ended():
+    s = skill(
+        state("b", to=(Transition("c", 0.2),), starts_at=0.5, ends_at=0.2, weight=2.0),
+        state("a", to=(Transition("b", 0.5), Transition("c", 0.1)), starts_at=1.0, ends_at=0.5, weight=3.0),
+        state("c", starts_at=0.2, ends_at=0.0, weight=5.0),
+        initial=1,
+    )
+    assert s.progress(1, at(1.0), F) == pytest.approx(0.0)
+    assert s.progress(1, at(0.5), F) == s.progress(0, at(0.5), F) == pytest.approx(1.5)
+    assert s.progress(0, at(0.2), F) == s.progress(2, at(0.2), F) == pytest.approx(2.1)
+    assert s.progress(2, at(0.0), F) == pytest.approx(3.1)
+    round_ = skill(
+        state("a", to=(Transition("b", 0.5),), starts_at=1.0, ends_at=0.5),
+        state("b", to=(Transition("a", 0.2),), starts_at=0.5, ends_at=0.2),
+    )
+    assert round_.progress(1, at(0.2), F) == pytest.approx(0.8)
+
+
+def test_a_state_needs_the_frames_of_all_its_parts():
+    s = SkillState(
+        "x", (im.TiltTowards((0, 1), 1.0, "a"),), (ac.Cylinder("b"),), td.Distance("c"), starts_at=1.0, ends_at=0.0
+    )
+    assert s.frame_names == {"a", "b", "c"}

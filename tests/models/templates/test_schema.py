@@ -1,0 +1,211 @@
+"""What a skill file may say, and what a person is told when it says something else."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from pydrake.math import RigidTransform
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.templates import load_skill, parse_skill
+from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
+from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register
+
+SKILL = (Path(__file__).parent / "reach.yaml").read_text()
+
+
+def changed(change):
+    data = yaml.safe_load(SKILL)
+    change(data)
+    return yaml.safe_dump(data, sort_keys=False)
+
+
+def test_reads_states_in_order_with_units_turned_into_si():
+    skill = parse_skill(SKILL)
+    assert [state.name for state in skill.states] == ["far", "near"]
+    assert skill.initial_state == 0
+    assert skill.states[1].starts_at == pytest.approx(np.pi / 2)
+    assert skill.states[0].ends_at == 0.1
+
+
+def test_numbers_may_be_arithmetic_on_the_objects_sizes():
+    cylinder = parse_skill(SKILL).states[0].active_constraints[0]
+    assert isinstance(cylinder, Cylinder)
+    assert (cylinder.min_radius_m, cylinder.max_radius_m) == pytest.approx((0.06, 0.3))
+    larger = parse_skill(SKILL, rim_m=0.06).states[0].active_constraints[0]
+    assert isinstance(larger, Cylinder)
+    assert (larger.min_radius_m, larger.max_radius_m) == pytest.approx((0.07, 0.36))
+
+
+def test_a_new_kind_is_one_class_and_one_registration():
+    @register(ACTIVE_CONSTRAINTS, "at_origin")
+    @dataclass(frozen=True)
+    class AtOrigin(ActiveConstraint):
+        frame: str
+        height_m: float = 0.0
+
+        def project(self, X_WE, frames):
+            return RigidTransform(X_WE.rotation(), frames[self.frame] @ np.array([0.0, 0.0, self.height_m]))
+
+    try:
+
+        def use(data):
+            data["states"]["far"]["active_constraints"] = [
+                {"kind": "at_origin", "frame": "cup", "height_m": "2 * rim_m"}
+            ]
+
+        skill = parse_skill(changed(use))
+        X_WP = skill.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
+        np.testing.assert_allclose(X_WP.translation(), [1.0, 0.0, 0.1])
+        with pytest.raises(ValueError, match="already registered"):
+            register(ACTIVE_CONSTRAINTS, "at_origin")(AtOrigin)
+    finally:
+        del ACTIVE_CONSTRAINTS["at_origin"]
+
+
+def set_in(*path, value):
+    def change(data):
+        for key in path[:-1]:
+            data = data[key]
+        data[path[-1]] = value
+
+    return change
+
+
+def remove(*path):
+    def change(data):
+        for key in path[:-1]:
+            data = data[key]
+        del data[path[-1]]
+
+    return change
+
+
+FAR = ("states", "far")
+MOVE = {"kind": "translation", "inputs": [0, 1], "speed_m_per_s": 0.1}
+TILT = {"kind": "tilt_towards", "inputs": [0, 1], "speed_rad_per_s": 0.1}
+SCALED = {"kind": "scaled", "distance_m": [0], "factor": [1], "of": {**TILT, "frame": "cup"}}
+PLANE = {"kind": "half_space", "offset_m": 0}
+UPRIGHT = {"kind": "fixed_orientation"}
+LIMITS = {"kind": "tilt_limits", "frame": "cup", "min_deg": 0, "max_deg": 1}
+LEAN = {"kind": "tilt_by_distance", "frame": "cup", "distance_m": [0], "tilt_deg": [0]}
+ARC = {"kind": "arc", "frame": "cup", "radius_m": 1}
+TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (set_in("inptus", value=3), "did you mean inputs"),
+        (remove("max_speed_m_per_s"), "max_speed_m_per_s is missing"),
+        (set_in("inputs", value=7), "from 1 to 6"),
+        (set_in("initial_state", value="fra"), "did you mean far"),
+        (set_in(*FAR, "active_constraints", 0, "kind", value="cylindre"), "did you mean cylinder"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_mm", value=1), "did you mean min_radius_m"),
+        (set_in(*FAR, "active_constraints", 0, "frame", value="cpu"), "did you mean cup"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="rmi_m"), "did you mean rim_m"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="().__class__"), "is not a number"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1 / 0"), "not arithmetic"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=float("nan")), "finite"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=True), "must be a number"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=2.0), "0 ≤ min_radius_m ≤ max_radius_m"),
+        (remove(*FAR, "input_mapping", 0, "speed_m_per_s"), "speed_m_per_s is missing"),
+        (set_in(*FAR, "input_mapping", 0, "inputs", value=[0, 2]), "no input 2"),
+        (set_in(*FAR, "transitions", 0, "to", value="naer"), "did you mean near"),
+        (set_in(*FAR, "transitions", 0, "below_deg", value=5), "below_"),
+        (set_in(*FAR, "transitions", 0, "hysteresis_m", value=-0.1), "hysteresis_m must be positive"),
+        (set_in(*FAR, "starts_at_m", value=0.05), "distances decrease"),
+        (remove("states", "near", "ends_at_deg"), "ends_at_deg is missing"),
+        (set_in("states", "near", "starts_at_m", value=1.0), "did you mean starts_at_deg"),
+        (set_in("states", value={}), "at least one"),
+        (set_in("frames", value=["cup", "cup"]), "different names"),
+        (set_in("frames", value=["cup", "world"]), "world is always there"),
+        (set_in("frames", value=["cup", "tool"]), "tool is always there"),
+        (set_in("frames", value=[["cup"]]), "different names"),
+        (set_in("inputs", value=True), "from 1 to 6"),
+        (set_in("name", value={"a": 1}), "short text"),
+        (set_in("name", value="two\nlines"), "short text"),
+        (set_in("initial_state", value=["far"]), "is not a state"),
+        (set_in("states", "a\tb", value={}), "can't name a state"),
+        (set_in("states", value={f"s{i}": {} for i in range(31)}), "more than 30"),
+        (set_in(*FAR, "active_constraints", value=[{}] * 31), "more than 30"),
+        (set_in(*FAR, "active_constraints", 0, "kind", value=["cylinder"]), "unknown kind"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=int("9" * 400)), "not arithmetic"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="9" * 199), "at most a million"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1e309"), "finite"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=2e6), "at most a million"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="2001-99-99x"), "not arithmetic"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="(" * 150), "not arithmetic"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1+" * 20_000 + "1"), "too long"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="True"), "is not a number"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1j"), "is not a number"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="2 ** 9999"), "is not a number"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="a\0b"), "not arithmetic"),
+        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=[[[["x"] * 99] * 9] * 9]), "must be a number"),
+        (set_in(*FAR, "input_mapping", 0, "inputs", value=[True, False]), "whole numbers"),
+        (set_in(*FAR, "input_mapping", 0, value={**MOVE, "inputs": [], "axes": []}), "at least one"),
+        (set_in(*FAR, "input_mapping", 0, value={**MOVE, "axes": [[1, 0], [0, 1]]}), "three numbers"),
+        (set_in(*FAR, "input_mapping", 0, value={**TILT, "frame": "tool"}), "not the tool's own"),
+        (set_in(*FAR, "input_mapping", 0, value={**SCALED, "frame": "tool"}), "not the tool's own"),
+        (set_in(*FAR, "active_constraints", 0, value={**PLANE, "normal": [1e-9, 0, 0]}), "must not be zero"),
+        (set_in(*FAR, "active_constraints", 0, value={**PLANE, "normal": [0.1] * 3000}), "three numbers"),
+        (set_in(*FAR, "active_constraints", 0, value={**UPRIGHT, "rpy_deg": [0, 0]}), "three numbers"),
+        (set_in(*FAR, "active_constraints", 0, value={**LIMITS, "rpy_deg": [0]}), "three numbers"),
+        (set_in(*FAR, "active_constraints", 0, value={**ARC, "rpy_deg": [0] * 4}), "three numbers"),
+        (set_in(*FAR, "active_constraints", 0, value={**LEAN, "rpy_deg": []}), "three numbers"),
+        (set_in(*FAR, "transition_distance", value={"kind": "distance", "frame": "cup", "point_m": [0]}), "three"),
+        (set_in(*FAR, "transition_distance", value={"kind": "rotation_to_go", "rpy_deg": [0]}), "three"),
+        (set_in(*FAR, "transition_distance", value={**TO_GO, "rpy_deg": [0]}), "three"),
+        (set_in(*FAR, "transitions", 0, "to", value=["near"]), "name of a state"),
+        (set_in(*FAR, "transitions", value=None), "ends_at_m is missing"),
+        (set_in("parameters", "rim m", value=1), "can't name a parameter"),
+        (set_in("parameters", "ﬁ", value=1), "can't name a parameter"),
+    ],
+)
+def test_says_what_is_wrong_and_what_to_do(change, said):
+    with pytest.raises(InputError) as refused:
+        parse_skill(changed(change))
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 500
+
+
+def test_refuses_parameters_that_are_no_numbers():
+    for value in (None, [0.04], True, float("nan"), 1e300, 10**400):
+        with pytest.raises(InputError, match="rim_m"):
+            parse_skill(SKILL, rim_m=value)
+    assert parse_skill(SKILL, rim_m=np.float32(0.25)).parameters["rim_m"] == 0.25
+
+
+def test_refuses_what_other_readers_would_stumble_over():
+    for text in ("inputs: 010", "inputs: 2001-99-99", "inputs: 2\ninputs: 3", "inputs: !!int 2", "inputs: 1:30"):
+        with pytest.raises(InputError):
+            parse_skill(SKILL.replace("inputs: 2", text, 1))
+    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+        f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
+    )
+    with pytest.raises(InputError, match="more than 10000"):
+        parse_skill(SKILL + bomb)
+
+
+def test_refuses_what_is_not_there(tmp_path):
+    with pytest.raises(InputError, match="did you mean pouring"):
+        load_skill("puoring")
+    with pytest.raises(InputError, match="there is no skill"):
+        load_skill(tmp_path / "missing.yaml")
+    with pytest.raises(InputError, match="no parameter"):
+        load_skill("pouring", mug_size_m=0.1)
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("name: [")
+    with pytest.raises(InputError, match="not YAML"):
+        load_skill(broken)
+
+
+def test_a_parameter_is_made_of_no_other_and_the_sentence_names_them():
+    with pytest.raises(InputError, match=r"'far' is no number, and no parameter \(near, far\) is made of others"):
+        parse_skill(
+            "{name: x, inputs: 1, parameters: {near: far, far: 1}, max_speed_m_per_s: 1, "
+            "max_speed_rad_per_s: 1, states: {}}"
+        )

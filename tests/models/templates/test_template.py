@@ -1,0 +1,304 @@
+"""The laws of a skill: mapping, displacement, command, transitions and progress."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.templates import Command, Skill, SkillState, Transition, load_skill
+from guiderail.models.templates import constraints as ac
+from guiderail.models.templates import mappings as im
+from guiderail.models.templates import transitions as td
+from guiderail.models.templates.geometry import angle_between
+
+PERIOD = 0.01
+MUG = {"mug_tip": RigidTransform(RotationMatrix.MakeZRotation(0.3), [0.7, 0.1, 0.1])}
+
+
+@pytest.fixture(scope="module")
+def pouring():
+    return load_skill("pouring")
+
+
+def in_mug(p):
+    return RigidTransform(MUG["mug_tip"].rotation(), MUG["mug_tip"] @ np.array(p))
+
+
+def run(skill, X_WE, inputs, steps, state=None, observe=None):
+    """The template under `inputs(k, X)`, as the systems run it; returns the last state and command."""
+    state = skill.state_at(X_WE, MUG) if state is None else state
+    for k in range(steps):
+        request = skill.displace(X_WE, skill.map(state, inputs(k, X_WE), X_WE, MUG, PERIOD))
+        X_last, X_WE = X_WE, skill.command(state, X_WE, request, MUG, PERIOD).X_WE
+        if observe:
+            observe(state, X_last, X_WE)
+        state = skill.next_state(state, X_WE, MUG)
+    return state, X_WE
+
+
+def test_translation_moves_at_its_speed_along_its_frame():
+    mapping = im.Translation(inputs=(1,), axes=((0.0, 0.0, 1.0),), speed_m_per_s=0.2, frame="tool")
+    X_WE = RigidTransform(RotationMatrix.MakeYRotation(np.pi / 2), np.zeros(3))
+    moved = mapping.displacement(np.array([9.0, 0.5]), X_WE, {}, 0.1)
+    np.testing.assert_allclose(moved.translation(), [0.01, 0.0, 0.0], atol=1e-15)
+
+
+def test_rotation_turns_about_the_end_effectors_own_origin(pouring):
+    mapping = im.Rotation(inputs=(0, 1, 2), speed_rad_per_s=2.0)
+    X_WE = RigidTransform([1.0, 2.0, 3.0])
+    turned = pouring.displace(X_WE, mapping.displacement(np.array([0.0, 0.0, 1.0]), X_WE, {}, 0.1))
+    np.testing.assert_allclose(turned.translation(), X_WE.translation())
+    assert angle_between(turned.rotation(), RotationMatrix.MakeZRotation(0.2)) < 1e-12
+
+
+def test_only_the_input_towards_the_object_tilts():
+    mapping = im.TiltTowards(inputs=(0, 1), speed_rad_per_s=1.0, frame="mug_tip")
+    X_WE = in_mug([0.0, -0.05, 0.05])
+    across = mapping.displacement(np.array([1.0, 0.0]), X_WE, MUG, 0.1)
+    along = mapping.displacement(np.array([0.3, 0.5]), X_WE, MUG, 0.1)
+    assert angle_between(across.rotation(), RotationMatrix()) < 1e-12
+    # The tool's z axis leans along the mug frame's y, where the mug is.
+    lean = along.rotation().matrix()[:, 2]
+    np.testing.assert_allclose(lean, MUG["mug_tip"].rotation() @ np.array([0, np.sin(0.05), np.cos(0.05)]), atol=1e-12)
+
+
+def test_scaled_slows_down_near_the_object():
+    mapping = im.Scaled(
+        frame="mug_tip", distance_m=(0.1, 0.3), factor=(0.2, 1.0), of=im.Translation((0,), 1.0, axes=((1.0, 0.0, 0.0),))
+    )
+    speeds = [
+        mapping.displacement(np.ones(1), in_mug([0.0, -d, 0.0]), MUG, 1.0).translation()[0] for d in (0.05, 0.2, 1.0)
+    ]
+    np.testing.assert_allclose(speeds, [0.2, 0.6, 1.0])
+
+
+def test_uneven_leads_one_way_on_average():
+    mapping = im.Uneven(above=0.4, below=1.0, of=im.Translation((0,), 1.0, axes=((0.0, 0.0, 1.0),)))
+    speeds = [mapping.displacement(np.array([u]), RigidTransform(), {}, 1.0).translation()[2] for u in (-1, 0, 0.5, 1)]
+    np.testing.assert_allclose(speeds, [-1.0, 0.0, 0.2, 0.4])
+
+
+def test_inputs_beyond_one_are_one(pouring):
+    X_WE = in_mug([0.0, -0.3, 0.1])
+    one = pouring.map(0, np.array([1.0, -1.0, 0.0]), X_WE, MUG, PERIOD)
+    much = pouring.map(0, np.array([50.0, -7.0, 0.0]), X_WE, MUG, PERIOD)
+    assert one.IsExactlyEqualTo(much)
+
+
+def test_a_state_that_maps_no_input_stands_still(pouring):
+    deaf = replace(pouring, states=tuple(replace(state, input_mapping=()) for state in pouring.states))
+    moved = deaf.map(0, np.ones(3), in_mug([0.2, 0.0, 0.2]), {"mug_tip": RigidTransform()}, 0.01)
+    np.testing.assert_array_equal(moved.GetAsMatrix34(), RigidTransform().GetAsMatrix34())
+
+
+def test_adversarial_inputs_never_leave_the_constraints_or_exceed_the_speeds(pouring):
+    rng = np.random.default_rng(0)
+    worst = speed = turn = 0.0
+    seen = set()
+
+    def observe(state, X_last, X_WE):
+        nonlocal worst, speed, turn
+        seen.add(state)
+        worst = max(worst, pouring.violation(state, X_WE, MUG))
+        speed = max(speed, np.linalg.norm(X_WE.translation() - X_last.translation()) / PERIOD)
+        turn = max(turn, angle_between(X_WE.rotation(), X_last.rotation()) / PERIOD)
+
+    held = np.zeros(3)
+    for _ in range(4):
+
+        def inputs(k, X_WE):
+            nonlocal held
+            if k % 10 == 0:
+                towards = MUG["mug_tip"].translation() - X_WE.translation()
+                held = np.clip(1.5 * rng.normal(size=3) + 2.0 * towards / np.linalg.norm(towards), -1.0, 1.0)
+            return held
+
+        start = in_mug(rng.normal([-0.1, -0.25, 0.15], 0.05))
+        start = pouring.project(pouring.state_at(start, MUG), start, MUG)
+        run(pouring, start, inputs, 1000, observe=observe)
+    assert seen == {0, 1, 2}
+    assert worst <= 1e-9
+    assert speed <= pouring.max_speed_m_per_s * (1 + 1e-9)
+    assert turn <= pouring.max_speed_rad_per_s * (1 + 1e-9)
+
+
+def test_translation_slows_down_where_the_tilt_could_not_keep_up(pouring):
+    full = np.array([0.0, 1.0, 0.0])
+    X_WE = pouring.project(1, in_mug([0.0, -0.15, 0.06]), MUG)
+    request = pouring.displace(X_WE, pouring.map(1, full, X_WE, MUG, 0.1))
+    slow = pouring.command(1, X_WE, request, MUG, PERIOD)
+    assert 0.0 < slow.fraction < 1.0
+    assert pouring.violation(1, slow.X_WE, MUG) <= 1e-9
+
+
+def test_a_command_outside_is_led_inside_at_the_greatest_speed(pouring):
+    outside = in_mug([0.0, -0.3, 0.02])  # 3 cm too low
+    steps = 0
+    X_WE = outside
+    while pouring.violation(0, X_WE, MUG) > 1e-9:
+        X_WE = pouring.command(0, X_WE, X_WE, MUG, PERIOD).X_WE
+        steps += 1
+        assert steps < 100
+    assert steps == pytest.approx(0.03 / (pouring.max_speed_m_per_s * PERIOD), abs=2)
+
+
+def test_states_change_with_hysteresis(pouring):
+    def after(state, distance):
+        return pouring.next_state(state, in_mug([0.0, -distance, 0.0]), MUG)
+
+    assert [after(0, d) for d in (0.251, 0.249)] == [0, 1]
+    assert [after(1, d) for d in (0.269, 0.271)] == [1, 0]
+    assert [after(1, d) for d in (0.076, 0.074)] == [1, 2]
+    assert after(2, 0.5) == 2  # there is no way back from pouring
+
+
+def test_transition_finds_the_command_inside_the_next_states_constraints(pouring):
+    jumps = []
+
+    def observe(state, X_last, X_WE):
+        after = pouring.next_state(state, X_WE, MUG)
+        if after > state:
+            jumps.append(pouring.violation(after, X_WE, MUG))
+
+    run(pouring, in_mug([-0.05, -0.31, 0.12]), lambda k, X: np.array([0.1, 0.8, -0.5]), 600, observe=observe)
+    assert len(jumps) == 2
+    assert max(jumps) <= 1e-9
+
+
+def test_progress_adds_up_to_what_the_distances_lost(pouring):
+    rises = []
+    first = in_mug([-0.05, -0.31, 0.12])
+    last = [pouring.progress(0, first, MUG)]
+
+    def observe(state, X_last, X_WE):
+        rises.append(pouring.progress(state, X_WE, MUG) - last[0])
+        last[0] += rises[-1]
+
+    state, X_WE = run(pouring, first, lambda k, X: np.array([0.1, 0.8, -0.5]), 900, observe=observe)
+    assert state == 2
+    assert min(rises) > -0.02  # going straight at the mug, it falls nowhere by more than a transition's own overshoot
+    total = sum(s.weight * (s.starts_at - s.ends_at) for s in pouring.states)
+    assert pouring.progress(state, X_WE, MUG) == pytest.approx(total, abs=0.01)
+
+
+def test_without_active_constraints_what_is_asked_is_done(pouring):
+    free = pouring.without_active_constraints()
+    X_WE = in_mug([0.0, -0.06, 0.01])
+    assert pouring.violation(1, X_WE, MUG) > 0.01
+    assert free.violation(1, X_WE, MUG) == 0.0
+    assert [s.name for s in free.states] == [s.name for s in pouring.states]
+
+
+def test_the_template_follows_the_object():
+    wide = load_skill("pouring", mug_radius_m=0.06)
+    narrow = load_skill("pouring", mug_radius_m=0.04)
+    assert wide.states[1].ends_at - narrow.states[1].ends_at == pytest.approx(0.02)
+
+
+def test_the_length_of_an_axis_multiplies_the_speed():
+    moved = [
+        im.Translation((0,), 0.1, axes=((0.0, 0.0, length),)).displacement(np.ones(1), RigidTransform(), {}, 0.5)
+        for length in (1.0, 2.0)
+    ]
+    np.testing.assert_allclose(moved[1].translation(), 2 * moved[0].translation())
+
+
+REACH = 0.125  # [m] of one step of the skills below, and a number that arithmetic keeps to the last bit
+
+
+class UpTo(ac.ActiveConstraint):
+    """Says how far x is beyond a limit, and projects nothing: only a shorter displacement gets inside."""
+
+    frame_names = ()
+
+    def __init__(self, limit):
+        self.limit = limit
+
+    def project(self, X_WE, frames):
+        return RigidTransform(X_WE)
+
+    def violation(self, X_WE, frames):
+        return max(0.0, X_WE.translation()[0] - self.limit)
+
+
+def one_state(*constraints, name="only", **numbers):
+    numbers = {"starts_at": 1.0, "ends_at": 0.0, **numbers}
+    return SkillState(name, (im.Translation((0, 1, 2), 1.0),), constraints, td.Height("world"), **numbers)
+
+
+def one(*constraints):
+    return Skill("one", 3, (), (one_state(*constraints),), 0, REACH, 1.0)
+
+
+def shifted(x):
+    return RigidTransform([x, 0.0, 0.0])
+
+
+def floor_and_ceiling(floor, ceiling):
+    return one(ac.HalfSpace((0.0, 0.0, 1.0), floor), ac.HalfSpace((0.0, 0.0, -1.0), -ceiling))
+
+
+def test_a_nanometre_outside_is_inside_and_more_is_not():
+    """A floor above a ceiling: what the ceiling leaves is outside of the floor by their distance."""
+    X = RigidTransform()
+    for floor, fraction in ((1e-9, 1.0), (1.5e-9, 0.0)):
+        assert floor_and_ceiling(floor, 0.0).command(0, X, X, {}, 1.0).fraction == fraction
+        assert floor_and_ceiling(floor, 0.0).can_enter(0, X, {}, 1.0) == (fraction == 1.0)
+
+
+@pytest.mark.parametrize("halvings", range(9))
+def test_a_displacement_is_halved_until_it_is_inside_seven_times_at_most(halvings):
+    skill = one(UpTo(0.75 * 0.5 ** (halvings - 1) * 0.0625))
+    command = skill.command(0, RigidTransform(), shifted(0.0625), {}, 1.0)
+    fraction = 0.5**halvings if halvings < 8 else 0.0
+    assert command.fraction == fraction
+    assert command.X_WE.translation()[0] == pytest.approx(0.0625 * fraction, abs=1e-15)
+
+
+def test_the_whole_reach_is_within_reach():
+    there = shifted(REACH)
+    assert one().command(0, RigidTransform(), there, {}, 1.0) == Command(there, 1.0)
+    assert one(UpTo(0.75 * REACH)).command(0, RigidTransform(), there, {}, 1.0).fraction == 0.5
+    beyond = one(ac.HalfSpace((1.0, 0.0, 0.0), REACH))
+    assert beyond.can_enter(0, RigidTransform(), {}, 1.0)
+    assert beyond.can_enter(0, shifted(0.5 * REACH), {}, 1.0)
+    assert not beyond.can_enter(0, shifted(-1e-6), {}, 1.0)
+
+
+def test_who_may_not_move_keeps_the_last_command_itself():
+    X_WLast = shifted(0.0)
+    command = one(UpTo(0.0)).command(0, X_WLast, shifted(0.1), {}, 1.0)
+    assert command.X_WE is X_WLast
+    assert command.fraction == 0.0
+
+
+def test_who_is_led_inside_goes_no_further_than_the_constraints_say():
+    led = floor_and_ceiling(0.0, -0.02).command(0, RigidTransform([0.0, 0.0, 0.04]), RigidTransform(), {}, 1.0)
+    assert led == Command(led.X_WE, 0.0)
+    np.testing.assert_allclose(led.X_WE.translation(), [0.0, 0.0, -0.02], atol=1e-15)
+
+
+def test_a_request_out_of_all_proportion_still_slides_along_a_wall():
+    """Brought within reach before it is projected, however far away it is: as far along the wall as one step goes."""
+    skill = one(ac.Box((-1.0, -1.0, -1.0), (0.0, 1e9, 1.0), "world"))
+    for far in (1.0, 1e4, 1e8):
+        command = skill.command(0, RigidTransform(), RigidTransform([far, far, 0.0]), {}, 1.0)
+        np.testing.assert_allclose(command.X_WE.translation(), [0.0, REACH / np.sqrt(2), 0.0], rtol=1e-7, atol=1e-9)
+
+
+def test_what_is_not_said_of_a_skill():
+    skill = one()
+    assert skill.parameters == {}
+    assert skill.states[0].weight == 1.0
+    with pytest.raises(InputError, match=r"one has no state 'onyl'.*did you mean only"):
+        skill.index("onyl")
+
+
+def test_the_progress_of_states_that_go_round_ends():
+    a, b, c = (
+        one_state(name=name, transitions=(Transition(to, 0.5),)) for name, to in (("a", "b"), ("b", "c"), ("c", "b"))
+    )
+    skill = Skill("round", 3, (), (a, b, c), 0, REACH, 1.0)
+    assert [skill.progress(number, RigidTransform(), {}) for number in range(3)] == [1.0, 2.0, 3.0]

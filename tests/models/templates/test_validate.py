@@ -1,0 +1,122 @@
+"""`guiderail check` finds the mistakes that a skill can make without being unreadable."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from guiderail.models.templates import load_skill, parse_skill
+from guiderail.models.templates.drawing import draw, to_dot
+from guiderail.models.templates.validate import validate
+
+SKILL = (Path(__file__).parent / "reach.yaml").read_text()
+
+
+def findings(change=None):
+    data = yaml.safe_load(SKILL)
+    if change:
+        change(data)
+    return validate(parse_skill(yaml.safe_dump(data, sort_keys=False)))
+
+
+def errors(change):
+    return [finding.message for finding in findings(change) if finding.is_error]
+
+
+@pytest.mark.parametrize("name", ["pouring", "pouring_aimed", "grid_clamp", "end_effector_velocity"])
+def test_our_own_skills_have_no_errors(name):
+    assert [f.message for f in validate(load_skill(name)) if f.is_error] == []
+
+
+def test_a_sound_skill_is_left_alone():
+    assert findings() == []
+
+
+def test_finds_a_state_that_nothing_leads_to():
+    def change(data):
+        data["states"]["lost"] = dict(data["states"]["near"])
+
+    (message,) = errors(change)
+    assert "lost" in message
+
+
+def test_finds_a_transition_that_the_constraints_never_allow():
+    def change(data):
+        data["states"]["far"]["transitions"][0]["below_m"] = 0.05  # the cylinder keeps it at 0.06
+
+    assert any("never fires" in message and "constraints" in message for message in errors(change))
+
+
+def test_finds_a_transition_that_no_input_leads_to():
+    def change(data):
+        data["states"]["near"]["input_mapping"] = [{"kind": "translation", "inputs": [0, 1, 2], "speed_m_per_s": 0.1}]
+        data["inputs"] = 3
+        data["states"]["near"]["active_constraints"] = [
+            {"kind": "tilt_limits", "frame": "cup", "min_deg": -20, "max_deg": 80}
+        ]
+
+    assert any("near: the end never fires" in message for message in errors(change))
+
+
+def test_finds_constraints_that_contradict_each_other():
+    def change(data):
+        data["states"]["far"]["active_constraints"] += [
+            {"kind": "keep_above", "frame": "cup", "height_m": 0.2},
+            {"kind": "half_space", "frame": "cup", "normal": [0, 0, -1], "offset_m": -0.1},
+        ]
+
+    assert any("contradicts" in message and "KeepAbove" in message for message in errors(change))
+
+
+def test_finds_a_wrong_order():
+    def change(data):
+        # An orientation that depends on the position, before the position is final.
+        data["states"]["far"]["active_constraints"].insert(
+            0, {"kind": "tilt_by_distance", "frame": "cup", "distance_m": [0.1, 0.5], "tilt_deg": [60, 0]}
+        )
+
+    assert any("undone by a constraint after it" in message for message in errors(change))
+
+
+def test_warns_of_inputs_that_move_nothing_and_frames_that_are_never_used():
+    def change(data):
+        data["inputs"] = 4
+        data["frames"].append("saucer")
+
+    messages = [finding.message for finding in findings(change)]
+    assert any("input 2" in message for message in messages)
+    assert any("saucer" in message for message in messages)
+
+
+@pytest.mark.parametrize("name", ['a "b" \\', "$x", "$\\frac{1", "ψ"])
+def test_draws_whatever_a_state_is_called(tmp_path, name):
+    def change(data):
+        data["states"][name] = data["states"].pop("near")
+        data["states"]["far"]["transitions"][0]["to"] = name
+
+    data = yaml.safe_load(SKILL)
+    change(data)
+    skill = parse_skill(yaml.safe_dump(data, sort_keys=False))
+    draw(skill, tmp_path / "a.png")
+    # Quotes and backslashes inside a quoted word are escaped: what is left pairs up.
+    for line in to_dot(skill).splitlines():
+        assert line.replace("\\\\", "").replace('\\"', "").count('"') % 2 == 0
+
+
+def test_draws_every_state_and_every_way(tmp_path):
+    skill = load_skill("pouring")
+    dot = to_dot(skill)
+    assert all(f'"{state.name}"' in dot for state in skill.states)
+    assert dot.count("->") == 3  # forward twice, and back from tilt
+    for suffix in (".dot", ".png"):
+        draw(skill, tmp_path / f"pouring{suffix}")
+        assert (tmp_path / f"pouring{suffix}").stat().st_size > 100
+
+
+def test_warns_of_a_transition_into_tighter_constraints():
+    def change(data):
+        data["states"]["near"]["active_constraints"].insert(
+            0, {"kind": "cylinder", "frame": "cup", "max_radius_m": 0.01}
+        )
+
+    assert any("waits in" in finding.message and not finding.is_error for finding in findings(change))

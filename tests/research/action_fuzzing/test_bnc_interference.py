@@ -1,0 +1,59 @@
+import numpy as np
+import pytest
+from pydrake.math import RotationMatrix
+
+from guiderail.models.objects.bnc_connector.geometry import BncDimensions
+from research.action_fuzzing.bnc_connector import interference, slot_path
+
+MM = 1e-3
+D = BncDimensions()
+
+
+def depth(lug_angle, lug_depth, x=0.0, y=0.0):
+    """Interference [mm] of an upright plug with the lug `lug_angle` degrees along its slot, `lug_depth` mm deep."""
+    R_JP = RotationMatrix.MakeZRotation(-np.deg2rad(lug_angle)).matrix()
+    return max(interference(D, R_JP, np.array([x * MM, y * MM, D.lug_height - lug_depth * MM]))) / MM
+
+
+def test_nothing_is_in_the_way_of_the_lugs_own_path():
+    for arc, lug_depth in slot_path(D):
+        for turned in (0.0, 180.0):  # the two lugs are alike
+            angle = np.rad2deg(arc / D.slot_radius) + turned
+            assert depth(angle, max(lug_depth / MM, -5.0)) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("lug_angle", [30.0, 60.0, 120.0, 150.0])
+def test_the_mouths_face_stops_the_lugs_elsewhere(lug_angle):
+    radius = D.lug_radius / MM
+    assert depth(lug_angle, -radius - 0.01) == 0.0
+    assert depth(lug_angle, -radius + 0.4) == pytest.approx(0.4)
+
+
+def test_the_slots_walls_stop_the_lugs():
+    clearance = D.slot_clearance / MM
+    # Deeper than the entry's bottom, short of the ramp, past the detent, and turned while in the straight entry.
+    assert depth(0.0, 4.4) == pytest.approx(1.0 - clearance, abs=0.1)
+    assert depth(45.0, 3.0) > 0.8
+    assert depth(100.0, 5.0) == pytest.approx(np.deg2rad(10.0) * D.slot_radius / MM - clearance, abs=1e-6)
+    assert depth(20.0, 1.5) > 1.0
+
+
+def test_lugs_and_barrel_are_told_apart():
+    upright = np.eye(3)
+    lugs, barrel = interference(D, upright, np.array([0.0, 0.0, D.lug_height - 4.4 * MM]))
+    assert lugs > 0.8 * MM
+    assert barrel == 0.0
+    lugs, barrel = interference(D, upright, np.array([3.0 * MM, 0.0, D.barrel_height - 0.2 * MM]))
+    assert lugs == 0.0
+    assert barrel == pytest.approx(0.2 * MM)
+
+
+def test_the_bore_stops_the_barrel():
+    deep = 3.0
+    assert depth(0.0, deep, x=0.09) == 0.0
+    assert depth(0.0, deep, x=1.1) == pytest.approx(1.0)
+    # On the rim the plug may be anywhere, and beside the jack too.
+    on_rim = (D.lug_height - D.barrel_height) / MM
+    assert depth(0.0, on_rim, x=3.0) == 0.0
+    assert depth(0.0, on_rim + 0.2, x=3.0) == pytest.approx(0.2)
+    assert depth(0.0, on_rim + 5.0, x=12.0) == 0.0

@@ -1,0 +1,23 @@
+from research.benchmarks import saving
+from research.benchmarks.saving import saving_share, timed
+
+
+def test_only_what_saving_took_is_counted(monkeypatch, bead_config):
+    monkeypatch.setattr(saving, "configure", lambda *_, **__: bead_config)
+    monkeypatch.setattr(saving, "with_defaults", lambda task, given: given)
+    found = saving_share("Bead", bead_config.episodes)
+    assert 1 <= found["checkpoints"] <= bead_config.episodes
+    assert 0 < found["ledger_share"] < 1
+    assert 0 < found["ledger_ms_per_episode"] < 1e3 * found["seconds"]
+
+
+def test_a_timed_function_is_put_back():
+    class Owner:
+        def method(self):
+            return 3
+
+    before = Owner.method
+    with timed(Owner, "method") as spent:
+        assert Owner().method() == 3
+    assert len(spent) == 1
+    assert Owner.method is before

@@ -1,0 +1,39 @@
+import numpy as np
+import pytest
+
+from guiderail.diagrams.envs.recording import DrivenStation, along
+from guiderail.diagrams.stations.pouring import PouringStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.systems.wrench_sensor import WrenchSensor
+from research.benchmarks import simulation as bench_simulation
+from research.benchmarks.simulation import CALLBACKS, real_time_factor, scripted_motion, timed_callbacks
+
+
+def test_systems_are_left_as_they_were():
+    before = [getattr(system, name) for system, name in CALLBACKS]
+    with timed_callbacks():
+        assert WrenchSensor._sample is not before[0]
+    assert [getattr(system, name) for system, name in CALLBACKS] == before
+
+
+@pytest.mark.parametrize(
+    ("name", "contact"), [("rails", "CONTACT"), ("grid_clamp", "CLAMP_CONTACT"), ("pouring", "POUR_CONTACT")]
+)
+def test_pythons_share_is_a_part_of_the_whole(monkeypatch, name, contact):
+    monkeypatch.setattr("research.benchmarks.simulation.REPEATS", 1)
+    first, _ = getattr(bench_simulation, contact)
+    monkeypatch.setattr(f"research.benchmarks.simulation.{contact}", (first, first + 0.8))
+    result = real_time_factor(name)
+    assert result["real_time_factor"] > 0.0
+    assert 0.0 < result["python_share"] < 1.0
+
+
+def test_the_pour_that_is_timed_empties_the_thermos():
+    config, times, poses, _ = scripted_motion("Pouring")
+    station = PouringStation(config)
+    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    driven.start(poses[0])
+    driven.run()
+    balls = station.GetOutputPort("balls_in_mug").Eval(station.GetMyContextFromRoot(driven.context)).reshape(-1, 6)
+    assert (balls[:, 2] < 0.0).all()
+    assert (np.hypot(balls[:, 0], balls[:, 1]) < config.mug.inner_diameter / 2).all()

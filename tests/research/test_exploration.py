@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, white
+
+STEPS, SIZE = 400, 2
+MADE = {
+    "white": (white, {}),
+    "repeat": (white, {"hold": 7}),
+    "pink": (pink, {}),
+    "ou": (ornstein_uhlenbeck, {}),
+    "low_pass": (low_pass, {"cutoff": 1.0}),
+}
+
+
+def sequence(name, seed=0):
+    make, arguments = MADE[name]
+    act = open_loop(make, np.random.default_rng(seed), STEPS, SIZE, **arguments)
+    return np.array([act(np.zeros(3)) for _ in range(STEPS)])
+
+
+def roughness(actions):
+    return np.sqrt(np.mean(np.diff(actions, 3, axis=0) ** 2))
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_all_have_the_same_rms_and_the_same_limits(name):
+    actions = sequence(name)
+    np.testing.assert_allclose(np.sqrt(np.mean(actions**2, axis=0)), RMS, rtol=1e-3)
+    assert np.abs(actions).max() <= 1.0
+    np.testing.assert_array_equal(actions, sequence(name))
+    assert not np.array_equal(actions, sequence(name, seed=1))
+
+
+def test_an_action_is_repeated_as_often_as_said():
+    actions = sequence("repeat")
+    changes = np.flatnonzero(np.abs(np.diff(actions, axis=0)).sum(axis=1)) + 1
+    np.testing.assert_array_equal(changes, np.arange(7, STEPS, 7))
+
+
+def test_they_differ_in_how_rough_they_are():
+    assert roughness(sequence("low_pass")) < 0.05 * roughness(sequence("white"))
+    assert roughness(sequence("pink")) < roughness(sequence("white"))
+    assert roughness(sequence("ou")) < roughness(sequence("white"))
+
+
+def test_pink_noise_has_the_same_power_in_every_octave():
+    rng = np.random.default_rng(0)
+    power = np.mean([np.abs(np.fft.rfft(pink(rng, 1024, 1)[:, 0])) ** 2 for _ in range(200)], axis=0)
+    octaves = [power[n : 2 * n].sum() for n in (8, 16, 32, 64, 128)]
+    assert max(octaves) < 1.2 * min(octaves)
+
+
+def test_state_dependent_noise_depends_on_the_state_and_is_chosen_anew():
+    act = state_dependent(np.random.default_rng(0), STEPS, SIZE, interval=3)
+    states = [np.ones(5), np.ones(5), 2.0 * np.ones(5) - np.arange(5), np.ones(5)]
+    first, again, elsewhere, anew = (act(state) for state in states)
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(first, elsewhere)
+    assert not np.allclose(first, anew)
+
+
+def test_nothing_to_make_is_refused():
+    with pytest.raises(InputError):
+        open_loop(white, np.random.default_rng(0), 0, 2)

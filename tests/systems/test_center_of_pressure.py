@@ -1,0 +1,30 @@
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.systems.center_of_pressure import ContactLever
+
+
+def lever(wrench, least_force=0.5):
+    system = ContactLever(least_force)
+    context = system.CreateDefaultContext()
+    system.get_wrench_input_port().FixValue(context, wrench)
+    return system.get_lever_output_port().Eval(context)
+
+
+@pytest.mark.parametrize("force", [0.5, 2.0, 30.0])
+def test_leads_from_the_tool_centre_to_where_a_force_acts_however_large_it_is(force):
+    point = np.array([0.003, -0.004, 0.0])
+    pushed = np.array([0.0, 0.0, force])
+    np.testing.assert_allclose(lever([*pushed, *np.cross(point, pushed)]), point[:2])
+
+
+@pytest.mark.parametrize("force", [0.49, 0.0, -5.0])
+def test_is_zero_where_next_to_nothing_pushes(force):
+    np.testing.assert_array_equal(lever([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
+
+
+@pytest.mark.parametrize("least_force", [0.0, -1.0, np.nan])
+def test_refuses_what_is_no_least_force(least_force):
+    with pytest.raises(InputError):
+        ContactLever(least_force)

@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource
+
+from guiderail.models.common.errors import InputError
+from guiderail.systems.function_guidance_system import GuidanceLaw
+
+PERIOD = 0.25
+
+
+def running(law, action=(0.5,), pose=(1.0, 2.0), wrench=(3.0,)):
+    """The system in a simulation, its constants, and a function that sets one of them."""
+    builder = DiagramBuilder()
+    system = builder.AddSystem(GuidanceLaw(law, len(action), len(pose), len(wrench), PERIOD))
+    sources = {}
+    for name, value in (("action", action), ("pose", pose), ("wrench", wrench)):
+        sources[name] = builder.AddSystem(ConstantVectorSource(value))
+        builder.Connect(sources[name].get_output_port(), system.GetInputPort(name))
+    simulator = Simulator(builder.Build())
+    simulator.Initialize()
+    context = simulator.get_mutable_context()
+
+    def give(name, value):
+        sources[name].get_mutable_source_value(sources[name].GetMyMutableContextFromRoot(context)).set_value(value)
+
+    def out(name):
+        return system.GetOutputPort(name).Eval(system.GetMyContextFromRoot(context)).tolist()
+
+    return simulator, give, out
+
+
+def test_commands_what_the_law_says_once_a_period():
+    simulator, give, out = running(lambda action, pose, wrench: pose + action * wrench)
+    assert out("desired_pose") == [2.5, 3.5]
+    assert (out("held_action"), out("fallback")) == ([0.5], [0.0])
+    simulator.AdvanceTo(PERIOD / 4)
+    give("action", [1.0])
+    simulator.AdvanceTo(PERIOD / 2)
+    assert out("desired_pose") == [2.5, 3.5]
+    simulator.AdvanceTo(1.5 * PERIOD)
+    assert out("desired_pose") == [4.0, 5.0]
+    assert out("held_action") == [1.0]
+
+
+@pytest.mark.parametrize(
+    "nothing", [[np.nan, 0.0], [np.inf, 0.0], [1.0], [[1.0, 2.0]], None, "far", np.array([1j, 0.0]), [[], 1.0]]
+)
+def test_what_cannot_be_commanded_leaves_the_last_command(nothing):
+    simulator, give, out = running(lambda action, pose, wrench: pose + 1 if action[0] > 0 else nothing)
+    assert out("desired_pose") == [2.0, 3.0]
+    give("action", [-1.0])
+    give("pose", [7.0, 7.0])
+    simulator.AdvanceTo(1.5 * PERIOD)
+    assert (out("desired_pose"), out("fallback")) == ([2.0, 3.0], [1.0])
+    give("action", [1.0])
+    simulator.AdvanceTo(2.5 * PERIOD)
+    assert (out("desired_pose"), out("fallback")) == ([8.0, 8.0], [0.0])
+
+
+def test_before_there_was_a_command_the_measured_pose_is_commanded():
+    _, _, out = running(lambda action, pose, wrench: None)
+    assert (out("desired_pose"), out("fallback")) == ([1.0, 2.0], [1.0])
+
+
+def test_the_law_cannot_change_what_others_read():
+    def law(action, pose, wrench):
+        action[:], pose[:], wrench[:] = 9.0, 9.0, 9.0
+        return pose
+
+    _, _, out = running(law)
+    assert out("held_action") == [0.5]
+
+
+def test_nothing_feeds_through():
+    assert not GuidanceLaw(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD).HasAnyDirectFeedthrough()
+
+
+@pytest.mark.parametrize("sizes", [(0, 1, 1), (1, 0, 1), (1, 1, 0)])
+def test_refuses_what_makes_no_sense(sizes):
+    with pytest.raises(InputError, match="sizes of at least 1"):
+        GuidanceLaw(lambda action, pose, wrench: pose, *sizes, PERIOD)
+    with pytest.raises(InputError, match="period"):
+        GuidanceLaw(lambda action, pose, wrench: pose, 1, 1, 1, 0.0)

@@ -1,0 +1,111 @@
+"""The system by itself; `tests/diagrams/stations/test_mujoco_rails.py` has the physics."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+pytest.importorskip("mujoco")
+
+from guiderail.diagrams.stations.mujoco import MujocoStation
+from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.units import MM
+from guiderail.systems import MovedBodies, MujocoRails
+
+FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # high above the jack
+
+
+@pytest.fixture(scope="module")
+def station():
+    return MujocoStation(BncWorkcell())
+
+
+def advanced(station, desired, steps):
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    station.set_pose(context, FREE)
+    station.get_desired_pose_input_port().FixValue(context, desired)
+    simulator.Initialize()
+    simulator.AdvanceTo(steps * PLANT_PERIOD)
+    return context
+
+
+def test_in_the_air_it_goes_where_it_is_told_without_a_force(station):
+    desired = FREE + [0.01, -0.005, 0.01, 0.2, 0.05, -0.05]
+    context = advanced(station, desired, 60)
+    np.testing.assert_allclose(station.get_pose_output_port().Eval(context), desired, atol=1e-5)
+    np.testing.assert_allclose(station.get_wrench_output_port().Eval(context), 0.0, atol=1e-9)
+
+
+def test_it_pushes_as_far_as_its_limits(station):
+    context = advanced(station, FREE + [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 1)
+    pushed = station.rails.get_impedance_wrench_output_port().Eval(station.rails.GetMyContextFromRoot(context))
+    assert pushed[0] == pytest.approx(Impedance().limits[0])
+
+
+def test_the_state_is_all_there_is(station):
+    """Time, state and parameters copied into another context go on to the same bits."""
+    context = advanced(station, FREE - [0.0, 0.0, 0.04, 0.0, 0.0, 0.0], 20)
+    copy = station.CreateDefaultContext()
+    station.get_desired_pose_input_port().FixValue(copy, FREE)
+    station.get_desired_pose_input_port().FixValue(context, FREE)
+    copy.SetTimeStateAndParametersFrom(context)
+    advanced(station, FREE, 5)  # another one between
+    poses = []
+    for one in (context, copy):
+        simulator = Simulator(station, one)
+        simulator.reset_context(one)
+        simulator.AdvanceTo(one.get_time() + 10 * PLANT_PERIOD)
+        poses.append(station.get_pose_output_port().Eval(one))
+    np.testing.assert_array_equal(*poses)
+
+
+def pressed(workcell, modulus):
+    """How deep a clamp beside its holes sinks into the table [m] under 19.5 N."""
+    station = MujocoStation(workcell)
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    top = np.array([2.0 * MM, 1.5 * MM, 12.0 * MM, 0.0, 0.0, 0.0])
+    below = top - [0.0, 0.0, 19.5 / Impedance().stiffness[2], 0.0, 0.0, 0.0]
+    station.set_pose(context, top)
+    station.set_contact(context, 1.0, modulus)
+    station.get_desired_pose_input_port().FixValue(context, below)
+    simulator.Initialize()
+    simulator.AdvanceTo(1.0)
+    assert station.get_wrench_output_port().Eval(context)[2] == pytest.approx(19.5, abs=0.01)
+    return top[2] - station.get_pose_output_port().Eval(context)[2]
+
+
+def test_the_contact_itself_is_as_many_times_stiffer_as_it_is_told():
+    workcell = GridClampWorkcell()
+    nominal = pressed(workcell, 1.0)
+    for modulus in (0.1, 3.0, 10.0, 30.0):
+        assert pressed(workcell, modulus) * modulus == pytest.approx(nominal, rel=1e-2)
+
+
+def test_what_is_no_stiffer_is_stepped_as_the_model_says(station):
+    """And what is stiffer leaves nothing behind in the model."""
+    model = station.rails.model
+    names = ("jnt_stiffness", "dof_damping", "geom_solref", "geom_friction")
+    before = {name: getattr(model, name).copy() for name in names} | {"timestep": model.opt.timestep}
+    for factors in ((0.5, 7.0), (1.0, 1.0)):
+        simulator = Simulator(station)
+        context = simulator.get_mutable_context()
+        station.set_pose(context, FREE)
+        station.set_contact(context, *factors)
+        station.get_desired_pose_input_port().FixValue(context, FREE)
+        simulator.Initialize()
+        simulator.AdvanceTo(PLANT_PERIOD)
+    after = {name: getattr(model, name) for name in names} | {"timestep": model.opt.timestep}
+    for name, value in before.items():
+        np.testing.assert_array_equal(after[name], value)
+
+
+@pytest.mark.parametrize(("period", "constant"), [(PLANT_PERIOD * 1.0001, 0.0), (PLANT_PERIOD, -1.0), (0.0, 0.0)])
+def test_what_makes_no_sense_is_refused(station, period, constant):
+    plant = station.plant
+    moved = MovedBodies(*(plant.GetBodyByName(name) for name in ("jack", "tool_centre", "plug")))
+    with pytest.raises(InputError):
+        MujocoRails(station.rails.model, plant, moved, BncWorkcell().X_WT, period, constant)

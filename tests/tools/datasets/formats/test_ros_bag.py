@@ -1,0 +1,108 @@
+"""What a message says by names is read by its names; what no motion can be made of is refused in a sentence."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.datasets.formats.ros_bag import read_bags, write_mcap
+
+pytest.importorskip("rosbags")
+JOINTS = "sensor_msgs/msg/JointState"
+POSE = "geometry_msgs/msg/Pose"
+ARRAY = "std_msgs/msg/Float64MultiArray"
+
+
+def write(path, kind, make, given):
+    """A bag of a message for each of what is given, of which `make` makes it with the types by their short names."""
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = {name.split("/")[-1]: one for name, one in store.types.items()}
+    with Writer(path, version=8) as writer:
+        connection = writer.add_connection("/it", kind, typestore=store)
+        for n, one in enumerate(given):
+            writer.write(connection, 10_000_000 * n, store.serialize_cdr(make(types, one), kind))
+    return path
+
+
+def joints(types, values):
+    names, positions = values
+    header = types["Header"](stamp=types["Time"](sec=0, nanosec=0), frame_id="")
+    none = np.array([])
+    return types["JointState"](
+        header=header, name=list(names), position=np.array(positions, dtype=float), velocity=none, effort=none
+    )
+
+
+def pose(types, w):
+    return types["Pose"](
+        position=types["Point"](x=0.0, y=0.0, z=0.0), orientation=types["Quaternion"](x=0.0, y=0.0, z=0.0, w=w)
+    )
+
+
+def array(types, values):
+    layout = types["MultiArrayLayout"](dim=[], data_offset=0)
+    return types["Float64MultiArray"](layout=layout, data=np.array(values, dtype=float))
+
+
+def test_every_message_has_its_own_order_of_joints(tmp_path):
+    orders = [("abc", (1, 2, 3)), ("cab", (3, 1, 2)), ("bca", (2, 3, 1)), ("abc", (1, 2, 3))]
+    found = read_bags(write(tmp_path / "bag", JOINTS, joints, orders), None, None)
+    assert found.names == ("a [rad]", "b [rad]", "c [rad]")
+    np.testing.assert_array_equal(found.outputs[0], [[1, 2, 3]] * 4)
+
+
+def test_every_bag_has_its_own_order_of_joints(tmp_path):
+    for name, order in (("0", ("abc", (1, 2, 3))), ("1", ("cab", (3, 1, 2)))):
+        write(tmp_path / name, JOINTS, joints, [order] * 2)
+    found = read_bags(tmp_path, None, None)
+    assert found.names == ("a [rad]", "b [rad]", "c [rad]")
+    np.testing.assert_array_equal(found.outputs, [[[1, 2, 3]] * 2] * 2)
+
+
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        (("g", (5,)), "message 1 on /it of .* is of g, and the first of a, b: record each device"),
+        (("ag", (1, 5)), "is of a, g, and the first of a, b"),
+        (("ab", ()), "has 0 positions of 2 joints"),
+    ],
+)
+def test_messages_of_other_joints_are_refused(other, words, tmp_path):
+    bag = write(tmp_path / "bag", JOINTS, joints, [("ab", (1, 2)), other, ("ab", (1, 2))])
+    with pytest.raises(InputError, match=words):
+        read_bags(bag, None, None)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, np.nan])
+def test_a_quaternion_that_is_no_rotation_is_refused(wrong, tmp_path):
+    bag = write(tmp_path / "bag", POSE, pose, [1.0, wrong, 1.0])
+    with pytest.raises(InputError, match=r"at sample 1, .*cut such samples out \(1 of 3\)"):
+        read_bags(bag, None, None)
+
+
+def test_arrays_of_other_sizes_are_refused(tmp_path):
+    bag = write(tmp_path / "bag", ARRAY, array, [range(6), range(5)])
+    with pytest.raises(InputError, match=r"message 1 on /it .* has 5 numbers, and not 6"):
+        read_bags(bag, None, None)
+
+
+def test_time_before_zero_is_counted_from_the_start_and_said(tmp_path):
+    t = 0.1 * np.arange(5)
+    notes = write_mcap(tmp_path / "bags", Demonstrations([t - 0.2, t + 0.3], [t[:, None]] * 2))
+    assert "first sample, where it was -0.2 to 0.3" in notes[-1]
+    back = read_bags(tmp_path / "bags", None, None)
+    np.testing.assert_allclose(back.times, [t, t], atol=1e-9)
+    np.testing.assert_array_equal(back.outputs, [t[:, None]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [([0.0, 1e10], "ends at 1e\\+10 s"), ([0.0, 1e-12], "less than a nanosecond apart")],
+)
+def test_time_that_a_bag_cannot_count_is_refused_and_leaves_nothing(times, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        write_mcap(tmp_path / "bags", Demonstrations([np.array(times)], [np.ones((2, 1))]))
+    assert list(tmp_path.iterdir()) == []

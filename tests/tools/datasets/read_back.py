@@ -1,0 +1,105 @@
+"""Demonstrations that this package wrote, read by the formats' own libraries: LeRobot's, and MCAP's for ROS 2.
+
+`python tests/tools/recording/read_back.py --environment FOLDER [--interpreter python3.12]` makes an environment there
+with both libraries, which can't be installed beside this package (5 GB, and minutes), or uses the one that it finds. It
+ends with 1 where a number that comes back differs by more than its format rounds.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+LIBRARIES = ("lerobot[dataset]", "mcap", "mcap-ros2-support")
+ROUNDING = {"lerobot": 2.0**-24, "mcap": 0.0}  # of a number: 32 bits, or all of it
+NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
+
+
+def read_lerobot(folder: Path) -> list[list[list[float]]]:
+    """The rows of each episode."""
+    from lerobot.datasets import LeRobotDataset
+
+    dataset = LeRobotDataset("guiderail/shown", root=folder)
+    rows: dict[int, list[list[float]]] = {}
+    for number in range(dataset.num_frames):
+        frame = dataset[number]
+        rows.setdefault(int(frame["episode_index"]), []).append(frame["action"].tolist())
+    return [rows[episode] for episode in sorted(rows)]
+
+
+def read_mcap(folder: Path) -> list[list[list[float]]]:
+    """The rows of each bag."""
+    from mcap_ros2.reader import read_ros2_messages
+
+    return [
+        [list(message.ros_msg.data) for message in read_ros2_messages(str(file))]
+        for file in sorted(folder.rglob("*.mcap"))
+    ]
+
+
+READERS = {"lerobot": read_lerobot, "mcap": read_mcap}
+
+
+def environment(folder: Path, interpreter: str) -> Path:
+    """The interpreter of an environment that has the libraries."""
+    python = folder / "bin" / "python"
+    if not python.exists():
+        subprocess.run([interpreter, "-m", "venv", folder], check=True)
+        subprocess.run([python, "-m", "pip", "install", "-q", *LIBRARIES], check=True)
+    return python
+
+
+def differences(python: Path) -> dict[str, float]:
+    """By how much what comes back differs from what was written at most, by format, as a share of the number."""
+    from guiderail.models.primitives import Demonstrations
+    from guiderail.tools.datasets.convert import export_demonstrations
+
+    rng = np.random.default_rng(0)
+    times = [0.02 * np.arange(40 + number) for number in range(3)]
+    outputs = [0.2 * np.cumsum(rng.standard_normal((len(t), 6)), axis=0) / len(t) for t in times]
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder, "shown.npz")
+        Demonstrations(times, outputs, NAMES).save(file)
+        for kind in READERS:
+            export_demonstrations(file, Path(folder, kind), kind)
+            offline = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": folder}
+            asked = [python, __file__, "--read", kind, "--folder", Path(folder, kind)]
+            said = subprocess.run(asked, env=offline, stdout=subprocess.PIPE, text=True, check=True).stdout
+            back = json.loads(said.splitlines()[-1])
+            if [len(rows) for rows in back] != [len(rows) for rows in outputs]:
+                raise SystemExit(f"{kind}: other demonstrations, or of other lengths, came back")
+            found[kind] = max(
+                float(np.max(np.abs(np.array(one) - other) / np.abs(other)))
+                for one, other in zip(back, outputs, strict=True)
+            )
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--environment", type=Path, help="folder of the libraries' own environment")
+    parser.add_argument("--interpreter", default=sys.executable, help="that makes it")
+    parser.add_argument("--read", choices=READERS, help="prints what a folder holds: called in that environment")
+    parser.add_argument("--folder", type=Path)
+    given = parser.parse_args()
+    if given.read:
+        print(json.dumps(READERS[given.read](given.folder)))
+        return 0
+    if given.environment is None:
+        parser.error("name a folder for the libraries' environment with --environment")
+    found = differences(environment(given.environment, given.interpreter))
+    for kind, difference in found.items():
+        print(
+            f"{kind}: read by its own library, {difference:.1e} of a number apart at most (rounds {ROUNDING[kind]:.1e})"
+        )
+    return int(any(difference > ROUNDING[kind] for kind, difference in found.items()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

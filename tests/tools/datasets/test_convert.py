@@ -1,0 +1,286 @@
+"""What others recorded comes in and goes out with its numbers; what a file doesn't say is asked for."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.datasets.bounds import constraints
+from guiderail.tools.datasets.convert import export_demonstrations, import_recording
+
+NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
+
+
+def shown(count=3, steps=40, period=0.02):
+    rng = np.random.default_rng(0)
+    times = [period * np.arange(steps + m) for m in range(count)]
+    outputs = [0.2 * np.cumsum(rng.standard_normal((len(t), 6)), axis=0) / len(t) for t in times]
+    return Demonstrations(times, outputs, NAMES)
+
+
+@pytest.fixture
+def file(tmp_path):
+    shown().save(tmp_path / "shown.npz")
+    return tmp_path / "shown.npz"
+
+
+@pytest.mark.parametrize(("kind", "tolerance", "library"), [("lerobot", 1e-6, "pyarrow"), ("mcap", 1e-15, "rosbags")])
+def test_a_round_trip_is_equal_to_rounding(kind, tolerance, library, file, tmp_path):
+    pytest.importorskip(library)
+    export_demonstrations(file, tmp_path / kind, kind)
+    signal = "action" if kind == "lerobot" else None
+    found = import_recording(tmp_path / kind, tmp_path / "back.npz", signal=signal)
+    back, there = Demonstrations.load(tmp_path / "back.npz"), shown()
+    assert found["demonstrations"] == 3
+    assert back.names == there.names
+    for one, other in zip((*back.outputs, *back.times), (*there.outputs, *there.times), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=max(tolerance, 1e-9 if one.ndim == 1 else 0))
+
+
+def test_a_dataset_is_laid_out_as_version_3_says(file, tmp_path):
+    import pyarrow.parquet as parquet
+
+    export_demonstrations(file, tmp_path / "set", "lerobot")
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["total_episodes"], info["total_frames"]) == ("v3.0", 50, 3, 123)
+    table = parquet.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    assert set(table.column_names) == set(info["features"])
+    episodes = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pydict()
+    assert episodes["dataset_from_index"] == [0, 40, 81]
+    assert episodes["dataset_to_index"] == [40, 81, 123]
+    tasks = parquet.read_table(tmp_path / "set/meta/tasks.parquet").to_pandas()
+    assert list(tasks["task_index"]) == [0]
+
+
+def test_a_dataset_that_has_a_command_and_a_measurement_gives_the_command(file, tmp_path):
+    export_demonstrations(file, tmp_path / "set", "lerobot")
+    found = import_recording(tmp_path / "set", tmp_path / "back.csv")
+    assert "action is what was commanded" in found["assumed"]
+
+
+def test_several_rates_need_one(tmp_path):
+    t = np.array([0.0, 0.1, 0.3])
+    Demonstrations(t, [np.ones((3, 1))]).save(tmp_path / "uneven.npz")
+    with pytest.raises(InputError, match="--rate"):
+        export_demonstrations(tmp_path / "uneven.npz", tmp_path / "set", "lerobot")
+    export_demonstrations(tmp_path / "uneven.npz", tmp_path / "set", "lerobot", rate=10)
+
+
+LAYOUTS = {
+    "/franka_robot_state_broadcaster/current_pose": "fr3_link0",  # franka_ros2
+    "/iiwa/command/CartesianPose": "iiwa_link_0",  # iiwa_stack
+}
+
+
+def write_bag(path, topics, kind="geometry_msgs/msg/PoseStamped", stamped=True, beside=None):
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = {name.split("/")[-1]: one for name, one in store.types.items()}
+    with Writer(path, version=8) as writer:
+        for topic, frame in topics.items():
+            connection = writer.add_connection(topic, kind, typestore=store)
+            if beside is not None:
+                writer.add_connection(topic, beside, typestore=store)
+            for n in range(5):
+                stamp = types["Time"](sec=10 if stamped else 0, nanosec=10_000_000 * n if stamped else 0)
+                x, y, z, w = Rotation.from_euler("z", 10.0 * n, degrees=True).as_quat()
+                pose = types["Pose"](
+                    position=types["Point"](x=0.5 + 0.01 * n, y=0.1, z=0.3),
+                    orientation=types["Quaternion"](x=x, y=y, z=z, w=w),
+                )
+                message = types["PoseStamped"](header=types["Header"](stamp=stamp, frame_id=frame), pose=pose)
+                writer.write(connection, 20_000_000_000 + 11_000_000 * n, store.serialize_cdr(message, kind))
+
+
+@pytest.mark.parametrize(("topic", "frame"), LAYOUTS.items())
+def test_a_bag_of_an_arm(topic, frame, tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {topic: frame})
+    found = import_recording(tmp_path / "bag", tmp_path / "kept.npz")
+    assert frame in found["assumed"]
+    kept = Demonstrations.load(tmp_path / "kept.npz")
+    np.testing.assert_allclose(kept.times[0], 0.01 * np.arange(5), atol=1e-9)
+    np.testing.assert_allclose(kept.outputs[0][3], [0.53, 0.1, 0.3, np.deg2rad(30), 0, 0], atol=1e-12)
+
+    import_recording(tmp_path / "bag", tmp_path / "in_target.npz", target=(0.5, 0.1, 0.2, 0, 0, 90))
+    moved = Demonstrations.load(tmp_path / "in_target.npz").outputs[0]
+    np.testing.assert_allclose(moved[2], [0, -0.02, 0.1, np.deg2rad(-70), 0, 0], atol=1e-12)
+
+
+def test_a_bag_with_two_measured_poses_is_asked_about(tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {"/a/pose": "base", "/b/pose": "base"})
+    with pytest.raises(InputError, match=r"/a/pose, /b/pose, and does not say which.*--signal"):
+        import_recording(tmp_path / "bag", tmp_path / "x.npz")
+    assert import_recording(tmp_path / "bag", tmp_path / "x.npz", signal="/b/pose")["samples"] == [5]
+
+
+def test_without_stamps_time_is_the_recorders(tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {"/a/pose": "base"}, stamped=False)
+    assert "when the recorder got" in import_recording(tmp_path / "bag", tmp_path / "x.npz")["assumed"]
+    np.testing.assert_allclose(Demonstrations.load(tmp_path / "x.npz").times[0], 0.011 * np.arange(5), atol=1e-9)
+
+
+def write_table(path, header, rows):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+
+
+def test_named_columns_say_all_that_matters(tmp_path):
+    rows = [(n * 10, 1 + n, 2, 3, 0, 0, np.sin(0.1 * n), np.cos(0.1 * n)) for n in range(4)]
+    write_table(tmp_path / "a.csv", "time_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw", rows)
+    import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+    back = Demonstrations.load(tmp_path / "a.npz")
+    np.testing.assert_allclose(back.times[0], 0.01 * np.arange(4))
+    np.testing.assert_allclose(back.outputs[0][3], [0.004, 0.002, 0.003, 0.6, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "asks", "remedy"),
+    [
+        ("t,x,y,z", (0.01, 1, 2, 3), "unit of x, y and z", {"unit": "mm"}),
+        ("timestamp,x_m,y_m,z_m", (8, 1, 2, 3), "unit of timestamp", {"time_unit": "ms"}),
+        ("t,x_m,y_m,z_m,q1,q2,q3,q4", (0.01, 1, 2, 3, 1, 0, 0, 0), "which is its scalar", {"quaternion": "wxyz"}),
+        ("t,x_m,y_m,z_m,roll,pitch,yaw", (0.01, 1, 2, 3, 0, 0, 1), "is in degrees", {"angles": "deg"}),
+    ],
+)
+def test_what_a_table_does_not_say_is_asked_for(header, row, asks, remedy, tmp_path):
+    rows = [(n * row[0], row[1] + n, *row[2:]) for n in range(4)]
+    write_table(tmp_path / "a.csv", header, rows)
+    with pytest.raises(InputError, match=asks):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+    import_recording(tmp_path / "a.csv", tmp_path / "a.npz", **remedy)
+    angle = {"angles": np.deg2rad(1)}.get(next(iter(remedy)), 0.0)
+    outputs = Demonstrations.load(tmp_path / "a.npz").outputs[0]
+    if outputs.shape[1] == 6:
+        assert outputs[0, 3] == pytest.approx(angle)
+
+
+def test_a_quaternion_that_is_none_is_refused(tmp_path):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m,qx,qy,qz,qw", [(0.01 * n, 0, 0, 0, 0, 0, 0, 3) for n in range(3)])
+    with pytest.raises(InputError, match="length 3"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+
+
+def test_what_is_no_recording_is_refused(tmp_path):
+    for source, words in ((tmp_path / "none", "there is no"), (tmp_path, "is no LeRobot dataset, bag")):
+        with pytest.raises(InputError, match=words):
+            import_recording(source, tmp_path / "a.npz")
+    (tmp_path / "bad.mcap").write_bytes(b"nothing")
+    pytest.importorskip("rosbags")
+    with pytest.raises(InputError, match="can't be read as a bag"):
+        import_recording(tmp_path / "bad.mcap", tmp_path / "a.npz")
+
+
+def test_a_turn_past_half_a_circle_is_the_same_in_all_demonstrations(tmp_path):
+    for name, degrees in (("a", 175), ("b", -175), ("c", 178)):
+        rows = [(0.01 * n, 0, 0, 0, 0, 0, np.deg2rad(degrees + n)) for n in range(4)]
+        write_table(tmp_path / f"{name}.csv", "t,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad", rows)
+    import_recording(tmp_path, tmp_path / "kept.npz")
+    starts = [np.rad2deg(one[0, 3]) for one in Demonstrations.load(tmp_path / "kept.npz").outputs]
+    assert starts == pytest.approx([175, 185, 178])
+
+
+def test_a_feature_of_one_number_is_an_output(tmp_path):
+    import pyarrow.parquet as parquet
+
+    t = 0.1 * np.arange(5)
+    Demonstrations([t], [t[:, None]]).save(tmp_path / "one.npz")
+    export_demonstrations(tmp_path / "one.npz", tmp_path / "set", "lerobot")
+    (data,) = (tmp_path / "set" / "data").rglob("*.parquet")
+    table = parquet.read_table(data)
+    flat = table["action"].combine_chunks().flatten()  # as LeRobot writes it
+    parquet.write_table(table.set_column(table.column_names.index("action"), "action", flat), data)
+    import_recording(tmp_path / "set", tmp_path / "back.npz", signal="action")
+    np.testing.assert_allclose(Demonstrations.load(tmp_path / "back.npz").outputs[0][:, 0], t, atol=1e-6)
+
+
+def test_two_publishers_on_a_topic_are_not_mixed(tmp_path):
+    pytest.importorskip("rosbags")
+    write_bag(tmp_path / "bag", {"/a/pose": "base"}, beside="geometry_msgs/msg/Pose")
+    with pytest.raises(InputError, match="2 publishers on /a/pose"):
+        import_recording(tmp_path / "bag", tmp_path / "x.npz")
+
+
+def test_bounds_go_into_a_folder_that_is_there(file, tmp_path):
+    with pytest.raises(InputError, match="there is no folder"):
+        constraints(file, out=tmp_path / "none" / "bounds.yaml")
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_an_export_that_fails_on_the_way_can_be_tried_again(kind, file, tmp_path, monkeypatch):
+    pytest.importorskip("rosbags")
+    out = tmp_path / "out"
+
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        # What is written last.
+        broken.setattr("guiderail.tools.datasets.formats.lerobot._statistics", full)
+        broken.setattr("rosbags.rosbag2.Writer.close", full)
+        with pytest.raises(InputError, match="No space left"):
+            export_demonstrations(file, out, kind)
+    assert [one.name for one in tmp_path.iterdir()] == [file.name]
+    export_demonstrations(file, out, kind)
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_where_nothing_can_be_written_is_said_before_anything_is_read(kind, file, tmp_path):
+    (tmp_path / "damaged.csv").write_text("nothing")
+    for place in (file / "set", file / "new" / "set"):
+        with pytest.raises(InputError, match="cannot be written"):
+            export_demonstrations(tmp_path / "damaged.csv", place, kind)
+        with pytest.raises(InputError, match="cannot be written"):
+            import_recording(tmp_path / "damaged.csv", place.with_suffix(".npz"))
+
+
+def test_a_start_that_resampling_leaves_is_said(tmp_path):
+    t = 0.1 * np.arange(5)
+    Demonstrations([t - 0.2], [t[:, None]]).save(tmp_path / "early.npz")
+    found = export_demonstrations(tmp_path / "early.npz", tmp_path / "set", "lerobot", rate=20)
+    assert found["note"].count("where it was -0.2") == 1
+
+
+@pytest.mark.parametrize("rate", [1e15, 1e308])
+def test_more_samples_than_a_file_holds_are_refused(rate, tmp_path):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
+    with pytest.raises(InputError, match="give a lower one"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz", rate=rate)
+
+
+def test_what_could_not_be_read_again_is_not_written(tmp_path, monkeypatch):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
+    monkeypatch.setattr("guiderail.tools.datasets.convert.MOST_NUMBERS", 15)
+    with pytest.raises(InputError, match=r"16 numbers.*--rate"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+    assert not (tmp_path / "a.npz").exists()
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_what_is_for_tables_is_refused_of_others(kind, file, tmp_path):
+    export_demonstrations(file, tmp_path / "set", kind)
+    with pytest.raises(InputError, match="say themselves what --unit would"):
+        import_recording(tmp_path / "set", tmp_path / "again.npz", unit="mm")
+    assert not (tmp_path / "again.npz").exists()
+
+
+def test_a_signal_is_refused_of_a_table(tmp_path):
+    write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
+    with pytest.raises(InputError, match="leave --signal out"):
+        import_recording(tmp_path / "a.csv", tmp_path / "a.npz", signal="foo")
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "mcap"])
+def test_a_dozen_demonstrations_keep_their_order(kind, tmp_path):
+    t = 0.1 * np.arange(6)
+    Demonstrations([t] * 12, [np.full((6, 1), float(k)) for k in range(12)]).save(tmp_path / "many.npz")
+    export_demonstrations(tmp_path / "many.npz", tmp_path / "set", kind)
+    import_recording(tmp_path / "set", tmp_path / "again.npz")
+    again = Demonstrations.load(tmp_path / "again.npz")
+    assert [one[0, 0] for one in again.outputs] == list(range(12))

@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.datasets.bounds import constraints
+from guiderail.tools.datasets.paths import load_demonstrations
+from guiderail.tools.datasets.validate import check
+
+CLOCK = np.linspace(0, 1, 30)
+
+
+def motion(index=0):
+    return np.column_stack([np.sin(3 * CLOCK + 0.1 * index), CLOCK * index, CLOCK**2])
+
+
+def write(path, index=0, header="t,x,y,z"):
+    rows = [",".join(map(repr, map(float, row))) for row in np.column_stack([CLOCK, motion(index)])]
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def test_a_table_with_a_line_of_names_is_one_demonstration(tmp_path):
+    read = load_demonstrations(write(tmp_path / "one.csv"))
+    assert read.names == ("x", "y", "z")
+    np.testing.assert_array_equal(read.times[0], CLOCK)
+    np.testing.assert_array_equal(read.outputs[0], motion())
+
+
+def test_a_folder_is_all_of_its_files_whatever_they_are(tmp_path):
+    for index in (2, 0, 1):
+        write(tmp_path / f"{index}.csv", index)
+    Demonstrations(CLOCK, [motion(3), motion(4)], ["x", "y", "z"]).save(tmp_path / "3.npz")
+    (tmp_path / "notes.txt").write_text("mine")
+    read = load_demonstrations(tmp_path)
+    assert read.num_demonstrations == 5
+    for index, outputs in enumerate(read.outputs):
+        np.testing.assert_array_equal(outputs, motion(index))
+
+
+def test_what_guiderail_itself_writes_is_read_as_before(tmp_path):
+    Demonstrations(CLOCK, [motion(0), motion(1)]).save(tmp_path / "two.csv")
+    assert load_demonstrations(tmp_path / "two.csv").num_demonstrations == 2
+
+
+def test_a_mark_at_the_beginning_is_no_part_of_the_first_name(tmp_path):
+    rows = [f"{m},{t},{m + t}" for m in range(2) for t in range(3)]
+    text = "\n".join(["demonstration,time,x", *rows])
+    (tmp_path / "marked.csv").write_text(text, encoding="utf-8-sig")  # as Excel writes it
+    assert load_demonstrations(tmp_path / "marked.csv").num_demonstrations == 2
+
+
+@pytest.mark.parametrize("read", [check, load_demonstrations, constraints])
+@pytest.mark.parametrize("ending", ["", ".csv", ".npz"])
+def test_a_name_that_no_file_can_have_is_refused(read, ending, tmp_path):
+    with pytest.raises(InputError, match="File name too long"):
+        read(tmp_path / ("x" * 300 + ending))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "first line must be"),
+        ("t\n0\n1\n", "first line must be"),
+        ("0,1,2\n0.1,1,2\n", "first line must be"),
+        ("x,y,z\n0,1,2\n1,2,3\n", "first line must be"),
+        ("t,x\n0,one\n1,2\n", "could not convert"),
+        ("t,x\n0,1\n1,\n", "line 3 holds something that is no number"),
+        ("t,x\n0,1\n1,nan\n", "NaN"),
+        ("t,x\n1,1\n0,2\n", "does not increase"),
+    ],
+)
+def test_what_is_no_demonstration_is_one_sentence(tmp_path, text, words):
+    (tmp_path / "wrong.csv").write_text(text)
+    with pytest.raises(InputError, match=words):
+        load_demonstrations(tmp_path / "wrong.csv")
+    with pytest.raises(InputError, match=words):
+        Demonstrations.load(tmp_path / "wrong.csv")  # whoever learns from it is told the same
+
+
+def test_a_folder_without_any_or_of_several_kinds_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no file"):
+        load_demonstrations(tmp_path)
+    write(tmp_path / "a.csv")
+    write(tmp_path / "b.csv", header="t,x,y,force")
+    with pytest.raises(InputError, match="force"):
+        load_demonstrations(tmp_path)
+
+
+@pytest.mark.parametrize(("ending", "magic"), [(".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")])
+def test_demonstrations_are_drawn_in_the_format_that_is_asked_for(tmp_path, ending, magic):
+    for index in range(3):
+        write(tmp_path / f"{index}.csv", index)
+    picture = tmp_path / f"drawn{ending}"
+    assert check(tmp_path, picture)["picture"] == str(picture)
+    assert picture.read_bytes().startswith(magic)
+    with pytest.raises(InputError, match="a picture is"):
+        check(tmp_path, tmp_path / "drawn.gif")

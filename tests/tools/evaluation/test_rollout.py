@@ -1,0 +1,100 @@
+import itertools
+
+import gymnasium
+import numpy as np
+
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.baselines import NULL_POLICIES, NullPolicy
+from guiderail.tools.evaluation.metrics import COLUMNS
+from guiderail.tools.evaluation.rollout import Observer, rollout
+
+
+class Diary(Observer):
+    def __init__(self):
+        self.said = []
+
+    def begin(self):
+        self.said.append("begin")
+
+    def see(self, decision):
+        self.said.append(decision)
+
+    def end(self, row):
+        self.said.append("end")
+        return {"decisions": len(self.said) - 2}
+
+
+def test_observers_see_an_episode_from_its_beginning_to_its_end():
+    env, diary = make_environment("Bead", {"hold": 2}), Diary()
+    row = rollout(env, lambda observation: np.array([0.5, -1.0]), diary, index=7, seed=3)
+    first, *decisions, last = diary.said
+    assert (first, last) == ("begin", "end")
+    assert [decision.is_last for decision in decisions] == [False] * (len(decisions) - 1) + [True]
+    for before, after in itertools.pairwise(decisions):
+        assert before.following is after.observation
+    assert row["decisions"] == len(decisions) == -(-row["steps"] // 2)
+    assert row["return"] == sum(decision.reward for decision in decisions)
+    assert list(row) == [*(c.name for c in COLUMNS), "reward_goal_distance", "decisions"]
+    assert row["episode"] == 7
+
+
+def test_the_same_seed_is_the_same_episode_and_held_out_ones_are_others():
+    env = make_environment("Bead", {})
+    rows = [
+        rollout(env, lambda observation: np.zeros(2), seed=seed, held_out=held_out)["return"]
+        for seed, held_out in ((3, False), (3, False), (4, False), (3, True))
+    ]
+    assert rows[0] == rows[1]
+    assert len(set(rows)) == 3
+
+
+def test_a_policy_that_watches_is_told_once():
+    env, told = make_environment("Bead", {}), []
+
+    class Policy(Observer):
+        def begin(self):
+            told.append("begin")
+
+        def __call__(self, observation):
+            return np.zeros(2)
+
+    policy = Policy()
+    rollout(env, policy, seed=0)
+    rollout(env, policy, policy, seed=0)
+    assert told == ["begin", "begin"]
+
+
+def test_an_episode_whose_simulation_failed_has_a_row_too():
+    class Failing(gymnasium.Wrapper):
+        def step(self, action):
+            observation, reward, *_, info = super().step(action)
+            info = {k: v for k, v in info.items() if k != "ledger"} | {"simulation_failure": "it diverged"}
+            return observation, reward, False, True, info | {"constraint_violation": 0.25}
+
+    row = rollout(Failing(make_environment("Bead", {})), lambda observation: np.zeros(2), seed=0)
+    assert row["termination"] == "simulation_failure"
+    assert (row["steps"], row["success"], row["collisions"]) == (1, 0, 0)
+    assert (row["worst_violation"], row["peak_force"]) == (0.25, 1.0)
+
+
+def acted(policy: NullPolicy, episodes: int) -> np.ndarray:
+    actions = []
+    for _ in range(episodes):
+        policy.begin()
+        actions.append([policy(np.zeros(3)) for _ in range(5)])
+    return np.array(actions)
+
+
+def test_null_policies_are_what_their_names_say():
+    env = make_environment("Bead", {})
+    zero, white, constant = (
+        acted(NullPolicy(NULL_POLICIES[name], env, 3), 4) for name in ("zero", "white", "constant")
+    )
+    assert not zero.any()
+    assert len(np.unique(white.reshape(-1, 2), axis=0)) == 20
+    assert (constant == constant[:, :1]).all()
+    assert len(np.unique(constant[:, 0], axis=0)) == 4
+    for name, actions in (("white", white), ("constant", constant)):
+        assert np.abs(actions).max() <= 1.0
+        np.testing.assert_array_equal(acted(NullPolicy(NULL_POLICIES[name], env, 3), 4), actions)
+        assert not np.array_equal(acted(NullPolicy(NULL_POLICIES[name], env, 4), 4), actions)

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.evaluation.step_log import MEANINGS, Ledger, ledger_file, read_ledger
+
+
+def act(env, seed=0):
+    rng = np.random.default_rng(seed)
+    return lambda observation: rng.uniform(-1, 1, env.action_space.shape)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ledger")
+    env = make_environment("NarrowPassage", {"guidance": "kgrl", "hold": 5})
+    rows = [rollout(env, act(env, index), Ledger(env, folder), index=index, seed=index) for index in range(2)]
+    trace = env.unwrapped.trace
+    return folder, rows, trace
+
+
+def test_it_has_every_control_step_and_agrees_with_the_episodes_table(written):
+    folder, rows, trace = written
+    ledger = read_ledger(folder)
+    assert [len(group) for _, group in ledger.groupby("episode")] == [row["steps"] for row in rows]
+    for row, (_, steps) in zip(rows, ledger.groupby("episode"), strict=True):
+        assert steps["step"].tolist() == list(range(row["steps"]))
+        assert steps["commanded_violation"].max() == row["worst_violation"] <= TOLERANCE
+        assert steps["measured_violation"].max() == row["worst_measured_violation"]
+        assert steps["contact_force"].max() == row["peak_force"]
+        assert steps["collision"].sum() == row["collision_steps"]
+        assert steps["fallback"].sum() == row["fallbacks"]
+        assert not steps["holding"].any()
+        assert (steps["saturation"] > 0).sum() == row["saturations"]
+        assert steps["reward"].sum() == pytest.approx(row["return"])
+    last = ledger[ledger["episode"] == 1]
+    np.testing.assert_array_equal(last[["desired_pose_0", "desired_pose_1"]], trace.commanded)
+    np.testing.assert_array_equal(last[["pose_0", "pose_1"]], trace.measured)
+    # The zone is x ≥ 0.6: by what was commanded itself, and not by what anybody says of it.
+    np.testing.assert_allclose(ledger["commanded_violation"], ledger["desired_pose_0"] - 0.6, atol=1e-12)
+
+
+def test_every_column_has_a_meaning(written):
+    for name in read_ledger(written[0]).columns:
+        stem, _, end = name.rpartition("_")
+        assert (f"{stem}_i" if end.isdigit() else name) in MEANINGS
+
+
+def test_a_collision_and_a_wrench_are_seen(tmp_path):
+    env = make_environment("NarrowPassage", {"guidance": "residual", "hold": 5})
+    aside = np.array([1.0, 0.0])
+    row = rollout(env, lambda observation: aside, Ledger(env, tmp_path), seed=0)
+    ledger = read_ledger(tmp_path)
+    assert row["collision_steps"] == ledger["collision"].sum() > 0
+    assert np.linalg.norm(ledger.loc[ledger["collision"], ["wrench_0", "wrench_1"]], axis=1).max() > 0
+
+
+def test_what_is_no_ledger_is_refused_in_a_sentence(written, tmp_path):
+    with pytest.raises(InputError, match="holds no ledger"):
+        read_ledger(tmp_path)
+    ledger_file(tmp_path, 0).write_bytes(b"PAR1 and not much more")
+    with pytest.raises(InputError, match="damaged"):
+        read_ledger(tmp_path)

@@ -1,0 +1,95 @@
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.experiments.engines.engine import ENGINES, make_engine
+from oracles.work import die, work
+
+PARENT = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+from oracles.work import wait
+from guiderail.tools.studies.engines.engine import make_engine
+if __name__ == "__main__":
+    with make_engine("process", 2) as engine:
+        list(engine.run(wait, {0: 0, 1: 1}))
+"""
+
+
+def run(do, jobs, processes=2):
+    with make_engine("process", processes) as engine:
+        return dict(engine.run(do, jobs))
+
+
+def gone(process):
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def test_every_job_is_done_by_some_worker_with_one_thread_and_none_is_left():
+    rows = {key: outcome.rows[0] for key, outcome in run(work, {n: n for n in range(7)}).items()}
+    assert {key: row["square"] for key, row in rows.items()} == {n: n * n for n in range(7)}
+    assert {row["threads"] for row in rows.values()} == {"1"}
+    workers = {row["process"] for row in rows.values()}
+    assert os.getpid() not in workers
+    assert all(map(gone, workers))
+
+
+def test_one_process_alone_is_this_one(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    assert run(work, {0: 3}, processes=1)[0].rows[0]["process"] == os.getpid()
+
+
+def test_a_job_whose_worker_is_killed_is_done_by_another(tmp_path):
+    found = run(work, {0: tmp_path / "once", 1: 5})
+    assert found[0].rows[0] == {"found": str(tmp_path / "once")}
+    assert found[1].rows[0]["square"] == 25
+
+
+def test_a_job_that_kills_every_worker_is_given_up_and_the_others_are_done():
+    found = run(die, {n: n for n in range(4)})
+    assert [found[n].rows[0]["square"] for n in (0, 2)] == [0, 4]
+    for n in (1, 3):
+        assert found[n].failure == "3 workers were lost with it, one after the other, the last by exit code 3"
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_no_worker_outlives_a_study_however_it_ends(how, tmp_path):
+    (tmp_path / "parent.py").write_text(PARENT)
+    paths = os.pathsep.join([str(Path(__file__).parents[3]), *filter(None, sys.path)])
+    with subprocess.Popen(
+        [sys.executable, tmp_path / "parent.py"],
+        env=os.environ | {"PYTHONPATH": paths},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as parent:
+        assert parent.stdout is not None
+        alarm = threading.Timer(60, parent.kill)
+        alarm.start()
+        workers = {int(parent.stdout.readline()) for _ in range(2)}
+        assert len(workers - {parent.pid}) == 2
+        parent.send_signal(how)
+        # The workers write to the same pipe: it ends when the last of them does.
+        assert parent.communicate() == ("", None)
+        alarm.cancel()
+        assert parent.returncode == -how
+
+
+def test_an_engine_refuses_what_it_has_no_use_for():
+    assert {"process", "ray"} <= set(ENGINES.names())
+    with pytest.raises(InputError, match="did you mean process"):
+        make_engine("proces")
+    with pytest.raises(InputError, match="--engine ray"):
+        make_engine("process", address="auto")
+    with pytest.raises(InputError, match="at least one process, not 0"):
+        make_engine("process", 0)

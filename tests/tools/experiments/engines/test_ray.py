@@ -1,0 +1,39 @@
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.experiments.engines.engine import make_engine
+
+needs_ray = pytest.mark.skipif(find_spec("ray") is None, reason="Ray is an extra: pip install 'guiderail[ray]'")
+
+
+def test_without_ray_it_is_one_sentence(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"pip install 'guiderail\[ray\]'"):
+        make_engine("ray")
+
+
+@needs_ray
+def test_a_cluster_says_how_many_run_side_by_side():
+    with pytest.raises(InputError, match="leave --processes out"):
+        make_engine("ray", 2, "127.0.0.1:6379")
+
+
+@needs_ray
+def test_an_address_where_nobody_is_is_one_sentence():
+    with (
+        pytest.raises(InputError, match=r"there is no Ray at 127.0.0.1:9 \(.*refused\)"),
+        make_engine("ray", None, "127.0.0.1:9"),
+    ):
+        pass
+
+
+@needs_ray
+def test_a_cluster_that_loses_a_worker_and_a_machine_gives_what_processes_give(tmp_path):
+    script = Path(__file__).with_name("ray_study.py")
+    done = subprocess.run([sys.executable, script, "--bead", "--out", tmp_path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr

@@ -1,0 +1,51 @@
+import io
+from pathlib import Path
+from types import SimpleNamespace
+
+from rich.console import Console
+
+from guiderail.tools.experiments.engines.engine import Outcome
+from guiderail.tools.experiments.progress import Board
+
+
+def job(folder: Path, seed: int):
+    (folder / f"run-{seed}").mkdir()
+    run = SimpleNamespace(path=folder / f"run-{seed}")
+    return SimpleNamespace(method="kgrl", seed=seed, marks=[2, 4], folder=run, log=folder / f"{seed}.txt")
+
+
+def begin(one, episodes, workers=1):
+    with one.log.open("a") as log:
+        log.write("2026-01-01 begins on here, process 1\n" * workers)
+    if episodes:
+        (one.folder.path / "episodes.csv").write_text("episode\n" + "0\n" * episodes)
+
+
+def test_it_shows_what_runs_how_far_it_is_and_what_has_ended(tmp_path):
+    jobs = {n: job(tmp_path, n) for n in range(5)}
+    begin(jobs[4], 4)  # in an earlier study: it waits
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    board = Board(jobs, 6, console)
+    with board:
+        begin(jobs[0], 3)
+        begin(jobs[1], 4, workers=2)
+        begin(jobs[2], 0)
+        board.end(5, job(tmp_path, 5), Outcome())  # finished before
+        board.end(2, jobs[2], Outcome(failure="learning diverged"))
+        console.print(board._table())
+    shown = console.file.getvalue()
+    assert "1/6 kgrl, seed 5\r" in shown or "1/6 kgrl, seed 5\n" in shown
+    assert "2/6 kgrl, seed 2: failed: learning diverged" in shown
+    assert [line.split() for line in shown.splitlines() if "episodes" in line] == [
+        ["kgrl,", "seed", "0", "3/4", "episodes"]
+    ]
+    assert "judged, by worker 2" in shown
+    assert "2 of 6 ended, 1 failed, 2 wait" in shown
+
+
+def test_a_log_file_gets_a_line_for_each_that_ends(tmp_path):
+    one, console = job(tmp_path, 0), Console(file=io.StringIO())
+    with Board({0: one}, 1, console) as board:
+        begin(one, 4, workers=2)
+        board.end(0, one, Outcome(({"judged_on": "held out", "success_rate": 0.5},)))
+    assert console.file.getvalue() == "1/1 kgrl, seed 0: held out 50% (by worker 2, those before it were lost)\n"

@@ -1,0 +1,425 @@
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from guiderail.diagrams.envs.make import resolve
+from guiderail.models.common.errors import InputError, RunsFailedError
+from guiderail.tools.cli.main import main
+from guiderail.tools.environments import import_modules, make_environment
+from guiderail.tools.evaluation.baselines import always
+from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.evaluation.metrics import STATISTICS
+from guiderail.tools.experiments.declaration import JudgedOn, Ratio, Study, load_study, shipped_studies
+from guiderail.tools.experiments.engines.engine import make_engine
+from guiderail.tools.experiments.study import (
+    Job,
+    _check,
+    differences_of,
+    differing,
+    each,
+    ratio,
+    run_study,
+    study_command,
+)
+from guiderail.tools.experiments.sweep import AT_ONCE, NEVER, breaking_point
+from guiderail.tools.learning import older
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.tables import read_table
+
+SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
+BEAD = {
+    "name": "beads",
+    "task": "Bead",
+    "learner": {"settings": SETTINGS},
+    "methods": {"learner": {}},
+    "seeds": [5, 6],
+    "marks": [2, 4],
+    "judged on": [{"episodes": 3}],
+}
+
+
+def study(**changed):
+    return Study.model_validate(BEAD | changed)
+
+
+def run(one, out):
+    return run_study(one, out, make_engine(processes=1))
+
+
+def without_clock(rows):
+    return rows.drop(columns=["folder", "training_wall_time"]).to_dict("records")
+
+
+def written(folder):
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+def test_there_is_a_row_for_every_method_seed_mark_and_what_is_judged_on(tmp_path):
+    methods = {"learner": {}, "nothing": {"policy": "zero"}, "anything": {"policy": "white", "seeds": [9]}}
+    judged = [{"episodes": 2}, {"name": "far away", "episodes": 3, "env": {"wall": -0.5}}]
+    rows = run(study(methods=methods, **{"judged on": judged}), tmp_path)
+    expected = [
+        *(("learner", seed, mark, name) for seed in (5, 6) for mark in (2, 4) for name in ("held out", "far away")),
+        *(("nothing", seed, 0, name) for seed in (5, 6) for name in ("held out", "far away")),
+        *(("anything", 9, 0, name) for name in ("held out", "far away")),
+    ]
+    assert list(rows[["method", "seed", "mark", "judged_on"]].itertuples(index=False, name=None)) == expected
+    assert rows[rows["judged_on"] == "far away"]["success_rate"].eq(0).all()
+    assert rows[rows["judged_on"] == "far away"]["episodes"].eq(3).all()
+    assert rows[rows["method"] == "learner"]["training_episodes"].eq(rows["mark"][:8]).all()
+    assert rows[rows["method"] == "nothing"]["training_success_rate"].isna().all()
+
+
+def test_a_finished_study_is_not_touched_and_one_that_was_stopped_goes_on_to_the_same_rows(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    expected = run(study(), whole)
+    before = written(whole)
+    assert without_clock(run(study(), whole)) == without_clock(expected)
+    assert written(whole) == before
+    run(study(marks=[2], seeds=[5]), parts)
+    assert without_clock(run(study(), parts)) == without_clock(expected)
+
+
+def test_a_run_that_fails_stops_no_other_and_is_named_at_the_end(tmp_path, capsys):
+    file, out = tmp_path / "beads.yaml", tmp_path / "out"
+    expected = run(study(), tmp_path / "undisturbed")
+    run(study(marks=[2]), out)
+    checkpoint = out / "learner-5" / "checkpoint" / "state.safetensors"
+    whole = checkpoint.read_bytes()
+    checkpoint.write_bytes(whole[:-1000])
+    file.write_text(yaml.safe_dump(BEAD))
+    command = ["study", str(file), "--out", str(out), "--processes", "1", "--json"]
+    with pytest.raises(SystemExit) as end:
+        main(command)
+    said = capsys.readouterr()
+    assert end.value.code == 1
+    sentence = f"learner, seed 5, failed: the checkpoint {checkpoint} is damaged"
+    assert said.err.splitlines()[-1].startswith(f"guiderail: {sentence}")
+    assert json.loads(said.out)["failed"][0].startswith(sentence)
+    assert read_table(out / "beads.csv")["seed"].tolist() == [6, 6]
+    assert "damaged" in (out / "logs" / "beads-learner-5.txt").read_text()
+    (judged,) = (out / "learner-6").glob("held_out-4-*.csv")
+    table = judged.read_bytes()
+    judged.write_text("a,b\n1\n")
+    with pytest.raises(RunsFailedError) as failed:
+        run(study(), out)
+    assert [sentence.partition(",")[2][:7] for sentence in failed.value.sentences] == [" seed 5", " seed 6"]
+    judged.write_bytes(table)
+    checkpoint.write_bytes(whole)
+    assert without_clock(run(study(), out)) == without_clock(expected)
+
+
+def test_a_study_names_what_registers_its_task(tmp_path):
+    file = tmp_path / "pearl.py"
+    file.write_text(
+        "import bead, gymnasium\n"
+        "if 'guiderail/Pearl-v0' not in gymnasium.registry:\n"
+        "    gymnasium.register('guiderail/Pearl-v0', entry_point=bead.Bead)\n"
+    )
+    with pytest.raises(InputError, match="there is none for"):
+        run(study(task="Pearl", imports=[str(tmp_path / "perl.py")], marks=[2]), tmp_path / "out")
+    rows = run(study(task="Pearl", imports=[str(file)], seeds=[5], marks=[2]), tmp_path / "out")
+    assert rows["seed"].tolist() == [5]
+    assert RunFolder(tmp_path / "out" / "learner-5").config().imports == (str(file),)
+
+
+def test_two_runs_never_share_a_folder(tmp_path):
+    with pytest.raises(InputError, match="both runs of learner, seed 5 and of learner, seed 6"):
+        run(study(folder="{method}"), tmp_path)
+
+
+def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
+    run(study(**{"judged on": []}), tmp_path)
+    late, expected = run(study(), tmp_path), run(study(), tmp_path / "other")
+    assert without_clock(late) == without_clock(expected)
+    for mark in (tmp_path / "learner-5" / "marks").iterdir():
+        for file in mark.iterdir():
+            file.unlink()
+        mark.rmdir()
+    with pytest.raises(InputError, match="its policy of then is gone"):
+        run(study(**{"judged on": [{"episodes": 4}]}), tmp_path)
+
+
+def test_other_episodes_of_the_same_name_are_not_taken_for_these(tmp_path):
+    methods = {"nothing": {"policy": "zero"}}
+    near, far = (
+        run(study(methods=methods, **{"judged on": [{"episodes": 3, "env": {"wall": wall}}]}), tmp_path)
+        for wall in (1.0, -0.5)
+    )
+    assert near["mean_return"].gt(far["mean_return"]).all()
+    other = run(study(methods={"nothing": {"policy": "constant"}}), tmp_path)
+    assert not other["mean_return"].isin(near["mean_return"]).any()
+
+
+def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
+    """By the seed where a folder's name doesn't say it, by the task, and by a sentence where a file's name is given."""
+    (tmp_path / "pearl.py").write_text(
+        "import bead, gymnasium\n"
+        "if 'guiderail/Twin-v0' not in gymnasium.registry:\n"
+        "    gymnasium.register('guiderail/Twin-v0', entry_point=bead.Bead)\n"
+    )
+    white = {"methods": {"anything": {"policy": "white"}}, "folder": "{method}", "seeds": [5]}
+    out = tmp_path / "out"
+    for changed in ({}, {"seeds": [6]}, {"task": "Twin", "imports": [str(tmp_path / "pearl.py")]}):
+        run(study(**(white | changed)), out)
+    assert len(list((out / "anything").glob("held_out-0-*.csv"))) == 3
+    named = {"judged on": [{"episodes": 3, "file": "held_out.csv"}]}
+    run(study(**white, **named), out)
+    before = written(out)
+    run(study(**white, **named), out)
+    assert written(out) == before
+    for changed in ({"env": {"wall": -0.5}}, {"seeds": [6]}, {"judged on": [{"episodes": 4, "file": "held_out.csv"}]}):
+        with pytest.raises(InputError, match="episodes of another study"):
+            run(study(**(white | named | changed)), out)
+    assert written(out) == before
+
+
+def test_a_study_says_in_what_its_methods_differ_from_the_thesis():
+    study = load_study("connector_hard").only(["kgrl", "skgrl", "white", "rule"])
+    told = differing(study)
+    assert "reward aligned (thesis: sparse)" in told["all methods"]
+    assert any(words.startswith("difficulty 'hard', which is ours") for words in told["all methods"])
+    assert any("checkpoint selection" in words for words in told["kgrl"])
+    assert any("ρ" in words for words in told["skgrl"])
+    assert not any("checkpoint selection" in words for words in differences_of(study, "white"))
+    for method in study.methods:
+        own = [one for methods, words in told.items() if method in methods.split(", ") for one in words]
+        assert sorted([*told["all methods"], *own]) == sorted(differences_of(study, method))
+
+
+def test_where_a_method_breaks_lies_on_a_line_between_two_values():
+    assert breaking_point([1.0, 2.0, 3.0], [1.0, 1.0, 0.8]) == pytest.approx(2.5)
+    assert breaking_point([30.0, 20.0, 10.0], [1.0, 0.9, 0.0]) == pytest.approx(20.0)
+    assert breaking_point([1.0, 2.0], [0.89, 1.0]) == AT_ONCE
+    assert breaking_point([1.0, 2.0], [1.0, 0.9]) == NEVER
+
+
+def test_results_that_are_older_than_an_option_are_of_its_default():
+    assert older.options({"wall": 1.0, "impedance_control": "joint"}) == {"wall": 1.0}
+    assert older.options({"impedance_control": "cartesian"}) == {"impedance_control": "cartesian"}
+    for name, value in older.OPTIONS.items():
+        options = [resolve(task, {}).values for task in older.TASKS]
+        assert [one[name] for one in options if name in one].count(value) == sum(name in one for one in options) > 0
+
+
+def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_path):
+    run(study(seeds=[5], marks=[2]), tmp_path)
+    before = written(tmp_path)
+    with pytest.raises(InputError, match="another learner"):
+        run(study(learner={"settings": SETTINGS | {"batch_size": 8}}), tmp_path)
+    (tmp_path / "learner-6").mkdir()
+    (tmp_path / "learner-6" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="already exists"):
+        run(study(seeds=[6]), tmp_path)
+    assert before.items() <= written(tmp_path).items()
+
+
+def test_the_best_constant_is_the_best_of_its_grid(tmp_path):
+    rows = run(study(methods={"best": {"policy": "best_constant", "grid": [-1, 0, 1]}}, seeds=[1]), tmp_path)
+    tried = read_table(next((tmp_path / "best-1").glob("best_constant-*.csv")))
+    assert len(tried) == 9
+    assert tried[["action_0", "action_1"]].iloc[0].tolist() == [1.0, 1.0]  # up and to the right, where the goal is
+    assert tried["success_rate"].is_monotonic_decreasing
+    env = make_environment("Bead", {})
+    expected = evaluate_policy(env, always(env, np.array([1.0, 1.0])), episodes=3)
+    assert rows["mean_return"].tolist() == [expected["return"].mean()]
+
+
+def test_sampled_arguments_stay_in_their_range_and_change_every_few_episodes(tmp_path):
+    judged = [{"episodes": 5, "every": 2, "sampled": {"wall": [0.2, 0.3]}}]
+    run(study(methods={"nothing": {"policy": "zero"}}, seeds=[0], **{"judged on": judged}), tmp_path)
+    (file,) = (tmp_path / "nothing-0").glob("*.csv")
+    rows = read_table(file)
+    assert rows["episode"].tolist() == [0, 1, 2, 3, 4]
+    assert rows["wall"].between(0.2, 0.3).all()
+    assert [group["episode"].tolist() for _, group in rows.groupby("wall", sort=False)] == [[0, 1], [2, 3], [4]]
+
+
+def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
+    declared = Study.model_validate(
+        {
+            "name": "passage",
+            "task": "NarrowPassage",
+            "methods": {"anything": {"policy": "white"}},
+            "seeds": [0],
+            "judged on": [{"episodes": 1}],
+        }
+    )
+    one, two = (run_study(declared, tmp_path / str(n), make_engine(processes=n)).drop(columns="folder") for n in (1, 2))
+    pd.testing.assert_frame_equal(one, two)
+
+
+def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
+    one = study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], marks=[2])
+    result = study_command(one, tmp_path, make_engine(processes=1))
+    rows = read_table(tmp_path / "beads.csv")
+    assert len(rows) == 2
+    said = ", ".join(f"{rate:.0%}" for rate in rows["success_rate"])
+    assert result["learner after 2 episodes, held out, success of each seed"] == said
+    assert result["mean return of learner as a part of learner's, each seed"] == "1.00, 1.00"
+    assert result["differs_from_thesis"] == {"all methods": ["it has no task Bead"]}
+    err = capsys.readouterr().err
+    assert "1/2 learner, seed 5: held out" in err
+    assert "2/2 learner, seed 6: held out" in err
+
+
+def test_a_ratio_is_of_sums_and_a_number_that_never_was_says_so():
+    rows = pd.DataFrame(
+        {"method": ["a", "a", "b", "b"], "seed": [0, 1, 0, 1], "force": [1.0, 2.0, 4.0, 2.0], "after": [3, None, 1, 2]}
+    )
+    wanted = Ratio(of="force", method="a", against="b")
+    assert list(ratio(rows, wanted).values()) == ["0.25, 1.00", "0.50"]
+    assert ratio(rows[:2], wanted) == ratio(rows[:3], wanted) == {}
+    assert ratio(rows.assign(seed=[0, 1, 1, 2]), wanted) == {}
+    assert each(rows[:2].astype(object), "after") == "3.0, never"
+
+
+WRONG = [
+    ({"methods": {}}, "methods"),
+    ({"seeds": []}, "seeds"),
+    ({"seeds": ["x"]}, "seeds"),
+    ({"seeds": [True]}, "seeds, 0: input should be a valid integer, not True"),
+    ({"methods": {"learner": {"seeds": [True]}}}, "input should be a valid integer, not True"),
+    ({"marks": [0]}, "greater than or equal to 1"),
+    ({"marks": [True]}, "input should be a valid integer, not True"),
+    ({"marks": [5], "learner": {"episodes": 1}}, "no method learns as long as the mark 5"),
+    ({"marks": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}}, "no method learns as long as the mark 5"),
+    ({"task": "NarrowPassage", "judged on": [{"options": {"held_otu": True}}]}, "did you mean held_out"),
+    ({"task": "NarrowPassage", "judged on": [{"options": {"held_out": "far"}}]}, "held_out cannot be 'far'"),
+    ({"marks": [], "learner": {}}, "how long does learner learn"),
+    ({"task": "Beat"}, "did you mean Bead"),
+    ({"tsak": "Bead"}, "did you mean task"),
+    ({"methods": {"learner": {"enf": {}}}}, "did you mean env"),
+    ({"methods": {"../up": {}}}, "should match pattern"),
+    ({"methods": {"one": {"policy": "magic"}}}, "no policy 'magic'"),
+    ({"methods": {"one": {"env": {"guidanse": "kmp"}}}}, "did you mean guidance"),
+    ({"learner": {"preset": "robst"}}, "did you mean robust"),
+    ({"learner": {"algorithm": "ppo"}}, "sac, tqc"),
+    ({"learner": {"settings": {"batchsize": 3}}}, "batch_size"),
+    ({"judged on": [{"episodes": 0}]}, "judged on"),
+    ({"judged on": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
+    ({"judged on": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
+    ({"folder": "{guidance}-{seed}"}, "it may have {method}, {seed}, {episodes}, {algorithm}"),
+    ({"folder": "{method}-{seed"}, "has braces that nothing fills"),
+    ({"judged on": [{"file": "{mark}-{seed}.csv"}]}, "it may have {name}, {mark}, {episodes}, {digest}"),
+    ({"statistics": ["sucess_rate"]}, "did you mean success_rate"),
+    ({"judged on": [{"episodes": 2}, {"episodes": 3}]}, "called 'held out'"),
+    ({"ratios": [{"of": "mean_force", "method": "learnt", "against": "learner"}]}, "did you mean learner"),
+    ({"ratios": [{"of": "mean_fource", "method": "learner", "against": "learner"}]}, "did you mean mean_force"),
+]
+
+
+@pytest.mark.parametrize(("changed", "words"), WRONG, ids=[words for _, words in WRONG])
+def test_what_makes_no_sense_is_one_sentence_and_nothing_is_written(changed, words, tmp_path):
+    (tmp_path / "study.yaml").write_text(yaml.safe_dump(BEAD | changed))
+    with pytest.raises(InputError) as refused:
+        run(load_study(tmp_path / "study.yaml"), tmp_path / "out")
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_mark_that_only_some_methods_reach_is_of_these():
+    methods = {"short": {"learner": {"episodes": 2}}, "long": {}, "nothing": {"policy": "zero"}}
+    one = study(methods=methods)
+    assert [Job(one, name, 5, None).marks for name in methods] == [[2], [2, 4], [0]]
+    assert study(methods={"nothing": {"policy": "zero"}}, learner={"episodes": 1}).marks == (2, 4)
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "\x00", "just words"])
+def test_what_is_no_study_is_one_sentence(text, tmp_path):
+    (tmp_path / "study.yaml").write_text(text)
+    with pytest.raises(InputError) as refused:
+        load_study(tmp_path / "study.yaml")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_study_is_named_by_its_file_or_by_its_name(tmp_path):
+    with pytest.raises(InputError, match="did you mean connector"):
+        load_study("conector")
+    with pytest.raises(InputError, match="there is no file"):
+        load_study(tmp_path / "none.yaml")
+    chosen = load_study("connector").only(["kgrl"], [1, 2])
+    assert (list(chosen.methods), chosen.seeds) == (["kgrl"], (1, 2))
+    with pytest.raises(InputError, match="did you mean kgrl"):
+        chosen.only(["kgrll"])
+
+
+@pytest.mark.parametrize("name", shipped_studies())
+def test_every_study_that_comes_along_makes_sense(name, tmp_path):
+    declared = load_study(name)
+    if not isinstance(declared, Study):
+        assert declared.program == name
+        return
+    assert declared.name == name
+    import_modules(declared.imports)
+    for method in declared.methods:
+        _check(Job(declared, method, declared.seeds[0], tmp_path))
+    for wanted in declared.ratios:
+        assert wanted.of.removeprefix("training_") in STATISTICS
+        assert {wanted.method, wanted.against} <= declared.methods.keys()
+
+
+def test_a_person_pours_and_the_constraints_are_why(tmp_path):
+    declared = load_study("pouring_mugs").only(["person", "person_unconstrained"])
+    declared = declared.model_copy(update={"judged_on": (JudgedOn(episodes=1),)})
+    bound, free = run(declared, tmp_path).to_dict("records")
+    assert (bound["success_rate"], free["success_rate"]) == (1.0, 0.0)
+    assert bound["ended_in_spill"] + bound["ended_in_collision"] == 0
+    assert free["ended_in_spill"] + free["ended_in_collision"] == 1
+    assert bound["worst_violation"] <= 1e-9
+
+
+def test_a_policy_learns_on_rails_wherever_it_is_judged(tmp_path):
+    declared = load_study("connector_on_arm")
+    config = Job(declared, "skgrl", 30, tmp_path).config(80)
+    assert config.environment["station"] == "rails"
+    assert declared.judged_on[0].env == {"station": "arm"}
+
+
+def test_a_run_of_a_study_is_a_run(tmp_path):
+    run(study(seeds=[5]), tmp_path)
+    folder = RunFolder(tmp_path / "learner-5")
+    assert folder.config().episodes == 4
+    assert np.array_equal(folder.episodes()["episode"], range(4))
+
+
+def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
+    """The wall of beads is where they start, or far away, where nothing succeeds."""
+    walls = {"quantity": "wall [m]", "at": {0.0: {}, -0.5: {"wall": -0.5}}, "episodes": 2}
+    methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "white"}}
+    one = study(methods=methods, sweeps=[walls], **{"judged on": []})
+    found = study_command(one, tmp_path, make_engine(processes=1))
+    rows = read_table(tmp_path / "beads.csv")
+    assert rows["judged_on"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
+    assert rows[rows["judged_on"] == "wall [m] -0.5"]["success_rate"].eq(0).all()
+    assert found["picture"] == str(tmp_path / "beads.png")
+    assert found["nothing, below 90% at wall [m]"] == "from the easiest on"
+    assert (tmp_path / "beads.png").stat().st_size > 10_000
+    assert run_study(one, tmp_path, make_engine(processes=1))["judged_on"].tolist() == rows["judged_on"].tolist()
+
+
+def test_a_policy_that_learned_longer_is_judged_by_itself_whatever_the_file_is_called(tmp_path):
+    judged = [{"episodes": 2, "file": "held_out-{episodes}-{digest}.csv"}]
+    run(study(marks=[2], seeds=[5], **{"judged on": judged}), tmp_path)
+    run(study(marks=[4], seeds=[5], **{"judged on": judged}), tmp_path)
+    assert len(list((tmp_path / "learner-5").glob("held_out-2-*.csv"))) == 2
+    same = [{"episodes": 2, "file": "held_out.csv"}]
+    run(study(marks=[4], seeds=[5], **{"judged on": same}), tmp_path)
+    with pytest.raises(InputError, match="after other training"):
+        run(study(marks=[6], seeds=[5], **{"judged on": same}), tmp_path)
+
+
+def test_a_part_of_a_study_does_not_take_the_place_of_its_table(tmp_path):
+    methods = {"learner": {}, "nothing": {"policy": "zero"}}
+    (tmp_path / "beads.yaml").write_text(yaml.safe_dump(BEAD | {"methods": methods, "marks": [2]}))
+    for words, rows in (([], 4), (["--methods", "nothing"], 2), (["--seeds", "5"], 2)):
+        with pytest.raises(SystemExit) as end:
+            main(["study", str(tmp_path / "beads.yaml"), "--out", str(tmp_path / "out"), "--processes", "1", *words])
+        assert end.value.code == 0
+        name = "-".join(["beads", *words[1:]])
+        assert len(read_table(tmp_path / "out" / f"{name}.csv")) == rows
+    assert len(read_table(tmp_path / "out" / "beads.csv")) == 4

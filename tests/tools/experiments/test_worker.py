@@ -1,0 +1,60 @@
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.experiments.worker import Attempt, attempts
+from guiderail.tools.learning.run_folder import installed_versions
+
+
+@dataclass(frozen=True)
+class Job:
+    log: Path
+    error: BaseException | None = None
+
+
+def work(job):
+    if job.error is not None:
+        raise job.error
+    return [{"success_rate": 1.0}]
+
+
+def test_who_took_a_job_and_what_became_of_it_is_in_its_log(tmp_path):
+    job, attempt = Job(tmp_path / "log.txt"), Attempt(work, installed_versions())
+    assert attempts(job.log) == 0
+    assert attempt(job).rows == ({"success_rate": 1.0},)
+    known = job.log.stat().st_size
+    assert (attempts(job.log), attempts(job.log, known)) == (1, 0)
+    assert "is done" in job.log.read_text()
+    attempt(job)
+    assert attempts(job.log, known) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence", "traced"),
+    [
+        (InputError("learning diverged: train with less"), "learning diverged: train with less", False),
+        (ZeroDivisionError("by\nzero"), "ZeroDivisionError: by zero (the traceback is in ", True),
+        (SystemExit("abort: Failure at plant.cc"), "SystemExit: abort: Failure at plant.cc (", True),
+    ],
+)
+def test_whatever_happens_is_one_sentence(error, sentence, traced, tmp_path):
+    job = Job(tmp_path / "log.txt", error)
+    failure = Attempt(work, installed_versions())(job).failure
+    assert failure.startswith(sentence)
+    assert "\n" not in failure
+    assert ("Traceback" in job.log.read_text()) == traced
+
+
+def test_a_worker_with_other_versions_does_nothing(tmp_path):
+    job = Job(tmp_path / "log.txt")
+    failure = Attempt(work, installed_versions() | {"numpy": "0.9"})(job).failure
+    assert "and 0.9 is wanted: install the same versions" in failure
+    assert not job.log.exists()
+
+
+def test_a_worker_that_does_not_see_the_folder_does_nothing(tmp_path):
+    failure = Attempt(work, installed_versions())(Job(tmp_path / "elsewhere" / "log.txt")).failure
+    assert "--out must be a folder that all workers share" in failure
+    assert not (tmp_path / "elsewhere").exists()

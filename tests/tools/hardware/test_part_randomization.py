@@ -1,0 +1,35 @@
+"""A simulated robot's parts are put where a simulation's reset would put them."""
+
+import numpy as np
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.envs.config import validated
+from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa
+from guiderail.tools.hardware.part_randomization import Places, put
+
+SEED = 30
+
+
+def test_the_same_seed_puts_them_where_a_simulations_resets_do():
+    task = resolve("BncConnector", {"uncertainty": "calibration"}).task
+    lcm = DrakeLcm("memq://")
+    robot = SimulatedIiwa(task.world(), lcm)
+    context = robot.CreateDefaultContext()
+    put(lcm, IIWA_DRIVER, task, robot, context)
+    places, rng = Places(task, lcm, IIWA_DRIVER, SEED), np.random.default_rng(7)
+    simulated = resolve("BncConnector", {"uncertainty": "calibration"}).task
+    simulated.offsets.draw(np.random.default_rng(SEED), validated(simulated.Reset, {}, "a reset"))
+    others, jacks = np.random.default_rng(7), []
+    plant = robot.plant
+    own = plant.GetMyContextFromRoot(context)
+    for options in ({}, {"held_out": True}):
+        drawn = places(rng, options)
+        lcm.HandleSubscriptions(0)
+        expected = simulated.offsets.draw(others, validated(simulated.Reset, options, "a reset"))
+        np.testing.assert_array_equal(drawn["jack_offset"], expected[0])
+        np.testing.assert_array_equal(drawn["grasp_offset"], expected[1])
+        jacks.append(plant.GetBodyByName("jack").EvalPoseInWorld(own).translation())
+        nominal = plant.GetBodyByName("jack").EvalPoseInWorld(plant.CreateDefaultContext()).translation()
+        np.testing.assert_allclose((jacks[-1] - nominal)[:2], expected[0], atol=1e-12)
+    np.testing.assert_array_equal(*jacks)  # hidden, and the same for a whole run

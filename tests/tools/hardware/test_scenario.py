@@ -1,0 +1,108 @@
+from pathlib import Path
+
+import pytest
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.hardware.station import SimulatedIiwa
+from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli.main import main
+from guiderail.tools.hardware.connection import Other
+from guiderail.tools.hardware.scenario import load_scenario
+
+SHIPPED = Path(__file__).parents[3] / "examples" / "connector.scenario.yaml"
+OF_BUS = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only, lcm_bus: bus, %s}}\n"
+DRIVER = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only, lcm_bus: bus}}\n"
+BUS = "lcm_buses: {bus: {lcm_url: 'udpm://239.255.76.67:7668?ttl=0'}}\n"
+
+
+@pytest.fixture
+def written(tmp_path):
+    def written(text):
+        path = tmp_path / "scenario.yaml"
+        path.write_text(text)
+        return path
+
+    return written
+
+
+def test_one_word_switches_between_a_simulated_robot_and_a_real_one(written):
+    simulated, real = (
+        Other.in_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
+    )
+    assert (simulated.rehearse, real.rehearse) == (True, False)
+    assert (simulated.robot, real.robot) == ("iiwa14", "iiwa14")
+    assert real.environment("hardware")["lcm_url"] == "udpm://239.255.76.67:7668?ttl=0"
+    # A rehearsal never speaks where a driver may listen.
+    assert simulated.environment("hardware")["lcm_url"] != real.environment("hardware")["lcm_url"]
+    with pytest.raises(InputError, match="a bus of its own"):
+        Other(rehearse=True, lcm_url="udpm://239.255.76.67:7667")
+    assert Other.in_scenario(None, robot="panda").robot == "panda"
+    assert Other.in_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot == "panda"
+
+
+def test_the_shipped_one_is_a_rehearsal():
+    assert Other.in_scenario(SHIPPED).rehearse
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("station: both\n", "hardware or simulation"),
+        ("{}\n", "exactly one robot"),
+        ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "takes torques"),
+        (DRIVER, "none of its own"),
+        ("directives: 3\n", "is no scenario"),
+        ("{{", "is no scenario"),
+        ("nonsense: 1\n", "nonsense"),
+        (BUS.replace("'}}", "', channel_suffix: _LEFT}}") + DRIVER, "channel_suffix is '_LEFT'"),
+        (BUS + OF_BUS % "lcm_status_period: 0.001", "lcm_status_period is 0.001"),
+        (BUS + OF_BUS % "desired_kp_gains: [1, 2]", "desired_kp_gains"),
+    ],
+)
+def test_refuses_in_a_sentence(written, text, words):
+    with pytest.raises(InputError, match=words) as refused:
+        load_scenario(written(text))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [({"robot": "panda"}, "--robot panda"), ({"lcm_url": "udpm://239.255.76.67:7777?ttl=0"}, "--lcm-url udpm")],
+)
+def test_another_robot_or_bus_than_the_files_is_refused(written, given, words):
+    file = written(f"station: hardware\n{BUS}{DRIVER}")
+    with pytest.raises(InputError, match=words):
+        Other.in_scenario(file, **given)
+    same = Other.in_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
+    assert same == Other.in_scenario(file)
+
+
+def test_a_robot_is_the_scenarios_unless_another_one_is_named(written, capsys):
+    file = written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")
+    for more, words in (([], "not a run"), (["--robot", "iiwa14"], "--robot iiwa14")):
+        with pytest.raises(SystemExit) as end:
+            main(["run", str(file.parent), "--scenario", str(file), *more])
+        assert end.value.code == 2
+        assert words in capsys.readouterr().err
+
+
+def test_directives_say_what_stands_around_a_simulated_robot(written, tmp_path):
+    box = tmp_path / "box.sdf"
+    box.write_text(
+        "<sdf version='1.9'><model name='box'><link name='box'><collision name='c'><geometry><box><size>1 1 1</size>"
+        "</box></geometry></collision></link></model></sdf>"
+    )
+    directives = f"""
+directives:
+- add_model: {{name: box, file: 'file://{box}'}}
+- add_weld: {{parent: world, child: 'box::box'}}
+"""
+    scenario = load_scenario(written(BUS + DRIVER + directives))
+    robot = SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=scenario.directives)
+    assert robot.plant.HasModelInstanceNamed("box")
+    lost = load_scenario(
+        written(BUS + DRIVER + "directives: [{add_model: {name: box, file: 'file:///nowhere.sdf'}}]\n")
+    )
+    with pytest.raises(InputError, match="can't be added"):
+        SimulatedIiwa(BncWorkcell(), DrakeLcm("memq://"), directives=lost.directives)

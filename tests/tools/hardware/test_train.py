@@ -1,0 +1,349 @@
+"""Learning on a robot: episodes as motions, both sides of the bus in one process."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+from injections.together import Together
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.envs.assemble import assemble
+from guiderail.diagrams.envs.make import make_guidance, make_station, resolve
+from guiderail.diagrams.hardware.station import IIWA_DRIVER
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import Fault
+from guiderail.models.policy import Policy
+from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.evaluation.step_log import read_ledger
+from guiderail.tools.hardware.connection import Other
+from guiderail.tools.hardware.evaluate import evaluate_on_robot
+from guiderail.tools.hardware.robot_env import RobotEnv
+from guiderail.tools.hardware.session import AtRobot, at_robot
+from guiderail.tools.hardware.sim_driver import START
+from guiderail.tools.hardware.slow_motion import CRAWL
+from guiderail.tools.hardware.train import _learn, train_on_robot
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import configure
+from guiderail.tools.teleop.teleoperator import Keys
+
+OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "reward": "shaped", "hold": 5}
+
+
+def make(patch, start, **options):
+    """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
+    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS | options)
+    patch.setattr(resolved.task, "num_steps", 10)
+    with patch.context() as bus:
+        bus.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
+        station = make_station(resolved)
+    task = assemble(resolved.task, station, make_guidance(resolved, station))
+    pace, keys, asked = Together(resolved.task.world(), lcm, start), Keys(), []
+    begin = resolved.task.start(np.random.default_rng(0))
+    elsewhere = station.alike(resolved.task.world())
+    env = RobotEnv(task, station, elsewhere, begin, pace, hold=5, keys=keys, go_on=asked.append, say=lambda words: None)
+    env.pace, env.keys, env.asked, env.begin = pace, keys, asked, begin
+    return env
+
+
+@pytest.fixture(scope="module")
+def shared():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("guiderail.tools.hardware.slow_motion.SETTLE", 0.1)
+        env = make(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+        yield env
+
+
+@pytest.fixture
+def env(shared):
+    shared._try(lambda: None)  # the test before may have left the arm at rest
+    shared.asked.clear()
+    shared.keys.take_back()
+    return shared
+
+
+def still(observation):
+    return np.zeros(2)
+
+
+def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
+    assert all(check.is_well for check in env.checks())
+    for index in range(2):
+        row = rollout(env, still, index=index)
+        assert (row["termination"], row["steps"], env.asked) == ("time_limit", 10, [])
+        np.testing.assert_allclose(env.trace.measured[0][:3], env.begin[:3], atol=2e-3)
+        assert (env.trace.signals["holding"] == 0.0).all()
+        env.idle()
+    with pytest.raises(InputError, match="takes no options"):
+        env.reset(options={"offset": (0.0, 0.0)})
+
+
+def test_in_a_rehearsal_a_reset_draws_what_a_simulations_does(env, monkeypatch):
+    monkeypatch.setattr(env, "_places", lambda rng, options: {"drawn": (float(rng.random()), options)})
+    _, info = env.reset(seed=3, options={"held_out": True})
+    assert info["drawn"] == (float(np.random.default_rng(3).random()), {"held_out": True})
+
+
+def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_path):
+    @contextmanager
+    def there(config, other, *, yes, say):
+        assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
+        yield AtRobot(env, dict)
+
+    monkeypatch.setattr("guiderail.tools.hardware.evaluate.at_robot", there)
+    learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
+    RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
+    env.keys.wants_pause = True
+    found = evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
+    assert (found["episodes"], found["success_rate"]) == (2, 0.0)
+    assert (env.asked, env.keys.wants_pause) == (["somebody asked for it"], False)  # after the first, and once
+    rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
+    assert rows["termination"].tolist() == ["time_limit"] * 2
+    with pytest.raises(InputError, match="already exists"):
+        evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
+    with pytest.raises(InputError, match="at least one"):
+        evaluate_on_robot(tmp_path, Other(), 0)
+    # Two at once, neither of which has a row yet: nobody replaces the other's.
+    elsewhere = tmp_path / "elsewhere"
+    with RunFolder(elsewhere).locked(), pytest.raises(InputError, match="another process"):
+        evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still, out=elsewhere)
+    assert not list(elsewhere.glob("*.csv"))
+
+
+def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, tmp_path, forkserver):
+    small = {"units": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_every": 1}
+    given = {"algorithm": "sac", "episodes": 5, "settings": small}
+    config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **given)
+    folder, idle, before = RunFolder(tmp_path), env.idle, []
+
+    def refuse():
+        before.append([file.name for file in tmp_path.rglob("*") if file.is_file()])
+        idle()
+        if len(before) == 4:  # the first of the second episode
+            raise InputError("not confirmed: nothing moves")
+
+    monkeypatch.setattr(env, "idle", refuse)
+    with pytest.raises(InputError, match="not confirmed"):
+        _learn(folder, config, env, waits=True, report=lambda row: None)
+    assert "policy.json" not in before[-1]
+    assert folder.episodes()["termination"].tolist() == ["time_limit"] * 2
+    assert len(read_ledger(folder.ledger)) == 20
+    assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
+    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.ASKED  # at rest
+
+
+def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
+    env.reset()
+    env.step(np.zeros(2))
+    env.keys.press()
+    _, _, _, truncated, info = env.step(np.zeros(2))
+    assert (truncated, info["termination"], info["stopped"]) == (True, "stopped", "somebody asked for it")
+    velocities = env.pace.robot.plant.GetVelocities(
+        env.pace.robot.plant.GetMyContextFromRoot(env.pace.simulator.get_context())
+    )
+    assert np.abs(velocities).max() < 0.01
+    assert env.asked == []
+    env.reset()
+    assert env.asked == ["somebody asked for it"]
+
+
+def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decision_that_was_cut(monkeypatch):
+    monkeypatch.setattr("guiderail.tools.hardware.slow_motion.SETTLE", 0.1)
+    env = make(monkeypatch, START, guidance="residual", bound=0.0005)
+    decisions = []
+
+    def act(observation):
+        decisions.append(observation)
+        if len(decisions) == 2:
+            env.pace.happens = {env.pace.step + 16: env.keys.press}  # in the decision's fourth of five control steps
+        return np.full(2, len(decisions) - 1.0)
+
+    infos = []
+    step = env.step
+    monkeypatch.setattr(env, "step", lambda action: infos.append(found := step(action)) or found)
+    row = rollout(env, act)
+    assert (row["termination"], row["steps"]) == ("stopped", 8)
+    for column, key, signal in (
+        ("worst_violation", "constraint_violation", "commanded_violation"),
+        ("worst_measured_violation", "measured_violation", "measured_violation"),
+    ):
+        seen = env.trace.signals[signal]
+        assert row[column] == seen.max() > seen[:5].max()
+        assert infos[-1][-1][key] == seen[5:].max()
+    assert infos[-1][-1]["contact_force"] == env.trace.force[5:].max()
+
+
+@pytest.fixture
+def ready(monkeypatch):
+    """An arm that waits for `at_robot`, which is told to begin; and what a person is asked."""
+    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
+    pace, asked = Together(resolved.task.world(), lcm, START), []
+
+    @contextmanager
+    def nobody(other, *where):
+        yield
+
+    monkeypatch.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
+    monkeypatch.setattr(Other, "standing_in", nobody)
+    monkeypatch.setattr(Other, "paces", lambda other, station: (pace, None))
+    monkeypatch.setattr("guiderail.tools.hardware.session.hurry", lambda: True)
+    monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", asked.append)
+    config = configure("BncConnector", OPTIONS, seed=0, episodes=1)
+    return pace, asked, lambda: at_robot(config, Other(), yes=False, say=lambda words: None)
+
+
+@pytest.mark.parametrize("name", ["start", "deputy", "commands"])
+def test_what_changes_while_the_person_thinks_is_seen_before_the_arm_moves(ready, monkeypatch, name):
+    pace, _, begin = ready
+    lcm = pace.deputy._lcm
+
+    def change(question):
+        if name == "start":
+            pose = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
+            pace.robot.set_pose(pace.simulator.get_mutable_context(), pose)
+        elif name == "deputy":
+            monkeypatch.setattr(pace.deputy, "_driver", replace(IIWA_DRIVER, command_channel="ANOTHER"))
+        else:
+            lcm.Publish(IIWA_DRIVER.command_channel, IIWA_DRIVER.encode(1.0, np.zeros(7)))
+
+    monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", change)
+    with pytest.raises(InputError, match=f"stays where it is: {name}"), begin():
+        pass
+
+
+def test_time_in_which_nobody_moves_the_arm_is_no_gap_between_its_statuses(ready, monkeypatch):
+    """Of the person who reads, and of whatever is made before the first reset."""
+    pace, asked, begin = ready
+    with begin() as robot:
+        assert (len(asked), robot.env._heard.count) == (1, 0)  # nothing was sent yet
+        begun, step = [], pace.step
+        monkeypatch.setattr(pace, "begin", lambda: begun.append(pace.step))
+        robot.env._take_over()
+        assert begun == [step]
+
+
+def test_an_arm_that_somebody_else_commands_is_left_alone(monkeypatch):
+    env = make(monkeypatch, START)
+
+    def check():
+        return {one.name: one.is_well for one in env.checks()}["commands"]
+
+    assert check()
+    env._elsewhere.lcm.Publish(IIWA_DRIVER.command_channel, IIWA_DRIVER.encode(1.0, np.zeros(7)))
+    env._pass(1)
+    assert not check()
+
+
+def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch):
+    """What is judged then is a status of now: not one from before the question, nor that nobody listened meanwhile."""
+    env = make(monkeypatch, START)
+    env.pace.clock = 100.0
+
+    def think(words):
+        env.asked.append(words)
+        env.pace.clock += 60.0
+
+    env._go_on = think
+    env.reset()
+    env.keys.press()
+    env.step(np.zeros(2))
+    env.reset()
+    assert env.asked == ["somebody asked for it"]
+    assert env._acting.get_phase_output_port().Eval(env._mine)[0] == Phase.RUNNING
+
+
+def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypatch):
+    """Not at the greatest speed that its commands may have, and not into what it was pulled out of."""
+    env = make(monkeypatch, START)
+    env.reset()
+    env.step(np.zeros(2))
+    env.keys.press()
+    env.step(np.zeros(2))
+    context = env.pace.simulator.get_mutable_context()
+    env.pace.robot.set_pose(context, env.pose + [0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
+    places, advance = [], env._advance
+
+    def watched():
+        advance()
+        places.append(env.pose[:3])
+
+    monkeypatch.setattr(env, "_advance", watched)
+    env.reset()
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / env.task.control_period
+    assert speeds.max() < 2.0 * CRAWL
+    assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
+
+
+def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought_to_rest(env):
+    def interrupt(context):
+        raise KeyboardInterrupt
+
+    env.reset()
+    env.step(np.ones(2))
+    env.simulator.set_monitor(interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        env.step(np.ones(2))
+    env.rest()
+    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.ASKED
+    plant = env.pace.robot.plant
+    velocities = plant.GetVelocities(plant.GetMyContextFromRoot(env.pace.simulator.get_context()))
+    assert np.abs(velocities).max() < 0.01
+
+
+def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(env):
+    env.reset()
+    env.step(np.zeros(2))
+    step = env.pace.step
+    env.pace.happens = {
+        step + 3: lambda: setattr(env.pace, "is_silent", True),
+        step + 30: lambda: setattr(env.pace, "is_silent", False),
+    }
+    _, _, terminated, truncated, info = env.step(np.zeros(2))
+    assert (terminated, truncated, info["termination"], info["is_success"]) == (False, True, "stopped", False)
+    assert env.fault == Fault.STALE
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+    env.reset()
+    assert len(env.asked) == 1
+    row = rollout(env, still)
+    assert row["termination"] == "time_limit"
+
+
+def test_what_stops_a_reset_stops_no_more_than_that(env):
+    env.pace.happens = {env.pace.step + 20: env.keys.press}
+    env.reset()
+    assert env.asked == ["somebody asked for it"]
+    assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
+
+
+def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, monkeypatch):
+    for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
+        one._try(one._take_over)
+        assert one._holds() == holds
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "words"),
+    [("GridClamp", {}, "nobody wrote down"), ("BncConnector", {"reward": "aligned"}, "a simulation alone knows")],
+)
+def test_refuses_what_a_robot_cannot_tell(task, options, words, tmp_path):
+    with pytest.raises(InputError, match=words):
+        train_on_robot(
+            task, tmp_path / "run", Other(rehearse=True), environment={"station": "hardware"} | options, given={}
+        )
+
+
+def test_refuses_what_nobody_can_show_it(tmp_path):
+    with pytest.raises(InputError, match="demonstration_episodes"):
+        train_on_robot(
+            "BncConnector",
+            tmp_path / "run",
+            Other(rehearse=True),
+            environment={"station": "hardware", "guidance": "kgrl"},
+            given={},
+            settings={"demonstration_episodes": 1},
+        )
+    assert not (tmp_path / "run").exists()

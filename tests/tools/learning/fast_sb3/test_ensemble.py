@@ -1,0 +1,151 @@
+"""The gradient step against Stable-Baselines3's own, from the same parameters, batches and random draws."""
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import Env, spaces
+from sb3_contrib import TQC
+from sb3_contrib.common.utils import quantile_huber_loss
+from stable_baselines3 import SAC
+from torch.nn.utils import parameters_to_vector
+
+from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.fast_sb3.ensemble import Ensemble
+from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
+
+STEPS, BATCH = 6, 64
+
+
+class Vector(Env):
+    observation_space = spaces.Box(-10, 10, (13,), np.float32)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+
+class Image(Vector):
+    observation_space = spaces.Box(0, 255, (3, 10, 15), np.uint8)
+
+
+class PlainSac(OffPolicyLearner):
+    algorithm = SAC
+
+
+class PlainTqc(OffPolicyLearner):
+    algorithm = TQC
+
+
+PAIRS = [(PlainSac, SacLearner), (PlainTqc, TqcLearner)]
+
+
+def make(kind, preset="robust", env=Vector, **settings):
+    settings = {"units": "32,24", "batch_size": BATCH, "symmetry": False, "learning_rate": 1e-4} | settings
+    learner = kind(resolve_preset(preset, "tqc", settings), env(), hold=10, seed=0, decisions=300)
+    random, space = np.random.default_rng(0), env.observation_space
+    for index in range(200):
+        seen, then = random.uniform(0, 2, (2, *space.shape)).astype(space.dtype)
+        if len(space.shape) == 3:
+            seen, then = (np.moveaxis(image, 0, -1) for image in (seen, then))
+        action, reward = random.uniform(-1, 1, 2).astype(np.float32), float(3 * random.normal())
+        learner.remember(Decision(seen, action, reward, then, index % 50 == 49, False, {}))
+    return learner
+
+
+def train_both(plain, ensemble, seed=0):
+    """On the same batches: Stable-Baselines3 draws them one by one, and ours all at once."""
+    np.random.seed(seed)  # noqa: NPY002 (Stable-Baselines3 samples from it)
+    batches = plain.model.replay_buffer.sample(STEPS * BATCH)
+    each = iter(zip(*[of_all.split(BATCH) for of_all in batches], strict=True))
+    for learner, sample in (
+        (plain, lambda _, env=None: type(batches)(*next(each))),
+        (ensemble, lambda _, env=None: batches),
+    ):
+        learner.model.replay_buffer.sample = sample
+        torch.manual_seed(seed)
+        learner.model.train(STEPS, BATCH)
+        del learner.model.replay_buffer.sample
+
+
+def same(plain, ensemble, tolerance):
+    for network in ("actor", "critic", "critic_target"):
+        expected, found = (parameters_to_vector(getattr(x.model, network).parameters()) for x in (plain, ensemble))
+        torch.testing.assert_close(found.detach(), expected.detach(), rtol=0, atol=tolerance)
+    if plain._entropy() is not None:
+        torch.testing.assert_close(ensemble._entropy(), plain._entropy().detach(), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
+@pytest.mark.parametrize(
+    ("preset", "settings"),
+    [("robust", {}), ("quick", {"n_steps": 3}), ("quick", {"entropy": "0.2", "units": "16"})],
+)
+def test_it_is_the_gradient_step_of_stable_baselines3(plain, ensemble, preset, settings):
+    expected, found = make(plain, preset, **settings), make(ensemble, preset, **settings)
+    same(expected, found, 0.0)
+    for seed in range(2):
+        train_both(expected, found, seed)
+        same(expected, found, 2e-6)
+    # A step of Adam is the same whatever a gradient is multiplied with; the actor's is left by both.
+    gradient = torch.cat([p.grad.flatten() for p in expected.model.actor.parameters()])
+    largest = gradient.abs().max()
+    torch.testing.assert_close(found.model.actor.optimizer.gradient / largest, gradient / largest, rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
+def test_images_are_averaged_and_scaled_as_there(plain, ensemble):
+    expected, found = make(plain, env=Image), make(ensemble, env=Image)
+    train_both(expected, found)
+    same(expected, found, 2e-6)
+
+
+def test_the_gradient_of_the_critics_is_that_of_the_quantile_huber_loss():
+    learner = make(TqcLearner)
+    generator = torch.Generator().manual_seed(0)
+    values = (2 * torch.randn(2, BATCH, 25, generator=generator)).requires_grad_()
+    target = 2 * torch.randn(BATCH, 46, generator=generator)
+    loss = quantile_huber_loss(values.transpose(0, 1), target[:, None], sum_over_quantiles=False)
+    (expected,) = torch.autograd.grad(loss, values)
+    found = learner.model._critic_gradient(values.detach(), target)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-9)
+
+
+@pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
+def test_a_checkpoint_of_stable_baselines3s_own_step_goes_on(plain, ensemble):
+    expected, found = make(plain), make(ensemble)
+    train_both(expected, make(ensemble))
+    arrays, values = expected.state()
+    found.restore({key: np.ascontiguousarray(value).copy() for key, value in arrays.items()}, values)  # as in a file
+    assert found.state()[0].keys() == arrays.keys()
+    train_both(expected, found, seed=1)
+    same(expected, found, 2e-6)
+
+
+def test_moments_of_other_networks_do_not_fit():
+    optimizer = make(SacLearner).model.actor.optimizer
+    optimizer.step()
+    stored = optimizer.state_dict()["state"]
+    with pytest.raises(ValueError, match="another shape"):
+        optimizer.load_state_dict({"state": stored | {0: {name: value.flatten() for name, value in stored[0].items()}}})
+    with pytest.raises(ValueError, match="moments of 1"):
+        optimizer.load_state_dict({"state": {0: stored[0]}})
+
+
+def test_layers_whose_gradient_is_not_written_out_are_refused():
+    class Other(Ensemble, SAC):
+        pass
+
+    with pytest.raises(TypeError, match="GELU"):
+        Other("MlpPolicy", Vector(), policy_kwargs={"activation_fn": torch.nn.GELU})
+
+
+def test_learning_does_not_wait_for_pytorchs_compiler(forks):
+    code = """
+import sys
+from guiderail.tools.learning.ensemble import EnsembleSac, EnsembleTqc
+from gymnasium import Env, spaces
+class Vector(Env):
+    observation_space = action_space = spaces.Box(-1, 1, (2,))
+for algorithm in (EnsembleSac, EnsembleTqc):
+    algorithm("MlpPolicy", Vector())
+sys.exit("torch._dynamo" in sys.modules)
+"""
+    assert forks.run("-c", code).returncode == 0

@@ -1,0 +1,64 @@
+"""Learning in a process of its own, beside acting."""
+
+import gymnasium
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.step_log import read_ledger
+from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.pipelined import Student, _written
+
+
+def made(**more):
+    """A student of two numbers, its learner, and what its process is told."""
+    space = gymnasium.Env()
+    space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+    space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    small = {"units": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_every": 1}
+    preset = resolve_preset("robust", "sac", small)
+    named = {"hold": 1, "seed": 0, "decisions": 100, "symmetry": None}
+    acting = LEARNERS.get("sac")(preset, space, **named)
+    return Student(acting, ((preset, space), named), waits=True, **more), acting
+
+
+def test_a_ledger_is_whole_or_not_there(tmp_path, monkeypatch):
+    rows, file = pa.table({"episode": np.zeros(9, np.int32)}), tmp_path / "ledger" / "episode-000000.parquet"
+
+    def fail(*names):
+        raise OSError("the process was killed")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", fail)
+        assert isinstance(_written(None, file, rows), InputError)
+    assert list(tmp_path.rglob("*.parquet")) == []
+    _written(None, file, rows)
+    assert len(read_ledger(file.parent)) == 9
+
+
+def test_a_ledger_that_cannot_be_written_is_said_by_who_acts(forkserver, tmp_path):
+    (tmp_path / "file").write_text("")
+    student, _ = made()
+    student.write(tmp_path / "file" / "episode-000000.parquet", pa.table({"episode": [0]}))
+    with pytest.raises(InputError, match="cannot be written"):
+        student.finish()
+
+
+def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(forkserver):
+    student, acting = made(leaves_out=("stopped",))
+    before = acting.actor().state_dict()["mu.weight"].clone()
+    rng, last = np.random.default_rng(0), {"success": False}
+    for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):
+        student.begin()
+        for _ in range(6):
+            observation, action = rng.uniform(-1, 1, 3).astype(np.float32), student.act(np.zeros(3, np.float32))
+            student.see(Decision(observation, action, 0.0, observation, False, False, {}))
+        assert (student.known, student.late) == (known, 0)
+        student.end({"termination": termination, **last})
+        student.hand_over()
+    student.finish()
+    assert (student.known, acting.decisions, acting.episodes) == (4, 24, 4)
+    assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])

@@ -1,0 +1,436 @@
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pandas as pd
+import pytest
+import threadpoolctl
+from safetensors.numpy import load_file
+
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.evaluate import kept_file
+from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import configure, run, with_defaults
+from guiderail.tools.learning.trainer import train
+
+# Trains like the fixture's run, and says after each episode that it is over; then the parent pulls the plug.
+CHILD = """
+import sys
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import bead
+bead.register()
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
+from guiderail.tools.learning.configure import configure
+settings = dict(units="16", batch_size=16, learning_starts=10, gradient_steps=4)
+train(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
+      report=lambda row: print(row["episode"], flush=True))
+"""
+
+
+def without_clock(rows):
+    return pd.DataFrame(rows).drop(columns="wall_time").to_dict("records")
+
+
+def assert_same_run(first, second):
+    assert without_clock(first.episodes()) == without_clock(second.episodes())
+    a, b = load_file(first.path / "policy.safetensors"), load_file(second.path / "policy.safetensors")
+    assert a.keys() == b.keys()
+    for key in a:
+        np.testing.assert_array_equal(a[key], b[key])
+    assert ledger_bytes(first) == ledger_bytes(second) != {}
+
+
+def ledger_bytes(folder):
+    return {path.name: path.read_bytes() for path in folder.ledger.iterdir()}
+
+
+def shown(config, number):
+    return replace(config, learner=replace(config.learner, demonstration_episodes=number))
+
+
+def always_left(env):
+    return lambda observation: env.action_space.low
+
+
+def test_a_demonstrator_acts_in_the_first_episodes_and_the_learner_after(bead_config, tmp_path):
+    acted = []
+
+    def watched(env):
+        acted.append(0)
+
+        def act(observation):
+            acted[-1] += 1
+            return env.action_space.low
+
+        return act
+
+    rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=watched)
+    assert acted[1:] == [row["steps"] for row in rows[:2]]  # the first was asked before anything moved
+    assert len(rows) > 2
+
+
+def test_a_run_that_was_demonstrated_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+    config = shown(bead_config, 2)
+    undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
+    train(undisturbed, config, demonstrator=always_left)
+    train(stopped, replace(config, episodes=1), demonstrator=always_left)
+    train(stopped, config, demonstrator=always_left, resume=True)
+    assert_same_run(undisturbed, stopped)
+
+
+def test_who_looks_at_what_is_not_there_demonstrates_nothing(bead_config, tmp_path):
+    def later(env):
+        return lambda seen: env.action_space.low if seen[0] < 0.5 else env.action_space.low * seen[99]
+
+    with pytest.raises(InputError, match="sees or moves other things"):
+        train(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=later)
+
+
+def test_where_nobody_demonstrates_a_run_is_refused_before_it_begins(bead_config, tmp_path):
+    with pytest.raises(InputError, match="demonstration_episodes"):
+        train(RunFolder(tmp_path / "run"), shown(bead_config, 1))
+    assert not (tmp_path / "run").exists()
+
+
+def test_who_moves_other_things_demonstrates_nothing(bead_config, tmp_path):
+    with pytest.raises(InputError, match="moves other things"):
+        train(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=lambda env: lambda seen: np.zeros(7))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
+    undisturbed, killed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "killed")
+    train(undisturbed, bead_config)
+    code = CHILD.format(tests=str(Path(__file__).parents[1]), out=str(killed.path))
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        for line in child.stdout:
+            if int(line) == 4:
+                os.kill(child.pid, signal.SIGKILL)
+                break
+    assert child.returncode == -signal.SIGKILL
+    assert not (killed.path / "policy.safetensors").exists()
+    train(killed, bead_config, resume=True)
+    assert_same_run(undisturbed, killed)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_another(bead_config, tmp_path):
+    folders = [RunFolder(tmp_path / name) for name in "abc"]
+    for folder, seed in zip(folders, (5, 5, 6), strict=True):
+        train(folder, replace(bead_config, seed=seed))
+    assert_same_run(folders[0], folders[1])
+    assert without_clock(folders[0].episodes()) != without_clock(folders[2].episodes())
+
+
+def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
+    long, extended = RunFolder(tmp_path / "long"), RunFolder(tmp_path / "extended")
+    train(long, bead_config)
+    train(extended, replace(bead_config, episodes=3))
+    train(extended, bead_config, resume=True)
+    assert_same_run(long, extended)
+    assert extended.config() == bead_config
+
+
+def test_a_run_that_is_killed_learning_on_has_no_policy_of_fewer_episodes(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, replace(bead_config, episodes=2))
+
+    class Killed(Exception):
+        pass
+
+    def kill(row):
+        raise Killed
+
+    with pytest.raises(Killed):
+        train(folder, replace(bead_config, episodes=3), resume=True, report=kill)
+    with pytest.raises(InputError, match="finish it with --resume"):
+        Policy.load(folder.path)
+    train(folder, replace(bead_config, episodes=3), resume=True)
+    before = Policy.load(folder.path).description
+    train(folder, replace(bead_config, episodes=3), resume=True)
+    assert Policy.load(folder.path).description == before, "of a finished one nothing is removed"
+
+
+def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path, forkserver):
+    """Whatever was not learned yet when it stopped is learned then."""
+    plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
+    config = replace(plain, learner=replace(plain.learner, pipelined=True))
+    undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
+    rows = train(undisturbed, config)
+
+    class Stop(Exception):
+        pass
+
+    def stop(row):
+        if row["episode"] == 4:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(stopped, config, report=stop)
+    train(stopped, config, resume=True)
+    assert_same_run(undisturbed, stopped)
+    # Another run than one that learns between its episodes: what is known is an episode older.
+    train(RunFolder(tmp_path / "other"), plain)
+    assert without_clock(rows) != without_clock(RunFolder(tmp_path / "other").episodes())
+
+
+def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    holds = "import sys; from guiderail.tools.learning.run_folder import RunFolder\n"
+    holds += f"with RunFolder({str(folder.path)!r}).locked(): print('held', flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", holds], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        with pytest.raises(InputError, match="another process writes into"):
+            train(folder, bead_config)
+        other.kill()  # its lock file stays, and holds nobody back
+    (folder.path / f".episodes.csv.{other.pid}.part").write_text("from a process that was killed while writing")
+    with folder.locked():
+        pass
+    train(folder, replace(bead_config, episodes=2))
+    assert {path.name for path in folder.path.iterdir() if path.name.startswith(".")} == set()
+
+
+def test_the_ledger_can_be_turned_off_and_a_run_goes_on_as_it_began(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, replace(bead_config, episodes=2, ledger=False))
+    assert not folder.ledger.exists()
+    with pytest.raises(InputError, match="ledger False, not True"):
+        run(None, folder.path, environment={}, ledger=True, resume=True)
+    # One of a version without ledgers does not get half of one.
+    text = (folder.path / "config.yaml").read_text()
+    (folder.path / "config.yaml").write_text(text.replace("ledger: false\n", ""))
+    assert folder.config().ledger is False
+
+
+def test_a_run_never_replaces_another(bead_config, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="already exists"):
+        train(RunFolder(tmp_path), bead_config)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda folder: folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:-1000]),
+        lambda folder: folder.checkpoint.unlink(),
+        lambda folder: (folder.path / "episodes.csv").write_text("episode,success\n0,1\n"),
+        lambda folder: (folder.path / "config.yaml").write_text("task: [Bead\n"),
+        lambda folder: (folder.path / "config.yaml").write_text("task: Bead\nepisodes: many\n"),
+    ],
+    ids=["truncated checkpoint", "no checkpoint", "another table", "broken yaml", "incomplete yaml"],
+)
+def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, replace(bead_config, episodes=2))
+    damage(folder)
+    before = {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+    with pytest.raises(InputError):
+        run(None, folder.path, environment={}, episodes=4, resume=True)
+    assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
+
+
+def test_a_run_killed_between_checkpoint_and_table_loses_nothing(bead_config, tmp_path):
+    whole, torn = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "torn")
+    train(whole, bead_config)
+    train(torn, replace(bead_config, episodes=4))
+    lines = (torn.path / "episodes.csv").read_text().splitlines(keepends=True)
+    (torn.path / "episodes.csv").write_text("".join(lines[:-1]))
+    train(torn, bead_config, resume=True)
+    assert_same_run(whole, torn)
+
+
+def test_a_complete_run_whose_table_lacks_episodes_gets_them_from_its_checkpoint(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    train(folder, bead_config)
+    table = folder.path / "episodes.csv"
+    whole = table.read_bytes()
+    for left in (b"".join(whole.splitlines(keepends=True)[:2]), None):
+        table.unlink() if left is None else table.write_bytes(left)
+        train(folder, bead_config, resume=True)
+        assert table.read_bytes() == whole
+
+
+def refused_in(episode):
+    """Demonstrates until the episode of that number, in which something is wrong."""
+    asked = []
+
+    def demonstrator(env):
+        asked.append(env)
+        if len(asked) == episode + 2:  # the first was asked before anything moved
+            raise InputError("this is wrong")
+        return always_left(env)
+
+    return demonstrator
+
+
+def test_a_run_that_is_refused_in_its_first_episode_leaves_nothing_in_the_way_of_the_next(bead_config, tmp_path):
+    there = tmp_path / "there"
+    there.mkdir()
+    (there / ".of_somebody").write_text("")
+    for path, is_left in ((tmp_path / "new", []), (there, [".of_somebody"])):
+        with pytest.raises(InputError, match="this is wrong"):
+            train(RunFolder(path), shown(bead_config, 3), demonstrator=refused_in(0))
+        assert path.exists() is bool(is_left)
+        assert [one.name for one in path.glob("*")] == is_left
+    train(RunFolder(tmp_path / "new"), replace(bead_config, episodes=1))
+
+
+def test_a_run_that_is_refused_later_or_going_on_keeps_what_it_has(bead_config, tmp_path):
+    config, later, begun = shown(bead_config, 3), RunFolder(tmp_path / "later"), RunFolder(tmp_path / "begun")
+    with pytest.raises(InputError, match="this is wrong"):
+        train(later, config, demonstrator=refused_in(1))
+    assert len(later.episodes()) == 1
+    begun.create(config)
+    with pytest.raises(InputError, match="this is wrong"):
+        train(begun, config, resume=True, demonstrator=refused_in(0))
+    assert begun.config() == config
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_again(bead_config, tmp_path):
+    whole, begun = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "begun")
+    train(whole, bead_config)
+    begun.create(bead_config)
+    train(begun, bead_config, resume=True)
+    assert_same_run(whole, begun)
+
+
+def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
+    train(RunFolder(tmp_path / "run"), replace(bead_config, episodes=2))
+    with pytest.raises(InputError, match="seed 5, not 7"):
+        run(None, tmp_path / "run", environment={}, seed=7, resume=True)
+    with pytest.raises(InputError, match="other learner settings"):
+        run(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
+
+
+def test_a_run_of_another_version_is_left_as_it_is(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    rows = train(folder, bead_config)
+    arrays, values = load_checkpoint(folder.checkpoint)
+    older = [{key: value for key, value in row.items() if key != "mean_force"} for row in rows]
+    save_checkpoint(folder.checkpoint, arrays, values | {"rows": older})
+    folder.write_episodes(older)
+    before = (folder.path / "episodes.csv").read_bytes()
+    with pytest.raises(InputError, match="another version"):
+        train(folder, replace(bead_config, episodes=9), resume=True)
+    assert (folder.path / "episodes.csv").read_bytes() == before
+
+
+def test_one_thread_does_the_sums():
+    threadpoolctl.threadpool_limits(2)
+    make_environment("Bead", {})
+    assert {pool["num_threads"] for pool in threadpoolctl.threadpool_info()} == {1}
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "algorithm"),
+    [("GridClamp", "clamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "robust", "tqc")],
+)
+def test_a_task_is_learned_as_it_was_measured_unless_told_otherwise(task, preset, algorithm):
+    config = configure(task, {}, **with_defaults(task, {"seed": 3}))
+    assert (config.preset, config.learner.algorithm, config.seed) == (preset, algorithm, 3)
+
+
+def test_a_learner_that_was_asked_for_is_taken_whole():
+    given = with_defaults("GridClamp", {"algorithm": "tqc"})
+    assert given == {"algorithm": "tqc"}
+    assert configure("GridClamp", {"guidance": "none"}, **given).preset == "robust"
+
+
+@pytest.mark.parametrize("pipelined", [False, True])
+def test_a_run_that_diverges_says_so_and_what_it_was_is_kept(pipelined, bead_config, tmp_path, forkserver):
+    learner = replace(bead_config.learner, learning_rate=1e30, constant_episodes=0, pipelined=pipelined)
+    folder = RunFolder(tmp_path / "run")
+    with pytest.raises(InputError, match="diverged"):
+        train(folder, replace(bead_config, learner=learner))
+    assert (folder.path / "config.yaml").exists()
+    assert not (folder.path / "policy.json").exists()
+
+
+def test_more_than_fits_into_memory_is_refused_before_a_run_begins(bead_config, tmp_path, monkeypatch):
+    def vast(*given, **named):
+        raise MemoryError("no 44 GiB")
+
+    monkeypatch.setitem(LEARNERS._entries, "vast", vast)
+    with pytest.raises(InputError, match="buffer_size"):
+        train(RunFolder(tmp_path / "run"), replace(bead_config, learner=replace(bead_config.learner, algorithm="vast")))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_goes_on_by_the_words_that_began_it_and_says_of_other_versions(tmp_path, capsys):
+    words = {"environment": {"guidance": "kgrl", "explored": "0,1"}, "settings": {"units": "8"}}
+    out = tmp_path / "run"
+    run("NarrowPassage", out, episodes=1, **words)
+    folder = RunFolder(out)
+    folder.write_config(replace(folder.config(), versions={**folder.config().versions, "drake": "1.0.0"}))
+    for _ in range(2):
+        run("NarrowPassage", out, episodes=2, resume=True, **words)
+    said = capsys.readouterr().err
+    assert said.count("goes on with other versions: drake 1.0.0, then ") == 1
+    assert folder.config().versions["drake"].startswith("1.0.0, then ")
+    with pytest.raises(InputError, match="has 2 episodes"):
+        run("NarrowPassage", out, episodes=1, resume=True, **words)
+
+
+def one_more(folder, package, kind, register, name):
+    """A file that registers a class like one of a package's under a name of its own."""
+    (module, _, like), (registry, _, decorator) = kind.partition("."), register.partition(".")
+    file = folder / "mine.py"
+    file.write_text(
+        f"from {package}.{module} import {like}\nfrom {package}.{registry} import {decorator}\n"
+        f"@{decorator}({name!r})\nclass Mine({like}):\n    pass\n"
+    )
+    return file
+
+
+def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monkeypatch):
+    monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # no other test has this one
+    kinds = "narrow_passage.NarrowPassage", "registry.register_task"
+    file = one_more(tmp_path, "guiderail.diagrams.tasks", *kinds, "changes/Passage")
+    out = tmp_path / "run"
+    run("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
+    config = RunFolder(out).config()
+    before = kept_file(out, "white", config, config.environment, episodes=2)
+    file.write_text(file.read_text() + "# now it is another one\n")
+    with pytest.raises(InputError, match="are not those that the run"):
+        run(None, out, environment={}, episodes=2, resume=True)
+    assert kept_file(out, "white", config, config.environment, episodes=2) != before
+    gymnasium.registry.pop(environment_id("changes/Passage"), None)
+
+
+def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, forkserver, monkeypatch):
+    monkeypatch.setitem(LEARNERS._entries, "sac_of_mine", None)  # no other test has this one
+    kinds = "off_policy.SacLearner", "learner.register_learner"
+    file = one_more(tmp_path, "guiderail.tools.learning", *kinds, "sac_of_mine")
+    settings = {"units": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
+    done = run(
+        "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "hold": 20}, algorithm="sac_of_mine",
+        settings=settings, episodes=2, imports=[str(file)],
+    )  # fmt: skip
+    assert done["episodes"] == 2
+
+
+def test_a_demonstrated_episode_is_marked(bead_config, tmp_path):
+    rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=always_left)
+    assert [row["demonstrated"] for row in rows[:3]] == [1, 1, 0]
+
+
+def test_a_folder_that_cannot_be_one_is_refused(tmp_path):
+    folder = RunFolder(tmp_path / ("n" * 300))
+    with pytest.raises(InputError, match="folder"):
+        folder.refuse_existing()
+    with pytest.raises(InputError, match="cannot be read"):
+        folder.config()

@@ -1,0 +1,143 @@
+"""The six parts that nobody tuned for: drawn, onboarded and learned by the commands alone, and judged.
+
+`python tests/tools/onboard/learn_parts.py --out FOLDER [--parts square_peg,dovetail] [--episodes 60] [--judged 100]
+[--seed 0] [--processes 2]`; `--episodes 0` onboards alone. What is finished in the folder is used again, and a run that
+was interrupted goes on: the same command makes the rest. It leaves `table.md` and, for each part, a log.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pandas as pd
+import yaml
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from oracles.parts import PARTS
+
+COMMAND = [sys.executable, "-c", "from guiderail.tools.cli.main import main; main()"]
+COLUMNS = (
+    "part", "real-time factor", "deepest [mm]", "allowed [mm]", "aligned", "1.5 mm off", "demonstrations alone",
+    "white",
+    "held out", "converged after", "episodes", "minutes",
+)  # fmt: skip
+
+
+def guiderail(log: Path, *words: object) -> str:
+    """Runs a command, its words and what it says in a log; returns what it printed."""
+    with log.open("a", encoding="utf-8") as file:
+        file.write(f"\n$ guiderail {' '.join(map(str, words))}\n")
+        file.flush()
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(
+            [*COMMAND, *map(str, words)], stdout=subprocess.PIPE, stderr=file, text=True, env=environment, check=False
+        )
+        file.write(done.stdout)
+    if done.returncode:
+        raise RuntimeError(f"guiderail {words[0]} ended with {done.returncode}: see {log}")
+    return done.stdout
+
+
+def finished(kept: Path, make) -> dict:
+    """What a step came to, with the minutes that it took: from its file, where there is one."""
+    if not kept.exists():
+        start = time.perf_counter()
+        found = make()
+        kept.write_text(json.dumps({**found, "minutes": (time.perf_counter() - start) / 60}), encoding="utf-8")
+    return json.loads(kept.read_text(encoding="utf-8"))
+
+
+def onboarded(name: str, out: Path, log: Path) -> dict:
+    """Draws a part and makes it a task."""
+    part, drawn, task = PARTS[name](), out / "drawn" / name, out / "tasks" / name
+    drawn.mkdir(parents=True, exist_ok=True)
+    plug, socket = part.write(drawn)
+    if not task.exists():
+        task.parent.mkdir(exist_ok=True)
+        guiderail(log, "onboard", plug, socket, "--unit", "mm", *part.options, "--out", task)
+    return yaml.safe_load((task / "task.yaml").read_text(encoding="utf-8"))["measured"]
+
+
+def learned(name: str, out: Path, log: Path, episodes: int, seed: int) -> dict:
+    """Trains with what the task recommends, and nothing else said."""
+    run = out / "runs" / name
+    if not (run / "policy.safetensors").exists():
+        how = ["--resume", "--out", run] if (run / "config.yaml").exists() else [out / "tasks" / name, "--out", run]
+        guiderail(log, "train", *how, *([] if "--resume" in how else ["--seed", seed]), "--episodes", episodes)
+    rows = pd.read_csv(run / "episodes.csv")
+    return {"episodes": len(rows), "training_minutes": rows["wall_time"].sum() / 60}
+
+
+def judged(name: str, out: Path, log: Path, episodes: int) -> dict:
+    """Held-out places that training never drew."""
+    said = guiderail(log, "evaluate", out / "runs" / name, "--episodes", episodes, "--beside", "white", "--json")
+    return json.loads(said.strip().splitlines()[-1])
+
+
+def all_of(name: str, out: Path, episodes: int, seed: int, held_out: int) -> list[object]:
+    """A part's row of the table."""
+    log, kept = out / "logs" / f"{name}.txt", out / "kept"
+    measured = finished(kept / f"{name}-onboarded.json", lambda: onboarded(name, out, log))
+    deepest = max(measured["penetration_mm"], measured["penetration_pushed_on_the_rim_mm"])
+    clearance = measured["clearance_mm"]
+    row: list[object] = [name, measured["real_time_factor"], deepest, round(clearance / 2, 4), measured["inserted"]]
+    row.append("/".join("in" if one else "stopped" for one in measured["inserted_1.5_mm_off"]))
+    if not episodes:
+        return [*row, *[""] * 5, f"{measured['minutes']:.1f}"]
+    trained = finished(kept / f"{name}-learned.json", lambda: learned(name, out, log, episodes, seed))
+    found = finished(kept / f"{name}-judged.json", lambda: judged(name, out, log, held_out))
+    minutes = measured["minutes"] + trained["training_minutes"] + found["minutes"]
+    whose = ("demonstration_success_rate", "white_success_rate", "success_rate")
+    alone, white, success = (f"{found[which] * found['episodes']:.0f}" for which in whose)
+    return [
+        *row,
+        alone,
+        white,
+        f"{success} of {found['episodes']}",
+        found["converged_after"],
+        trained["episodes"],
+        f"{minutes:.1f}",
+    ]
+
+
+def main() -> None:
+    """Does what is not there yet, and prints the table as far as it goes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--parts", default=",".join(PARTS))
+    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--judged", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--processes", type=int, default=2)
+    given = parser.parse_args()
+    for folder in ("drawn", "tasks", "runs", "logs", "kept"):
+        (given.out / folder).mkdir(parents=True, exist_ok=True)
+    rows, failed = {}, {}
+    with ThreadPoolExecutor(given.processes) as pool:
+        asked = {
+            name: pool.submit(all_of, name, given.out, given.episodes, given.seed, given.judged)
+            for name in given.parts.split(",")
+        }
+        for name, one in asked.items():
+            try:
+                rows[name] = one.result()
+            except (RuntimeError, OSError, ValueError) as error:
+                failed[name] = str(error)
+            lines = [
+                "| " + " | ".join(map(str, row)) + " |" for row in (COLUMNS, ["---"] * len(COLUMNS), *rows.values())
+            ]
+            (given.out / "table.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print((given.out / "table.md").read_text(encoding="utf-8"))
+    for name, why in failed.items():
+        print(f"{name}: {why}")
+    sys.exit(1 if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,229 @@
+"""Two meshes become a task by the command alone: it is checked, inserted, trained, evaluated and replayed."""
+
+import json
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+
+from guiderail.diagrams.envs.config import validated
+from guiderail.diagrams.tasks.part.file import PartTaskFile
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.models.common import files as writing
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli.main import main
+from guiderail.tools.parts.create_task import ask_unit, onboard, rank
+from guiderail.tools.visualization import replay
+
+pytest.importorskip("trimesh")
+pytest.importorskip("manifold3d")
+
+from oracles.parts import PARTS
+
+
+def call(*arguments, code=0):
+    with pytest.raises(SystemExit) as end:
+        main([str(argument) for argument in arguments])
+    assert end.value.code == code
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The simplest of the six; `learn_parts.py` beside this onboards and learns all of them."""
+    where = tmp_path_factory.mktemp("parts")
+    plug, socket = PARTS["square_peg"]().write(where)
+    call("onboard", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
+    yield where / "peg"
+    # What was registered here is nobody else's.
+    for name in [name for name in TASKS.names() if name.startswith("parts/")]:
+        del TASKS._entries[name]
+        gymnasium.registry.pop(environment_id(name), None)
+
+
+def test_what_was_measured_is_what_was_drawn(folder):
+    measured = yaml.safe_load((folder / "task.yaml").read_text())["measured"]
+    assert measured["clearance_mm"] == pytest.approx(0.1, abs=1e-3)
+    assert measured["inserted"] is True
+    assert measured["inserted_1.5_mm_off"] == [False, False]
+    assert max(measured["penetration_mm"], measured["penetration_pushed_on_the_rim_mm"]) <= 0.05
+    assert measured["demonstrations_seated"] == "5 of 5"
+    page = (folder / "preview.html").read_text()
+    assert "plug" in page
+    assert len(page) > 100_000
+
+
+def test_scenarios_that_would_lie_on_each_other_or_on_the_tasks_own_files_are_refused(tmp_path):
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    for name in ("a/table.yaml", "b/table.yaml", "a/task.yaml", "a/plug.obj"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("directives: []\n")
+    for names, words in (
+        (("a/table.yaml", "b/table.yaml"), "two scenarios are called table.yaml"),
+        (("a/task.yaml",), "not task.yaml"),
+        (("a/plug.obj",), "is no scenario"),
+    ):
+        with pytest.raises(InputError, match=words):
+            onboard(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
+    assert not (tmp_path / "peg").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_refused_in_a_sentence(tmp_path):
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        onboard(plug, socket, tmp_path / "file" / "peg", unit="mm")
+
+
+def test_a_question_is_no_part_of_the_result(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True, readline=lambda: "cm\n"))
+    files = [tmp_path / "plug.stl", tmp_path / "socket.stl"]
+    assert ask_unit(files, None) is None, "of files that are missing nothing is asked"
+    for file in files:
+        file.touch()
+    assert ask_unit(files, None) == "cm"
+    assert capsys.readouterr().out == ""
+
+
+def test_of_contacts_the_fastest_is_chosen_that_is_nowhere_too_deep_or_else_the_least_deep():
+    allowed = 1e-4
+    tried = {
+        "fast": rank(True, 0.9e-4, allowed, 3.0),
+        "shallow and slow": rank(True, 0.2e-4, allowed, 2.5),
+        "a little too deep": rank(True, 1.1e-4, allowed, 2.1),
+        "far too deep, and fast": rank(True, 2.3e-4, allowed, 4.4),
+        "not too deep, and unbearably slow": rank(True, 1.05e-4, allowed, 1.4),
+        "does not seat": rank(False, 0.1e-4, allowed, 9.0),
+    }
+    assert sorted(tried, key=tried.get, reverse=True) == list(tried)
+
+
+def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(replay, "EPISODES", 1)
+    call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
+    capsys.readouterr()
+    call("evaluate", tmp_path / "run", "--episodes", 1, "--beside", "none", "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert found["worst_violation"] <= 1e-9
+    assert (tmp_path / "run/replay.html").is_file()
+
+
+def test_it_is_learned_as_its_folder_recommends(folder):
+    from guiderail.diagrams.envs.make import resolve
+    from guiderail.tools.environments import task_named
+    from guiderail.tools.learning.train import configure, with_defaults
+
+    name, _ = task_named(str(folder))
+    recommended = yaml.safe_load((folder / "task.yaml").read_text())["recommended"]
+    config = configure(name, {}, **with_defaults(name, {"settings": {"batch_size": 32}}))
+    for key, value in recommended["environment"].items():
+        assert config.environment[key] == (tuple(value) if isinstance(value, list) else value)
+    assert (config.learner.symmetry, config.learner.batch_size) == ("near", 32)
+    task = resolve(name, {}).task
+    assert task.symmetry().actions.shape == (7, 2, 2)  # a square has eight sides
+    changed = yaml.safe_load((folder / "task.yaml").read_text())
+    for wrong in ({"sides": ["upside down"]}, {"time_step": 0.003}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            validated(PartTaskFile, changed | wrong, "task.yaml")
+
+
+def test_its_options_are_listed(folder, capsys):
+    call("list", folder)
+    assert "offset_range" in capsys.readouterr().out
+
+
+def test_bounds_from_demonstrations_become_its_own(folder, capsys):
+    from guiderail.diagrams.envs.make import make_env, resolve
+
+    before = (folder / "task.yaml").read_text()
+    try:
+        call("constraints", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--into", folder)
+        constraints = resolve(str(folder), {}).task.constraints()
+        assert constraints.G.shape[0] > 1
+        np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
+        env = make_env(str(folder), horizon=4)
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+    finally:
+        (folder / "task.yaml").write_text(before)
+
+
+def test_bounds_that_cannot_be_written_leave_the_task_as_it_was(folder, monkeypatch, capsys):
+    def fail(*paths):
+        raise OSError(28, "No space left on device")
+
+    before = (folder / "task.yaml").read_text()
+    monkeypatch.setattr(writing.os, "replace", fail)
+    call("constraints", folder / "demonstrations.npz", "--into", folder, code=2)
+    assert "cannot be written" in capsys.readouterr().err
+    assert (folder / "task.yaml").read_text() == before
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_task_as_it_was(folder, tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise InputError("no room")
+
+    before = (folder / "task.yaml").read_text()
+    monkeypatch.setattr("guiderail.tools.datasets.bounds._draw", fail)
+    args = ("--draw", tmp_path / "bounds.png", "--out", tmp_path / "bounds.yaml", "--into", folder)
+    call("constraints", folder / "demonstrations.npz", *args, code=2)
+    assert (folder / "task.yaml").read_text() == before
+    assert not (tmp_path / "bounds.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda text: text.replace("force_limit: 35.0", "force_limit: -3"), "force_limit must be at least 1"),
+        (lambda text: text.replace("file: plug_0.obj", "file: gone.obj"), "names gone.obj"),
+        (lambda text: text.replace("place:", "plaze:"), "did you mean place?"),
+        (lambda text: "format: other\n", "is no task"),
+    ],
+)
+def test_an_edited_number_is_checked(change, says, folder, capsys):
+    before = (folder / "task.yaml").read_text()
+    try:
+        (folder / "task.yaml").write_text(change(before))
+        call("list", folder, code=2)
+        assert says in capsys.readouterr().err
+    finally:
+        (folder / "task.yaml").write_text(before)
+
+
+def test_what_makes_no_sense_is_refused_and_leaves_nothing(folder, tmp_path, capsys):
+    plug, socket = PARTS["bayonet"]().write(tmp_path)
+    for arguments, says in (
+        ((), "does not say its unit"),
+        (("--unit", "ell"), "there is no unit"),
+        (("--unit", "mm"), "does not pass the socket"),
+        (("--unit", "mm", "--axis", "z"), "--axis is one of"),
+        (("--unit", "mm", "--place", "1,2"), "--place takes 6 numbers"),
+        (("--unit", "mm", "--out", folder), "already exists"),
+        (("--unit", "mm", "--friction", "5"), "friction must be at most 2, not 5"),
+        (("--unit", "mm", "--scenario", tmp_path / "none.yaml"), "there is no scenario"),
+    ):
+        out = () if "--out" in arguments else ("--out", tmp_path / "task")
+        call("onboard", plug, socket, *out, *arguments, code=2)
+        assert says in capsys.readouterr().err
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["plug.stl", "socket.stl"]
+
+
+def test_a_part_from_another_direction_is_the_same_task(tmp_path):
+    """Drawn lying along x, and the plug apart from its socket: --axis and --place bring both to the target frame."""
+    from guiderail.tools.parts.create_task import read_parts
+
+    plug, socket = PARTS["square_peg"]().write(tmp_path)
+    upright = read_parts(plug, socket, "mm", (0,) * 6, "+z", None)
+    import trimesh
+
+    turn = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
+    for path in (plug, socket):
+        trimesh.load(path).apply_transform(turn).export(path)
+    trimesh.load(plug).apply_translation([-30.0, 0, 0]).export(plug)
+    lying = read_parts(plug, socket, "mm", (30.0, 0, 0, 0, 0, 0), "+x", None)
+    for one, other in zip(lying, upright, strict=True):
+        np.testing.assert_allclose(one.bounds, other.bounds, atol=1e-8)
+    with pytest.raises(InputError, match="--axis"):
+        read_parts(plug, socket, "mm", (0,) * 6, "up", None)

@@ -1,0 +1,202 @@
+"""Demonstrations by a scripted person at a real page: headless Chromium, whose keys are pressed as a person would.
+
+`python tests/tools/operate/teach_in_browser.py TASK OUT.npz [SCREENSHOT.png]`; it needs chromium and websockets.
+"""
+
+import asyncio
+import base64
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import urllib.request
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import websockets
+
+from guiderail.diagrams.stations.station import CONTROL_PERIOD as PERIOD
+from guiderail.models.objects.bnc_connector.motion import RIM, SEARCH_PUSH, SEAT_COMMAND
+from guiderail.tools.environments import task_named
+from guiderail.tools.teleop.teach import SLIDERS, Teaching
+
+PORT = 9333
+COUNT = 5
+
+
+class Page:
+    """A tab, by Chromium's own protocol."""
+
+    def __init__(self, socket):
+        self._socket, self._number, self._asking = socket, 0, asyncio.Lock()
+
+    async def call(self, method, **parameters):
+        async with self._asking:
+            self._number += 1
+            await self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+            while True:
+                answer = json.loads(await self._socket.recv())
+                if answer.get("id") == self._number:
+                    return answer.get("result", answer)
+
+    async def press(self, code):
+        key = code.removeprefix("Key").lower()
+        for kind in ("keyDown", "keyUp"):
+            await self.call("Input.dispatchKeyEvent", type=kind, code=code, key=key)
+
+
+class Person:
+    """Who sits before the page, looks at where the robot is, and presses keys one after the other."""
+
+    def __init__(self, page, session, seed):
+        self.page, self.session, self.random = page, session, np.random.default_rng(seed)
+
+    async def press(self, code, times=1):
+        for _ in range(times):
+            await self.page.press(code)
+            await asyncio.sleep(self.random.uniform(0.02, 0.06))
+
+    async def look(self, seconds):
+        """Waits for so much of the simulation's time."""
+        until = self.session.steps * PERIOD + seconds
+        while self.session.steps * PERIOD < until:
+            await asyncio.sleep(0.02)
+
+    async def settle(self):
+        """Waits until the page has taken all keys in: a slow one does so seconds later."""
+        seen = None
+        while not np.array_equal(seen, self.session.wanted):
+            seen = self.session.wanted.copy()
+            await asyncio.sleep(0.4)
+            await self.look(0.1)
+
+    async def bring(self, output, to):
+        """Presses keys until a slider on the page says that an output of the command is to be there [m, rad]."""
+        *_, step, lower, higher, unit = list(SLIDERS.values())[output]
+        for _ in range(5):
+            said = self.session.start[output] + self.session.wanted[output]
+            left = round((to - said) / (step * unit))
+            if left == 0:
+                return
+            await self.press(higher if left > 0 else lower, abs(left))
+            await self.settle()
+
+    async def wander(self, seconds):
+        """Searches the rim: half a millimetre here, half a millimetre there, and back at last."""
+        until = self.session.steps * PERIOD + seconds
+        while self.session.steps * PERIOD < until:
+            for output, there in enumerate(self.random.integers(-3, 4, size=2)):
+                await self.bring(output, 0.5e-3 * there)
+        await self.bring(0, 0.0)
+        await self.bring(1, 0.0)
+
+    async def demonstrate(self, motion, picture=None):
+        """One demonstration of an insertion: to the rim, a search on it, in, a turn where there is one, and at rest.
+
+        The picture is taken while it is pushed in.
+        """
+        await self.look(0.3)
+        await self.bring(2, motion.rim - motion.press)
+        await self.look(0.3)
+        await self.wander(1.5)
+        await self.bring(2, -motion.push)
+        await self.look(0.9)
+        if picture is not None:
+            await shoot(self.page, picture)
+        if motion.turn:
+            await self.bring(3, self.session.start[3] + np.deg2rad(motion.turn))
+            await self.bring(2, -motion.push - 2e-3)
+            await self.look(0.9)
+        await self.bring(2, 0.0)
+        await self.look(0.6)
+        await self.press("Enter")
+
+
+@dataclass(frozen=True)
+class Insertion:
+    """What the person knows of the task: heights [m], and a turn [degrees]."""
+
+    rim: float
+    press: float
+    push: float
+    turn: float
+
+
+def known(session):
+    """Of the connector, or of a task folder."""
+    file = getattr(session.task, "file", None)
+    if file is None:
+        return Insertion(RIM, SEARCH_PUSH, -SEAT_COMMAND, -90.0)
+    return Insertion(file.motion.rim, file.motion.press, file.motion.push, file.motion.turn)
+
+
+async def person(url, session, connected, picture):
+    target = next(
+        tab for tab in json.load(urllib.request.urlopen(f"http://localhost:{PORT}/json")) if tab["type"] == "page"
+    )
+    async with websockets.connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
+        page = Page(socket)
+        await page.call("Page.enable")
+        await page.call("Page.navigate", url=url)
+        while not connected.is_set():
+            await asyncio.sleep(0.2)
+        await asyncio.sleep(2.0)
+        await page.press("KeyM")  # slow motion: keys take their time
+        for number in range(COUNT):
+            kept = len(session.kept)
+            whoever = Person(page, session, number)
+            await whoever.page.press("Backspace")  # from the start, as nothing was shown yet
+            await asyncio.sleep(0.5)
+            await whoever.demonstrate(known(session), picture if number == 0 else None)
+            while len(session.kept) == kept:
+                await asyncio.sleep(0.1)
+        if picture is not None:
+            await shoot(page, picture.with_stem(picture.stem + "-end"))
+        await page.press("Escape")
+
+
+async def shoot(page, picture):
+    shot = await page.call("Page.captureScreenshot", format="png")
+    picture.write_bytes(base64.b64decode(shot["data"]))
+
+
+def main(task, out, picture=None):
+    name, _ = task_named(task)
+    session = Teaching(name, {}, Path(out))
+    profile = tempfile.mkdtemp()
+    browser = subprocess.Popen(
+        [
+            shutil.which("chromium"), "--headless=new", "--no-sandbox", f"--remote-debugging-port={PORT}",
+            f"--user-data-dir={profile}", "--window-size=1200,800", "--enable-unsafe-swiftshader", "about:blank",
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        for _ in range(60):
+            try:
+                urllib.request.urlopen(f"http://localhost:{PORT}/json")
+                break
+            except OSError:
+                threading.Event().wait(0.5)
+        session.begin()
+        connected = threading.Event()
+        at_page = person(session.meshcat.web_url(), session, connected, None if picture is None else Path(picture))
+        hands = threading.Thread(target=asyncio.run, args=(at_page,))
+        hands.start()
+        while session.meshcat.GetNumActiveConnections() == 0:  # Meshcat answers the thread that made it, no other
+            threading.Event().wait(0.1)
+        connected.set()
+        session.run(print, most_steps=100_000)
+        hands.join()
+        print(json.dumps(session.learned()))
+    finally:
+        browser.terminate()
+        browser.wait()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,99 @@
+"""Who watches a run through a page: sliders are a push while they are not let go, and each click is one word."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+
+from guiderail.tools.environments import make_environment
+from guiderail.tools.teleop import supervisor as page_person
+from guiderail.tools.teleop.supervisor import FARTHEST, KEYS, LET_GO, SAYS, PagePerson
+
+
+class Page:
+    """What is asked of a Meshcat: sliders that stay where they are, buttons that count their clicks."""
+
+    def __init__(self):
+        self.sliders, self.clicks = {}, {}
+
+    def AddSlider(self, name, low, high, step, value, lower, higher):
+        assert (low, high) == (-FARTHEST, FARTHEST)
+        self.sliders[name] = value
+
+    def AddButton(self, name, key):
+        self.clicks[name] = 0
+
+    def SetSliderValue(self, name, value):
+        self.sliders[name] = value
+
+    def GetSliderValue(self, name):
+        return self.sliders[name]
+
+    def GetButtonClicks(self, name):
+        return self.clicks[name]
+
+
+@pytest.fixture
+def env():
+    env = make_environment("NarrowPassage", {"guidance": "kgrl", "hold": 10})
+    yield env
+    env.close()
+
+
+def watched(person, env):
+    # A page that is no Meshcat shows nothing.
+    person._name_sliders(env.unwrapped)
+    person._let_go()
+    return person
+
+
+def test_sliders_push_until_they_are_let_go(env):
+    page = Page()
+    person = watched(PagePerson(print, page), env)
+    assert person.push(None) is None
+    page.sliders["push 2"] = -2.5
+    np.testing.assert_array_equal(person.push(None), [0.0, -2.5])
+    page.clicks[LET_GO] += 1
+    assert person.push(None) is None
+    assert page.sliders == {"push 1": 0.0, "push 2": 0.0}
+
+
+def test_a_click_is_one_word(env):
+    page = Page()
+    person = watched(PagePerson(print, page), env)
+    assert person.says() is None
+    for name, (_, word) in SAYS.items():
+        page.clicks[name] += 2
+        assert person.says() == word
+        assert person.says() is None
+
+
+def test_of_what_is_said_between_two_episodes_a_stop_alone_counts(env, monkeypatch):
+    page = Page()
+    person = PagePerson(print, page)
+    monkeypatch.setattr(page_person, "look_at", lambda page, declaration: None)
+    monkeypatch.setattr(page_person, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
+    for name, (_, word) in SAYS.items():
+        page.clicks[name] += 1
+        person.begin(env)
+        assert person.says() == ("stop" if word == "stop" else None)
+        assert person.says() is None
+
+
+def test_no_key_has_two_meanings():
+    keys = [key for pair in KEYS for key in pair] + [key for key, _ in SAYS.values()]
+    assert len(set(keys)) == len(keys)
+
+
+def test_an_episode_is_shown_on_a_real_page(env):
+    person = PagePerson(print)
+    assert isinstance(person.meshcat, Meshcat)
+    env.reset(seed=0)
+    person.begin(env)
+    assert person.push(None) is None
+    env.step(np.zeros(2))
+    assert person.meshcat.HasPath("/drake/visualizer") or person.meshcat.HasPath("/drake/illustration")
+    person.meshcat.SetSliderValue("push 1", 1.0)
+    person.begin(env)
+    assert person.push(None) is None  # let go at the beginning of an episode

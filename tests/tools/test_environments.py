@@ -1,0 +1,43 @@
+import pytest
+
+from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import changed_environment, check_environment, import_modules
+
+
+@pytest.mark.parametrize(("learned_on", "judged_on"), [("rails", "mujoco"), ("rails", "arm"), ("arm", "rails")])
+def test_what_was_learned_on_one_station_is_judged_on_another(learned_on, judged_on):
+    learned = check_environment("BncConnector", {"station": learned_on, "hold": 3})
+    there = check_environment("BncConnector", changed_environment("BncConnector", learned, {"station": judged_on}))
+    assert (there["station"], there["hold"]) == (judged_on, 3)
+    assert there == check_environment("BncConnector", {"station": judged_on, "hold": 3})
+
+
+def test_what_is_asked_for_and_the_other_station_does_not_have_is_refused():
+    learned = check_environment("BncConnector", {"impedance_control": "cartesian"})
+    assert changed_environment("BncConnector", learned, {}) == learned
+    assert changed_environment("BncConnector", learned, {"station": "rails"})["impedance_control"] == "cartesian"
+    asked = changed_environment("BncConnector", learned, {"station": "arm", "impedance_control": "joint"})
+    with pytest.raises(InputError, match="it is one of station='rails'"):
+        check_environment("BncConnector", asked)
+
+
+def test_an_environment_of_no_station_takes_others():
+    assert changed_environment("Bead", {"wall": 1.0}, {"wall": 2.0}) == {"wall": 2.0}
+    assert changed_environment("Bead", {"wall": 1.0}, {"station": "rails"}) == {"wall": 1.0, "station": "rails"}
+
+
+def test_a_file_is_run_once_as_long_as_it_stays_what_it_is(tmp_path, monkeypatch):
+    monkeypatch.setitem(GUIDANCE._entries, "step_of_mine", None)  # no other test has this one
+    file = tmp_path / "step_of_mine.py"
+    declared = (
+        "import guiderail as gr\n\n@gr.register_guidance('step_of_mine', label='{}')\ndef step(known):\n    pass\n"
+    )
+    file.write_text(declared.format("one"), encoding="utf-8")
+    import_modules([file])
+    first = GUIDANCE.get("step_of_mine")
+    assert import_modules([file]) == (str(file),)
+    assert GUIDANCE.get("step_of_mine") is first
+    file.write_text(declared.format("another"), encoding="utf-8")
+    import_modules([file])
+    assert GUIDANCE.get("step_of_mine").label == "another"

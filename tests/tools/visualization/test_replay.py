@@ -1,0 +1,136 @@
+"""The page says what happened: its numbers are those of the episodes, and both sides met the same conditions."""
+
+import base64
+import json
+import re
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import LinearConstraints
+from guiderail.tools.environments import check_environment, make_environment
+from guiderail.tools.evaluation.baselines import NullPolicy, always, white
+from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.visualization import motion
+from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.motion import DRAWN, Motion, violation_unit
+from guiderail.tools.visualization.replay import report_beside, write_page
+
+ENVIRONMENT = {"guidance": "kgrl", "hold": 10}
+BALL = f"{DRAWN}/robot/ball"
+
+
+def _to_the_right(env):
+    return always(env, np.array([1.0, 0.0]))
+
+
+def poses(text):
+    return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 7)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    study = tmp_path_factory.mktemp("study")
+    (study / "report.html").write_text("")
+    (study / "run").mkdir()
+    file = study / "run" / "replay.html"
+    arguments = check_environment("NarrowPassage", ENVIRONMENT)
+    shown = Shown("NarrowPassage", arguments, _to_the_right, "to the right", "constant", run=file.parent)
+    row = write_page(file, shown, episodes=2)
+    return file.read_text(encoding="utf-8"), row
+
+
+def data(text):
+    return json.loads(re.search(r"const shown = (\{.*\});\n", text).group(1))
+
+
+def test_both_sides_are_there_with_every_episode_and_every_signal_has_the_same_clock(page):
+    before, after = data(page[0])["sides"]
+    for episode in (*before["episodes"], *after["episodes"]):
+        n = len(episode["times"])
+        assert all(len(episode[name]) == n for name in ("force", "commanded", "measured", "time"))
+        assert [len(values) for values in episode["action"]] == [n, n]
+        assert len(poses(episode["frames"][BALL])) == n
+    assert len(before["episodes"]) == len(after["episodes"]) == 2
+
+
+def test_before_is_the_demonstration_alone_from_the_same_start(page):
+    before, after = data(page[0])["sides"]
+    for one, other in zip(before["episodes"], after["episodes"], strict=True):
+        np.testing.assert_array_equal(poses(one["frames"][BALL])[0], poses(other["frames"][BALL])[0])
+        assert np.ptp(one["action"]) == 0.0
+        assert max(other["action"][0]) == 1.0
+    first, second = (poses(episode["frames"][BALL])[0] for episode in after["episodes"])
+    assert not np.array_equal(first, second)
+
+
+def test_who_pushes_at_the_constraint_is_seen_to_reach_it_and_no_more(page):
+    text, row = page
+    (episode, _) = data(text)["sides"][1]["episodes"]
+    assert max(episode["commanded"]) == pytest.approx(row["worst_violation"], abs=1e-9)
+    assert max(episode["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
+    assert data(text)["violation"] == {"unit": "mm", "scale": 1000.0}
+
+
+def test_a_page_fits_a_phone_has_its_name_and_needs_nothing_else(page):
+    text = page[0]
+    assert '<meta name="viewport" content="width=device-width' in text
+    assert "<title>NarrowPassage · kgrl · constant" in text
+    assert "@media (max-width: 700px)" in text
+    assert "<script src=" not in text
+    assert "<link" not in text
+
+
+def test_a_report_is_linked_where_there_is_one(page, tmp_path):
+    assert '<a href="../report.html">' in page[0]
+    run = tmp_path / "run"
+    run.mkdir()
+    assert report_beside(run / "replay.html", run) is None
+    (run / "report.html").write_text("")
+    assert report_beside(run / "replay.html", run) == "report.html"
+    assert report_beside(tmp_path / "replay.html", run) == "run/report.html"
+
+
+def test_no_peak_of_force_is_lost_where_an_episode_is_longer_than_a_page_is_wide(monkeypatch):
+    monkeypatch.setattr(motion, "POINTS", 7)
+    env = make_environment("NarrowPassage", {"guidance": "residual", "hold": 10}, render_mode="human")
+    env.unwrapped.simulator.set_target_realtime_rate(0.0)
+    env.reset(seed=0)
+    watching = Motion(env)
+    row = rollout(env, always(env, np.array([1.0, 0.0])), watching, seed=1_000_000, held_out=True)
+    shown, trace = watching.shown(), env.unwrapped.trace
+    assert len(shown["times"]) <= 8
+    assert shown["times"][-1] == pytest.approx(len(trace) * trace.period)
+    assert max(shown["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
+    assert max(shown["commanded"]) == pytest.approx(row["worst_violation"], rel=1e-4)
+    np.testing.assert_allclose(poses(shown["frames"][BALL])[-1, :2], trace.measured[-1], atol=1e-6)
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("constraints", "outputs", "unit"),
+    [
+        (LinearConstraints.box(-np.ones(2), np.ones(2)), 2, "mm"),
+        (LinearConstraints.box(-np.array([1, 1, *[np.inf] * 4]), np.array([1, 1, *[np.inf] * 4])), 6, "mm"),
+        (LinearConstraints.box(-np.ones(6), np.ones(6)), 6, "m or rad"),
+        (None, 6, "m or rad"),
+    ],
+)
+def test_a_violation_has_the_unit_of_what_is_bounded(constraints, outputs, unit):
+    assert violation_unit(constraints, outputs)[0] == unit
+
+
+def test_a_page_without_an_episode_is_refused(tmp_path):
+    shown = Shown("NarrowPassage", {}, lambda env: NullPolicy(white, env), "white", "white")
+    with pytest.raises(InputError, match="at least one episode"):
+        write_page(tmp_path / "replay.html", shown, episodes=0)
+
+
+@pytest.mark.parametrize("name", ["policy.safetensors", "."])
+def test_a_page_that_would_replace_what_is_none_is_refused_before_an_episode_is_run(name, tmp_path):
+    (tmp_path / "policy.safetensors").write_text("weights")
+    shown = Shown("NarrowPassage", {}, lambda env: pytest.fail("it goes on"), "white", "white")
+    with pytest.raises(InputError, match="a page is"):
+        write_page(tmp_path / name, shown)
+    assert (tmp_path / "policy.safetensors").read_text() == "weights"

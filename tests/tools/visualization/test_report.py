@@ -1,0 +1,195 @@
+import itertools
+import re
+import shlex
+import shutil
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.baselines import NullPolicy, white
+from guiderail.tools.evaluation.evaluate import evaluate
+from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.evaluation.step_log import Ledger, read_ledger
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import configure
+from guiderail.tools.learning.trainer import train
+from guiderail.tools.tables import read_table, write_table
+from guiderail.tools.visualization.curves import plot_run
+from guiderail.tools.visualization.report import write_report
+from guiderail.tools.visualization.report_data import command, gather
+
+SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory):
+    """Two methods, two seeds, and the table that a study of them leaves."""
+    folder = tmp_path_factory.mktemp("beads")
+    for guidance in ("skgrl", "kmp"):
+        for seed in (1, 2):
+            config = configure("Bead", {"guidance": guidance}, settings=SETTINGS, episodes=3, seed=seed)
+            train(RunFolder(folder / f"{guidance}-{seed}"), config)
+    rows = [("learner", "learned", seed, 3, 10, rate) for seed, rate in ((1, 0.9), (2, 0.7))]
+    rows.append(("nothing", "zero", 1, 0, 10, 0.1))
+    table = pd.DataFrame(rows, columns=["method", "policy", "seed", "mark", "episodes", "success_rate"])
+    write_table(folder / "beads", table.assign(judged_on="held out"))
+    return folder
+
+
+def text_of(page):
+    return " ".join(re.sub(r"<[^>]+>", " ", re.sub(r"<(svg|style).*?</\1>", " ", page, flags=re.S)).split())
+
+
+def test_a_study_is_one_page_that_needs_nothing_else(studied, tmp_path):
+    page = write_report([studied], tmp_path / "report.html").read_text()
+    assert page.count("<svg") >= 4
+    assert write_report([studied], tmp_path / "again.html").read_text() == page
+    outside = re.findall(r"(?:src|href)=\"(?!#)[^\"]*\"", page)
+    assert outside == []
+    assert "<script" not in page
+    text = text_of(page)
+    assert "sKGRL" in text
+    assert "16/20 80.0%" in text, "successes of all seeds together"
+    assert "9/10 (59.6% to 98.2%), 7/10 (39.7% to 89.2%)" in text, "and of each"
+    assert "58.4%" not in text, "of all together there is no interval: their episodes are not independent"
+    assert "nothing: zero" in text
+    assert "Differs from the thesis in it has no task Bead" in text
+    assert "guiderail study beads --out studies" in text
+    assert RunFolder(studied / "kmp-1").config().versions["drake"] in text
+
+
+def test_runs_are_named_by_what_they_differ_in(studied):
+    gathered = gather([studied / "skgrl-1", studied / "kmp-1"])
+    assert [run.method for run in gathered.runs] == ["sKGRL", "demonstration alone"]
+    assert not gathered.study
+    assert len(gathered.held_out) == 0
+    again = gather([studied / "skgrl-1", studied / "skgrl-2"])
+    assert {run.method for run in again.runs} == {"sKGRL"}
+    assert [len(runs) for runs in again.methods("Bead").values()] == [2]
+
+
+def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
+    run = studied / "skgrl-1"
+    judged = gather([run], episodes=2).held_out
+    assert set(judged["policy"]) == {"learned", "demonstration", "white", "constant"}
+    assert judged["episodes"].eq(2).all()
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    gather([run], episodes=2)
+    assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+
+
+def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_path):
+    run = shutil.copytree(studied / "skgrl-2", tmp_path / "run")
+    others = {"white": partial(NullPolicy, white)}
+    evaluate(run, episodes=4, environment={"wall": -0.5}, beside=others)
+    evaluate(run, episodes=4, seed=7, beside=others)
+    assert len(gather([run]).held_out) == 0
+    evaluate(run, episodes=2, beside=others)
+    judged = gather([run]).held_out
+    assert judged[["policy", "episodes"]].to_numpy().tolist() == [["demonstration", 2], ["white", 2], ["learned", 2]]
+
+
+def test_rows_of_a_part_of_a_study_are_counted_once_and_its_command_says_so(studied, tmp_path):
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    shutil.copy(studied / "beads.csv", folder)
+    rows = read_table(studied / "beads.csv")
+    part = rows.iloc[[0]]
+    more = part.assign(seed=5, success_rate=0.2)
+    write_table(folder / "beads-learner-1-5", pd.concat([part, more]))
+    page = write_report([folder], tmp_path / "page.html").read_text()
+    text = text_of(page)
+    assert "beads: learner 3 held out 16/20" in text
+    assert "beads-learner-1-5: learner 3 held out 2/10" in text
+    assert "guiderail study beads --methods learner --seeds 5 --out studies" in text
+    assert "Policies that learned nothing" not in text
+    (folder / "beads.csv").unlink()
+    text = text_of(write_report([folder], tmp_path / "page.html").read_text())
+    assert "guiderail study beads --methods learner --seeds 1,5 --out studies" in text
+
+
+def test_runs_in_folders_of_one_name_go_into_different_ones(studied, tmp_path):
+    for name in ("a", "b"):
+        shutil.copytree(studied / "skgrl-1", tmp_path / name / "same")
+    text = text_of(write_report([tmp_path / "a/same", tmp_path / "b/same"], tmp_path / "page.html").read_text())
+    assert "--out runs/same-1" in text
+    assert "--out runs/same-2" in text
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_anything_is_run(studied, tmp_path):
+    (tmp_path / "file").touch()
+    before = sorted(studied.rglob("*"))
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report([studied / "skgrl-1"], tmp_path / "file" / "page.html", episodes=5)
+    assert sorted(studied.rglob("*")) == before
+
+
+def test_a_run_without_a_column_has_no_figure_of_it(studied, tmp_path):
+    run = shutil.copytree(studied / "skgrl-1", tmp_path / "run")
+    table = pd.read_csv(run / "episodes.csv")
+    table.drop(columns="mean_squared_force").to_csv(run / "episodes.csv", index=False)
+    assert "success rate over" in write_report([run], tmp_path / "page.html").read_text()
+    table.drop(columns="worst_violation").to_csv(run / "episodes.csv", index=False)
+    with pytest.raises(InputError, match="no worst_violation; train anew"):
+        write_report([run], tmp_path / "page.html")
+    with pytest.raises(InputError, match="no worst_violation; train anew"):
+        plot_run(run)
+    table.assign(fault="NONE").to_csv(run / "episodes.csv", index=False)  # a column of words, as a robot's run has
+    assert plot_run(run).is_file()
+
+
+def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):
+    config = configure("NarrowPassage", {"guidance": "residual"}, episodes=1)
+    folder, env = RunFolder(tmp_path / "run"), make_environment("NarrowPassage", config.environment)
+    folder.create(config)
+    folder.write_episodes([rollout(env, lambda _: np.array([1.0, 0.0]), Ledger(env, folder.ledger), seed=0)])
+    env.close()
+    (run,) = gather([tmp_path / "run"]).runs
+    ledger, row = read_ledger(tmp_path / "run" / "ledger"), run.episodes.iloc[0]
+    assert run.safety["source"] == "ledger"
+    assert run.safety["steps"] == len(ledger) == row["steps"]
+    assert run.safety["collision_steps"] > 0
+    assert run.safety["poses_outside"] == (ledger["measured_violation"] > 1e-9).sum()
+    assert run.safety["worst_command"] == row["worst_violation"]
+    assert run.safety["collision_steps"] == row["collision_steps"]
+    (tmp_path / "run" / "ledger" / "episode-000000.parquet").unlink()
+    with pytest.raises(InputError, match="holds no ledger"):
+        _ = run.safety
+
+
+def test_the_command_of_a_run_makes_the_same_run(bead_config):
+    config = replace(bead_config, ledger=False)
+    words = shlex.split(command(config, "runs/bead"))
+    assert words[:3] == ["guiderail", "train", "Bead"]
+    assert words[-3:] == ["--no-ledger", "--out", "runs/bead"]
+    given = dict(word.split("=") for before, word in itertools.pairwise(words) if before == "--set")
+    option = dict(zip(words[3:-3:2], words[4:-3:2], strict=True))
+    again = configure(
+        "Bead", {"guidance": option["--guidance"]}, algorithm=option["--algorithm"], preset=option["--preset"],
+        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=given, ledger=False,
+    )  # fmt: skip
+    assert again == config
+
+
+@pytest.mark.parametrize("name", ["report.pdf", "report"])
+def test_what_is_no_page_is_refused_before_anything_is_read(name, tmp_path):
+    with pytest.raises(InputError, match=r"a page is .html"):
+        write_report([tmp_path / "missing"], tmp_path / name)
+
+
+def test_a_folder_without_runs_is_refused(tmp_path):
+    with pytest.raises(InputError, match="holds no run"):
+        write_report([tmp_path], tmp_path / "report.html")
+
+
+def test_a_run_that_lies_beside_a_study_is_judged_too(studied, tmp_path):
+    run = tmp_path / "alone"
+    train(RunFolder(run), configure("Bead", {}, settings=SETTINGS, episodes=2, seed=9))
+    judged = gather([run, studied], episodes=2).held_out
+    assert set(judged["seed"]) == {1, 2, 9}
+    assert judged[(judged["seed"] == 9) & (judged["policy"] == "learned")]["episodes"].tolist() == [2]

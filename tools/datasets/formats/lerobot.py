@@ -1,0 +1,186 @@
+"""LeRobot datasets of version 3, read and written with pyarrow: the library itself asks for other versions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.datasets.formats.recorded import Recorded, choose_signal, from_zero
+from guiderail.tools.files import whole_folder
+
+VERSION = "v3.0"
+INFO = Path("meta") / "info.json"
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+TASK = "guiderail demonstration"
+_CLOCKS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+
+
+def read_lerobot(folder: Path, signal: str | None) -> Recorded:
+    """One demonstration an episode.
+
+    Args:
+        folder: of the dataset.
+        signal: a feature of one dimension, such as action; found out unless given.
+
+    Raises:
+        InputError: if it is no such dataset, or does not say what is meant.
+    """
+    import pyarrow.parquet as parquet
+
+    try:
+        info = json.loads((folder / INFO).read_text(encoding="utf-8"))
+        version, features, fps = str(info["codebase_version"]), dict(info["features"]), float(info["fps"])
+        vectors = [name for name, feature in features.items() if _is_vector(name, feature)]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        raise InputError(f"{folder} is no LeRobot dataset: its {INFO} is missing or damaged") from error
+    if not 0.0 < fps < np.inf:
+        raise InputError(f"{folder} has {fps:g} frames a second: correct fps in its {INFO}")
+    if not version.startswith("v3"):
+        raise InputError(f"{folder} is a LeRobot dataset of version {version}: convert it to v3.0 by LeRobot's script")
+    chosen, assumed = choose_signal(sorted(vectors), signal, str(folder), "--signal")
+    files = sorted((folder / "data").rglob("*.parquet"))
+    if not files:
+        raise InputError(f"{folder} has no data/*.parquet: copy the whole dataset")
+    columns = [chosen, "frame_index", "episode_index"]
+    try:
+        tables = [parquet.read_table(file, columns=columns) for file in files]
+        values = np.concatenate([np.array(table[chosen].to_pylist(), dtype=float) for table in tables])
+        values = values.reshape(len(values), -1)  # a feature of one number is stored as numbers, not as lists of one
+        frames, episodes = (
+            np.concatenate([table[name].to_numpy() for table in tables]) for name in ("frame_index", "episode_index")
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{folder} holds data that its {INFO} does not describe: {error}") from error
+    names = _names(features[chosen], values.shape[1])
+    assumed += [
+        f"time is the frame's number by {fps:g} frames a second",
+        "numbers are kept as they are: a LeRobot dataset does not say their unit or frame",
+    ]
+    found = Recorded([], [], names, assumed)
+    for episode in np.unique(episodes):
+        rows = np.flatnonzero(episodes == episode)
+        rows = rows[np.argsort(frames[rows], kind="stable")]
+        found.times.append(frames[rows] / fps)
+        found.outputs.append(values[rows])
+    return found
+
+
+def _is_vector(name: str, feature: dict[str, Any]) -> bool:
+    kind = str(feature.get("dtype", ""))
+    return len(feature.get("shape", ())) == 1 and name not in _CLOCKS and kind.startswith("float")
+
+
+def _names(feature: dict[str, Any], size: int) -> tuple[str, ...]:
+    names = feature.get("names")
+    if isinstance(names, dict):  # some datasets have {"motors": [...]}
+        names = next(iter(names.values()), None)
+    if isinstance(names, list) and len(names) == size:
+        return tuple(str(name) for name in names)
+    return tuple(f"y{i + 1}" for i in range(size))
+
+
+def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
+    """Writes a dataset whose action is what was commanded.
+
+    Raises:
+        InputError: if the demonstrations have no common rate, which a dataset must have, a value is beyond 32 bits, or
+            it can't be written.
+    """
+    import pandas as pd
+    import pyarrow as arrow
+    import pyarrow.parquet as parquet
+
+    steps = np.concatenate([np.diff(t) for t in demonstrations.times])
+    period = float(np.median(steps))
+    if np.abs(steps - period).max() > 1e-3 * period:
+        raise InputError(
+            "a LeRobot dataset has one rate, and these demonstrations have several: give --rate to resample them"
+        )
+    fps = round(1.0 / period, 6)
+    if fps == 0.0:
+        raise InputError(f"a LeRobot dataset counts frames in a second, and these are {period:g} s apart: give --rate")
+    fps = int(fps) if float(fps).is_integer() else fps
+    size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
+    outputs = np.concatenate(demonstrations.outputs)
+    largest = np.abs(outputs).max()
+    if largest > np.finfo(np.float32).max:
+        raise InputError(f"a LeRobot dataset holds numbers of 32 bits, which a value of {largest:g} is beyond")
+    values = outputs.astype(np.float32)
+    frames = np.concatenate([np.arange(n) for n in lengths])
+    episodes = np.repeat(np.arange(len(lengths)), lengths)
+    flat = arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), size)
+    columns = {
+        "action": flat,
+        "observation.state": flat,
+        "timestamp": arrow.array((frames / fps).astype(np.float32)),
+        "frame_index": arrow.array(frames.astype(np.int64)),
+        "episode_index": arrow.array(episodes.astype(np.int64)),
+        "index": arrow.array(np.arange(len(frames), dtype=np.int64)),
+        "task_index": arrow.array(np.zeros(len(frames), dtype=np.int64)),
+    }
+    names = list(demonstrations.names)
+    features: dict[str, Any] = {
+        name: {"dtype": "float32", "shape": [size], "names": names} for name in ("action", "observation.state")
+    }
+    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _CLOCKS.items()}
+    ends = np.cumsum(lengths)
+    described = {
+        "episode_index": list(range(len(lengths))),
+        "tasks": [[TASK]] * len(lengths),
+        "length": lengths,
+        "data/chunk_index": [0] * len(lengths),
+        "data/file_index": [0] * len(lengths),
+        "dataset_from_index": [int(end - n) for end, n in zip(ends, lengths, strict=True)],
+        "dataset_to_index": [int(end) for end in ends],
+        "meta/episodes/chunk_index": [0] * len(lengths),
+        "meta/episodes/file_index": [0] * len(lengths),
+    }
+    info = {
+        "codebase_version": VERSION,
+        "robot_type": None,
+        "total_episodes": len(lengths),
+        "total_frames": len(frames),
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 500,
+        "fps": fps,
+        "splits": {"train": f"0:{len(lengths)}"},
+        "data_path": DATA_PATH,
+        "video_path": None,
+        "features": features,
+    }
+    with whole_folder(folder) as made:
+        for path, table in (
+            (DATA_PATH.format(chunk_index=0, file_index=0), columns),
+            ("meta/episodes/chunk-000/file-000.parquet", described),
+        ):
+            (made / path).parent.mkdir(parents=True)
+            parquet.write_table(arrow.table(table), made / path)
+        tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task"))
+        tasks.to_parquet(made / "meta" / "tasks.parquet")
+        (made / INFO).write_text(json.dumps(info, indent=4), encoding="utf-8")
+        stats = json.dumps(_statistics(columns, values), indent=4)
+        (made / "meta" / "stats.json").write_text(stats, encoding="utf-8")
+    notes = ["action and observation.state are both what was demonstrated, as 32-bit numbers"]
+    return notes + from_zero(demonstrations)
+
+
+def _statistics(columns: dict[str, Any], values: np.ndarray) -> dict[str, Any]:
+    found = {}
+    for name, column in columns.items():
+        numbers = values.astype(float) if name in ("action", "observation.state") else column.to_numpy()[:, None]
+        reduced = {"min": numbers.min(0), "max": numbers.max(0), "mean": numbers.mean(0), "std": numbers.std(0)}
+        found[name] = {key: value.tolist() for key, value in reduced.items()} | {"count": [len(numbers)]}
+    return found

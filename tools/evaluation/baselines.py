@@ -1,0 +1,94 @@
+"""Policies that know nothing: what a learned one is compared with, and what guidance must withstand."""
+
+from collections.abc import Callable
+from functools import partial
+
+import gymnasium
+import numpy as np
+
+from guiderail.tools.evaluation.rollout import Act, Observer
+
+REPEATS = 10  # decisions that a held action lasts
+TURNS = 0.1  # how likely corner actions turn into another corner at a decision
+
+# Makes the actions of an episode from its random generator and the size of an action.
+Choose = Callable[[np.random.Generator, int], Act]
+
+
+def zero(rng: np.random.Generator, size: int) -> Act:
+    """The action of zero, which leaves guidance to itself: where it has demonstrations, those."""
+    return lambda observation: np.zeros(size, np.float32)
+
+
+def white(rng: np.random.Generator, size: int) -> Act:
+    """Uniform in [−1, 1], anew at every decision: an untrained policy."""
+    return lambda observation: rng.uniform(-1.0, 1.0, size)
+
+
+def constant(rng: np.random.Generator, size: int) -> Act:
+    """One action for the whole episode, uniform in [−1, 1]."""
+    return _repeated(lambda: rng.uniform(-1.0, 1.0, size), lambda count: False)
+
+
+def held(rng: np.random.Generator, size: int) -> Act:
+    """Uniform, each for `REPEATS` decisions: they lead further than white ones."""
+    return _repeated(lambda: rng.uniform(-1.0, 1.0, size), lambda count: count % REPEATS == 0)
+
+
+def corners(rng: np.random.Generator, size: int) -> Act:
+    """Full deflection, that turns into another corner now and then."""
+    return _repeated(lambda: rng.choice([-1.0, 1.0], size), lambda count: rng.uniform() < TURNS)
+
+
+def stuck(rng: np.random.Generator, size: int) -> Act:
+    """Full deflection into one corner for the whole episode."""
+    return _repeated(lambda: rng.choice([-1.0, 1.0], size), lambda count: False)
+
+
+def _repeated(choose: Callable[[], np.ndarray], turns: Callable[[int], bool]) -> Act:
+    count, action = 0, choose()
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        nonlocal count, action
+        if count > 0 and turns(count):
+            action = choose()
+        count += 1
+        return action
+
+    return act
+
+
+NULL_POLICIES: dict[str, Choose] = {one.__name__: one for one in (zero, white, constant, held, corners, stuck)}
+
+
+class NullPolicy(Observer):
+    """Actions that look at nothing, chosen anew for every episode from a random generator of its own."""
+
+    def __init__(self, choose: Choose, env: gymnasium.Env, seed: int = 0):
+        """
+        Args:
+            choose: makes the actions of an episode.
+            env: for its actions' size only.
+            seed: of the generators; episode i has [seed, i].
+        """
+        self._choose, self._seed, self._episode = choose, seed, -1
+        self._size = int(np.prod(env.action_space.shape or ()))
+        self._act: Act = zero(np.random.default_rng(0), self._size)
+
+    def begin(self) -> None:
+        """The next episode's actions."""
+        self._episode += 1
+        self._act = self._choose(np.random.default_rng([self._seed, self._episode]), self._size)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """An action (A,) in [−1, 1]."""
+        return self._act(observation)
+
+
+still = partial(NullPolicy, zero)
+"""What acts by zero, for an environment."""
+
+
+def always(env: gymnasium.Env, action: np.ndarray) -> NullPolicy:
+    """The same action in every episode."""
+    return NullPolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)

@@ -1,1 +1,0 @@
-"""`guiderail onboard`: from two mesh files to a task."""

@@ -1,0 +1,233 @@
+"""Demonstrations of a scripted hand that searches the rim, recorded on rails."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatAnimation, MeshcatParams, Rgba, SurfaceTriangle, TriangleSurfaceMesh
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import EventStatus
+
+from guiderail.diagrams.envs.recording import DrivenStation, along, drive_along
+from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.tasks.part.file import PartTaskFile
+from guiderail.diagrams.tasks.part.task import PartInsertion, workcell
+from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.poses import pose_to_transform
+from guiderail.models.objects.bnc_connector.demonstrations import NAMES
+from guiderail.models.parts.assembly_check import nearest_on_surface
+from guiderail.models.parts.motion import NUM_DEMONSTRATIONS, demonstrator_motions, searching, straight
+from guiderail.models.primitives import Demonstrations
+from guiderail.systems.recorder import Recording
+
+_CORNERS = 8  # of a contact surface, those of the highest pressure, whose depth is measured
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One scripted insertion.
+
+    Attributes:
+        success: whether the plug was at the target in the end.
+        pose: of the plug in the socket then, position and rotation vector (6,) [m, rad].
+        peak_force: of the impedance [N].
+        penetration: how deep one part was in the other at most [m], what snaps left out.
+        snap: the same of what snaps [m].
+        real_time_factor: simulated seconds for each second of one core.
+        recording: poses, wrench and force at the control steps.
+    """
+
+    success: bool
+    pose: np.ndarray
+    peak_force: float
+    penetration: float
+    snap: float
+    real_time_factor: float
+    recording: Recording
+
+
+class Depths:
+    """How deep parts are in each other, measured from Drake's own contact surfaces at the control steps.
+
+    A contact surface lies in the rigid part's surface; each of its corners is as deep as it is far from the surface of
+    the compliant part.
+    """
+
+    def __init__(self, station: RailsStation, surfaces: dict[str, np.ndarray], snapping: set[str]):
+        """
+        Args:
+            station: of the parts.
+            surfaces: triangles (T, 3, 3) [m] of each compliant body, by name, in its own frame.
+            snapping: full names of geometries that overlap on purpose.
+        """
+        self._station, self._surfaces, self._snapping = station, surfaces, snapping
+        self.deepest = self.deepest_snap = 0.0
+        self.seconds = 0.0  # of measuring, which is no part of the simulation
+
+    def monitor(self, root_context) -> EventStatus:
+        """Looks at the contact there is now."""
+        start = time.process_time()
+        plant = self._station.plant
+        context = plant.GetMyContextFromRoot(root_context)
+        results = plant.get_contact_results_output_port().Eval(context)
+        inspector = self._station.scene_graph.model_inspector()
+        for number in range(results.num_hydroelastic_contacts()):
+            surface = results.hydroelastic_contact_info(number).contact_surface()
+            mesh = surface.tri_mesh_W() if surface.is_triangle() else surface.poly_mesh_W()
+            field = surface.tri_e_MN() if surface.is_triangle() else surface.poly_e_MN()
+            pressures = np.array([field.EvaluateAtVertex(i) for i in range(mesh.num_vertices())])
+            points = np.array([mesh.vertex(int(i)) for i in np.argsort(pressures)[-_CORNERS:]])
+            ids = (surface.id_M(), surface.id_N())
+            for geometry in ids:
+                body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
+                if body.name() not in self._surfaces:
+                    continue
+                X_BW = body.EvalPoseInWorld(context).inverse()
+                inside = X_BW.multiply(points.T).T
+                snaps = any(inspector.GetName(one).split("::")[-1] in self._snapping for one in ids)
+                depth = float(nearest_on_surface(inside, self._surfaces[body.name()])[1].max())
+                if snaps:
+                    self.deepest_snap = max(self.deepest_snap, depth)
+                else:
+                    self.deepest = max(self.deepest, depth)
+        self.seconds += time.process_time() - start
+        return EventStatus.DidNothing()
+
+
+def insert(
+    folder: Path,
+    file: PartTaskFile,
+    *,
+    offset: tuple[float, float] = (0.0, 0.0),
+    motion: tuple[np.ndarray, np.ndarray] | None = None,
+    snapping: frozenset[str] = frozenset(),
+    measure_depth: bool = True,
+) -> Trial:
+    """Drives the plug along the script on rails, with the socket off by `offset` [m], and judges the end.
+
+    Args:
+        folder: with the meshes.
+        file: of the task, which need not be written yet.
+        offset: of the socket.
+        motion: times and poses; straight in unless given.
+        snapping: names of pieces, such as `piece_1` of the plug, that overlap the socket on purpose.
+        measure_depth: whether depths are measured, which takes longer than the simulation.
+    """
+    numbers = file.motion
+    times, poses = straight(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
+    world = workcell(folder, file)
+    station = RailsStation(world, time_step=file.time_step)
+    driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
+    world.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
+    compliant = {
+        name: triangles_of(folder / part.visual)
+        for name, part in ((PLUG, file.plug), (SOCKET, file.socket))
+        if part.pieces[0].modulus is not None
+    }
+    depths = Depths(station, compliant, set(snapping))
+    driven.start(poses[0])
+    if measure_depth:
+        watch = [0]
+
+        def monitor(root_context) -> EventStatus:
+            watch[0] += 1
+            return depths.monitor(root_context) if watch[0] % 4 == 0 else EventStatus.DidNothing()
+
+        driven.simulator.set_monitor(monitor)
+    start = time.process_time()
+    recording = driven.run()
+    spent = time.process_time() - start - depths.seconds
+    plant, context = station.plant, driven.plant_context
+    X = plant.GetFrameByName(PLUG).CalcPose(context, plant.GetFrameByName(SOCKET))
+    turn = X.rotation().ToAngleAxis()
+    pose = np.concatenate([X.translation(), turn.angle() * turn.axis()])
+    judge: Any = type("Judge", (PartInsertion,), {"file": file})
+    return Trial(
+        success=judge.is_seated(pose),
+        pose=pose,
+        peak_force=float(recording["contact_force"].max()),
+        penetration=depths.deepest,
+        snap=depths.deepest_snap,
+        real_time_factor=float(times[-1] / max(spent, 1e-9)),
+        recording=recording,
+    )
+
+
+def triangles_of(path: Path) -> np.ndarray:
+    """The triangles (T, 3, 3) [m] of an OBJ file that onboarding wrote."""
+    vertices, corners = [], []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        kind, *rest = line.split()
+        if kind == "v":
+            vertices.append([float(one) for one in rest])
+        elif kind == "f":
+            corners.append([int(one.split("/")[0]) - 1 for one in rest])
+    return np.array(vertices)[np.array(corners)]
+
+
+_SOLID = {"plug": Rgba(0.85, 0.65, 0.25, 1.0), "socket": Rgba(0.62, 0.64, 0.68, 0.45)}
+_SCALE = 10.0  # a part of two centimetres is too near for the page's camera
+
+
+def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) -> None:
+    """Writes the page: parts in their colours, pieces that touch each in one of its own, hidden until asked for."""
+    try:
+        meshcat = Meshcat(MeshcatParams(host="localhost"))
+    except RuntimeError as error:
+        raise InputError(f"the preview can't be made ({error}): set DRAKE_ALLOW_NETWORK=meshcat") from error
+    rng = np.random.default_rng(2)
+    for name, part in (("plug", file.plug), ("socket", file.socket)):
+        _show(meshcat, f"/{name}/seen", folder / part.visual, _SOLID[name])
+        for piece in part.pieces:
+            colour = Rgba(*rng.uniform(0.25, 0.95, 3), 1.0)
+            _show(meshcat, f"/{name}/contact/{Path(piece.file).stem}", folder / piece.file, colour)
+        meshcat.SetProperty(f"/{name}/contact", "visible", False)
+    animation = MeshcatAnimation(frames_per_second=1.0 / CONTROL_PERIOD)
+    poses: Any = trial.recording["pose"]
+    for frame, pose in enumerate(poses):
+        X = pose_to_transform(pose)
+        animation.SetTransform(frame, "/plug", RigidTransform(X.rotation(), _SCALE * X.translation()))
+    meshcat.SetAnimation(animation)
+    size = _SCALE * file.motion.travel
+    meshcat.SetCameraPose(np.array([3.0, -4.0, 3.5]) * size, np.array([0.0, 0.0, 0.5 * size]))
+    page.write_text(meshcat.StaticHtml(), encoding="utf-8")
+
+
+def _show(meshcat: Any, path: str, file: Path, colour: Any) -> None:
+    corners = _SCALE * triangles_of(file).reshape(-1, 3)
+    triangles = [SurfaceTriangle(3 * i, 3 * i + 1, 3 * i + 2) for i in range(len(corners) // 3)]
+    meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), colour)
+
+
+MOST_SESSIONS = 3  # of five attempts, until five have seated the plug
+
+
+def demonstrate(folder: Path, file: PartTaskFile) -> int:
+    """Writes the demonstrations' file; returns how many of them seat the plug."""
+    numbers = file.motion
+    script = searching(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
+    times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
+    good: list[np.ndarray] = []
+    bad: list[np.ndarray] = []
+    for seed in range(MOST_SESSIONS):
+        for motion in demonstrator_motions(seed, script, numbers.rim - numbers.press - 1e-3, times):
+            if len(good) < NUM_DEMONSTRATIONS:
+                (good if _seats(folder, file, times, motion) else bad).append(motion)
+    shown = (good + bad)[:NUM_DEMONSTRATIONS]
+    Demonstrations([times] * len(shown), shown, NAMES).save(folder / file.demonstrations.file)
+    return len(good)
+
+
+def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:
+    driven, _ = drive_along(RailsStation(workcell(folder, file), time_step=file.time_step), times, motion)
+    plant = driven.station.plant
+    X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
+    turn = X.rotation().ToAngleAxis()
+    judge: Any = type("Judge", (PartInsertion,), {"file": file})
+    return judge.is_seated(np.concatenate([X.translation(), turn.angle() * turn.axis()]))

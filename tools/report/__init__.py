@@ -1,1 +1,0 @@
-"""`guiderail report`: what runs and studies came to, as one page."""
