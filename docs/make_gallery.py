@@ -24,10 +24,10 @@ from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment, task_named
-from guiderail.tools.evaluation.baselines import NullPolicy, still, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, still, white
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import Act, rollout
-from guiderail.tools.evaluation.scripted import untrained
+from guiderail.tools.evaluation.rollout import PolicyFn, rollout
+from guiderail.tools.evaluation.scripted import make_baseline
 from guiderail.tools.learning.train import run
 from guiderail.tools.parts.create_task import onboard
 from guiderail.tools.visualization.curves import draw_world
@@ -52,7 +52,7 @@ class Panel:
     title: str
     task: str | Callable[[], str]
     environment: dict[str, Any]
-    act: Callable[[Any], Act]
+    act: Callable[[Any], PolicyFn]
     seed: int = 1_000_000
     colour: tuple[int, int, int] = GREEN
     says: Callable[[dict[str, Any]], str] | None = None
@@ -154,8 +154,8 @@ def save(path: Path, frames: Sequence[Image.Image], seconds: float) -> None:
     frames[0].save(path, quality=55, method=4, **options)
 
 
-def _white(seed: int) -> Callable[[Any], Act]:
-    return lambda env: NullPolicy(white, env, seed)
+def _white(seed: int) -> Callable[[Any], PolicyFn]:
+    return lambda env: BaselinePolicy(white, env, seed)
 
 
 def _jerk(row: dict[str, Any]) -> str:
@@ -163,13 +163,13 @@ def _jerk(row: dict[str, Any]) -> str:
 
 
 def _worst(row: dict[str, Any]) -> str:
-    outside = row["worst_violation"]
+    outside = row["max_commanded_violation"]
     return "no command outside" if outside <= TOLERANCE else f"{1000 * outside:.0f} mm into the forbidden zone"
 
 
 def _within(row: dict[str, Any]) -> str:
-    outside = 1000 * row["worst_violation"]
-    bound = "no command outside" if row["worst_violation"] <= TOLERANCE else f"{outside:.2f} mm outside"
+    outside = 1000 * row["max_commanded_violation"]
+    bound = "no command outside" if row["max_commanded_violation"] <= TOLERANCE else f"{outside:.2f} mm outside"
     words = str(row["termination"]).replace("_", " ")
     return f"{words}, {bound}, jerk {row['jerk_commanded_linear']:.1f} m/s³"
 
@@ -178,7 +178,7 @@ def _obstacle(row: dict[str, Any]) -> str:
     return f"goal reached, obstacle cost {abs(row['reward_obstacle_cost']):.1f}"
 
 
-def _learned(env: Any) -> Act:
+def _learned(env: Any) -> PolicyFn:
     """What the demo learns: a run of `LEARNING_EPISODES` episodes, made here."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
@@ -187,8 +187,8 @@ def _learned(env: Any) -> Act:
         return Policy.load(out)
 
 
-def _right(env: Any) -> Act:
-    return NullPolicy(lambda rng, size: lambda observation: np.array([1.0, 0.0]), env)
+def _right(env: Any) -> PolicyFn:
+    return BaselinePolicy(lambda rng, size: lambda observation: np.array([1.0, 0.0]), env)
 
 
 @cache
@@ -208,7 +208,7 @@ def _onboarded(name: str) -> str:
 
 def _beside(distance: float) -> dict[str, Any]:
     """The socket so far from where it is believed to be [m]."""
-    return {"guidance": "kgrl", "uncertainty": "disc", "offset_range": [distance, distance]}
+    return {"guidance": "kgrl", "fixture_offset": "per_episode", "offset_range": [distance, distance]}
 
 
 PASSAGE, SQUARE = (240, 350), (320, 240)
@@ -217,8 +217,16 @@ PASSAGE, SQUARE = (240, 350), (320, 240)
 PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None]] = {
     "passage_methods": (
         lambda: [
-            Panel("KGRL, white actions", "NarrowPassage", {"guidance": "kgrl", "hold": 10}, _white(1), says=_jerk),
-            Panel("sKGRL, the same actions", "NarrowPassage", {"guidance": "skgrl", "hold": 10}, _white(1), says=_jerk),
+            Panel(
+                "KGRL, white actions", "NarrowPassage", {"guidance": "kgrl", "action_repeat": 10}, _white(1), says=_jerk
+            ),
+            Panel(
+                "sKGRL, the same actions",
+                "NarrowPassage",
+                {"guidance": "skgrl", "action_repeat": 10},
+                _white(1),
+                says=_jerk,
+            ),
         ],
         PASSAGE,
         None,
@@ -248,7 +256,9 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "connector": (
         lambda: [
             Panel("the demonstration alone", "BncConnector", {"guidance": "kgrl"}, still),
-            Panel("KGRL, a rule by hand", "BncConnector", {"guidance": "kgrl"}, untrained("BncConnector", "rule")),
+            Panel(
+                "KGRL, a rule by hand", "BncConnector", {"guidance": "kgrl"}, make_baseline("BncConnector", "scripted")
+            ),
         ],
         SQUARE,
         8,
@@ -259,14 +269,14 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
                 title,
                 "BncConnector",
                 {"difficulty": "hard", **guidance},
-                untrained("BncConnector", "rule"),
+                make_baseline("BncConnector", "scripted"),
                 seed=1_000_002,
                 says=_within,
             )
             for title, guidance in (
                 ("a rule by hand, through KGRL", {"guidance": "kgrl"}),
                 ("sKGRL, adaptive history", {"guidance": "skgrl", "adaptive_history": True}),
-                ("residual, the same reach", {"guidance": "residual", "kappa": 1.85}),
+                ("residual, the same reach", {"guidance": "residual", "action_scale": 1.85}),
             )
         ],
         SQUARE,
@@ -283,8 +293,8 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "clamp": (
         lambda: [
-            Panel("straight down", "GridClamp", {"seconds": 5.0}, untrained("GridClamp", "straight_descent")),
-            Panel("a rule that searches", "GridClamp", {"seconds": 5.0}, untrained("GridClamp", "rule")),
+            Panel("straight down", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "straight_descent")),
+            Panel("a rule that searches", "GridClamp", {"seconds": 5.0}, make_baseline("GridClamp", "scripted")),
         ],
         SQUARE,
         3,
@@ -292,7 +302,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     "pouring": (
         lambda: [
             Panel("random inputs", "Pouring", {"time_limit": 6.0}, _white(1)),
-            Panel("a person's inputs", "Pouring", {"time_limit": 6.0}, untrained("Pouring", "rule")),
+            Panel("a person's inputs", "Pouring", {"time_limit": 6.0}, make_baseline("Pouring", "scripted")),
         ],
         SQUARE,
         6,

@@ -52,17 +52,17 @@ TASKS: dict[str, list[Row]] = {
         Row("KGRL", "connector", "kgrl"),
         Row("sKGRL", "connector", "skgrl"),
         Row("residual RL", "connector_guidance", "residual"),
-        *_nulls("connector_nulls", ("demonstrations", "white", "best_constant", "rule"), "calibration"),
+        *_nulls("connector_nulls", ("demonstrations", "uniform_random", "best_constant", "scripted"), "per_run"),
     ],
     "**connector**, the thesis to the letter": [
         Row("KGRL", "connector_thesis", "kgrl"),
         Row("sKGRL", "connector_thesis", "skgrl"),
-        *_nulls("connector_thesis", ("demonstrations", "white"), names=NULLS[:2]),
+        *_nulls("connector_thesis", ("demonstrations", "uniform_random"), names=NULLS[:2]),
     ],
     "**connector**, another offset in every episode": [
         Row("KGRL", "connector_disc", "kgrl"),
         Row("sKGRL", "connector_disc", "skgrl"),
-        *_nulls("connector_nulls", ("demonstrations", "white", "best_constant", "rule"), "disc"),
+        *_nulls("connector_nulls", ("demonstrations", "uniform_random", "best_constant", "scripted"), "per_episode"),
     ],
     "**connector, hard**": [
         Row("KGRL", "connector_hard", "kgrl"),
@@ -71,51 +71,61 @@ TASKS: dict[str, list[Row]] = {
         Row("residual RL", "connector_hard", "residual"),
         Row("safe residual RL", "connector_hard", "safe_residual"),
         Row("residual RL that reaches farther", "connector_hard", "residual_far"),
-        *_nulls("connector_hard_nulls", ("demonstrations", "white", "best_constant", "rule")),
+        *_nulls("connector_hard_nulls", ("demonstrations", "uniform_random", "best_constant", "scripted")),
     ],
     "**connector, hard**, commands within 2.8 mm": [
         Row("KGRL", "connector_hard_safety", "kgrl"),
         Row("sKGRL, adaptive history", "connector_hard_safety", "skgrl_adaptive"),
         Row("residual RL", "connector_hard_safety", "residual"),
         Row("safe residual RL", "connector_hard_safety", "safe_residual"),
-        *_nulls("connector_hard_safety", ("demonstrations", "white", "rule"), names=(*NULLS[:2], NULLS[3])),
+        *_nulls(
+            "connector_hard_safety", ("demonstrations", "uniform_random", "scripted"), names=(*NULLS[:2], NULLS[3])
+        ),
     ],
     "**connector, hard**, learned at a finer contact in Drake, judged in MuJoCo": [
         Row("KGRL", "connector_hard_fine", "kgrl", "MuJoCo"),
         Row("KGRL, randomized contact", "connector_hard_fine", "kgrl_randomized", "MuJoCo"),
         Row("sKGRL, adaptive history", "connector_hard_fine", "skgrl_adaptive", "MuJoCo"),
         Row("residual RL", "connector_hard_fine", "residual", "MuJoCo"),
-        *_nulls("connector_hard_fine", ("demonstrations", "white", "rule"), "MuJoCo", (*NULLS[:2], NULLS[3])),
+        *_nulls(
+            "connector_hard_fine", ("demonstrations", "uniform_random", "scripted"), "MuJoCo", (*NULLS[:2], NULLS[3])
+        ),
     ],
     "**grid clamp**": [
         Row("RL-SCT", "grid_clamp", "sct"),
         Row("residual RL", "grid_clamp_guidance", "residual"),
         Row("RL, 6D velocities", "grid_clamp_guidance", "none"),
-        *_nulls("grid_clamp_nulls", ("nothing", "white", "best_constant", "rule"), names=NO_DEMONSTRATIONS),
+        *_nulls(
+            "grid_clamp_nulls", ("nothing", "uniform_random", "best_constant", "scripted"), names=NO_DEMONSTRATIONS
+        ),
     ],
     "**grid clamp, hard**": [
         Row("RL-SCT, shown 3 episodes", "grid_clamp_hard", "sct"),
         Row("residual RL", "grid_clamp_hard", "residual"),
         Row("RL, 6D velocities", "grid_clamp_hard", "none"),
-        *_nulls("grid_clamp_hard_nulls", ("zero", "white", "best_constant", "rule"), names=NO_DEMONSTRATIONS),
+        *_nulls(
+            "grid_clamp_hard_nulls", ("zero", "uniform_random", "best_constant", "scripted"), names=NO_DEMONSTRATIONS
+        ),
     ],
     "**pouring**": [
         Row("RL-SCT, shaped", "pouring_sac", "rl_sct_shaped"),
         Row("RL-SCT, sparse", "pouring_sac", "rl_sct_sparse"),
         Row("RL, shaped by hand", "pouring_sac", "rl_shaped"),
-        *_nulls("pouring_nulls", ("nothing", "white", "best_constant", "person"), names=NO_DEMONSTRATIONS),
+        *_nulls(
+            "pouring_nulls", ("nothing", "uniform_random", "best_constant", "scripted_pour"), names=NO_DEMONSTRATIONS
+        ),
     ],
     "**pouring, hard**": [
         Row("RL-SCT", "pouring_hard", "rl_sct"),
         Row("RL-SCT, longer", "pouring_hard", "rl_sct_longer"),
         Row("RL, shaped by hand", "pouring_hard", "rl"),
-        *_nulls("pouring_hard_nulls", ("zero", "white", "best_constant", "rule"), names=NO_DEMONSTRATIONS),
+        *_nulls("pouring_hard_nulls", ("zero", "uniform_random", "best_constant", "scripted"), names=NO_DEMONSTRATIONS),
     ],
     "**narrow passage**": [
         Row("KGRL", "narrow_passage", "kgrl"),
         Row("residual RL", "narrow_passage", "residual"),
         Row("safe residual RL", "narrow_passage", "safe_residual"),
-        *_nulls("narrow_passage_nulls", ("demonstrations", "white", "best_constant"), names=NULLS[:3]),
+        *_nulls("narrow_passage_nulls", ("demonstrations", "uniform_random", "best_constant"), names=NULLS[:3]),
     ],
     "**narrow passage, hard**": [
         Row("KGRL, shown 10 episodes", "narrow_passage_hard", "kgrl"),
@@ -146,8 +156,8 @@ def _seeds(results: Path, row: Row) -> pd.DataFrame:
     if not path.is_file():
         return pd.DataFrame()
     found = read_table(path)
-    found = found[(found["method"] == row.method) & ((row.judged is None) | (found["judged_on"] == row.judged))]
-    return found.sort_values(["seed", "mark"], kind="stable").drop_duplicates("seed", keep="last")
+    found = found[(found["method"] == row.method) & ((row.judged is None) | (found["eval_set"] == row.judged))]
+    return found.sort_values(["seed", "after_episodes"], kind="stable").drop_duplicates("seed", keep="last")
 
 
 def numbers(seeds: pd.DataFrame) -> tuple[str, ...]:
@@ -160,13 +170,13 @@ def numbers(seeds: pd.DataFrame) -> tuple[str, ...]:
     column = "success_rate" if held_out else "training_success_rate"
     of = "" if not held_out or (seeds["episodes"] == 100).all() else f" of {_each(seeds['episodes'])}"
     success = _each(100 * seeds[column]) + (of if held_out else " in training")
-    converged = _each(seeds["training_converged_after"])
+    converged = _each(seeds["training_episodes_to_convergence"])
     parts = [_safety(seeds, prefix) for prefix in (("", "training_") if held_out else ("training_",))]
     forces = _forces(parts) if held_out else f"({_forces(parts)})"
     return f"{episodes} ({_span(seeds['seed'])})", success, converged, _beyond(parts), forces
 
 
-SAFETY = ("worst_violation", "violating_episodes", "peak_force")
+SAFETY = ("max_commanded_violation", "violating_episodes", "peak_force")
 
 
 def _safety(seeds: pd.DataFrame, prefix: str) -> pd.DataFrame:
@@ -193,7 +203,7 @@ def _interval(row: dict) -> str:
 
 def _beyond(parts: Sequence[pd.DataFrame]) -> str:
     """How far commands were outside, and in how many episodes; held out and in training together."""
-    worst = max(float(part["worst_violation"].max()) for part in parts)
+    worst = max(float(part["max_commanded_violation"].max()) for part in parts)
     if worst <= TOLERANCE:
         return "never"
     episodes = sum(int(part["violating_episodes"].sum()) for part in parts)

@@ -226,7 +226,7 @@ def api() -> str:
     from guiderail.diagrams import guidance
     from guiderail.diagrams.envs.observation import CLOCKS
     from guiderail.diagrams.guidance import guidance as guidance_ports
-    from guiderail.diagrams.guidance.registry import INGREDIENTS
+    from guiderail.diagrams.guidance.registry import REQUIREMENTS
     from guiderail.diagrams.stations.station import OUTPUTS
     from guiderail.models import primitives
     from guiderail.systems.episode_monitor import TERMINATIONS
@@ -252,7 +252,7 @@ def api() -> str:
             TERMINATIONS,
             "how an episode ends; the empty one: it goes on",
         ),
-        ("guiderail.diagrams.guidance.registry.INGREDIENTS", tuple(INGREDIENTS), "what `register_guidance` can need"),
+        ("guiderail.diagrams.guidance.registry.REQUIREMENTS", tuple(REQUIREMENTS), "what `register_guidance` can need"),
         ("guiderail.diagrams.stations.station.OUTPUTS", OUTPUTS, "signals that every station has"),
         ("guiderail.diagrams.guidance.guidance.OUTPUTS", guidance_ports.OUTPUTS, "signals that every guidance has"),
     ]
@@ -444,7 +444,7 @@ def shipped_templates() -> str:
     page = ""
     for file in sorted((one for one in folder.iterdir() if one.name.endswith(".yaml")), key=lambda one: one.name):
         name = file.name.removesuffix(".yaml")
-        page += f"### The template {name}\n\n`load_skill({name!r})`:\n\n"
+        page += f"### The template {name}\n\n`load_template({name!r})`:\n\n"
         page += f"```yaml\n{file.read_text(encoding='utf-8').rstrip()}\n```\n\n"
     return page
 
@@ -457,7 +457,7 @@ def templates() -> str:
     if set(SKILL_WORDS) != loader.SKILL_FIELDS:
         raise ValueError(f"a skill's fields changed: {set(SKILL_WORDS) ^ loader.SKILL_FIELDS} have no words here")
     page = (
-        "# Template files\n\nA shared control template is a YAML file; `load_skill(path)` reads it and "
+        "# Template files\n\nA shared control template is a YAML file; `load_template(path)` reads it and "
         "`guiderail check FILE` says what is wrong with it, in a sentence. "
         "[Write a template](../tutorials/write_a_template.md) makes one.\n\n"
     )
@@ -508,7 +508,7 @@ def worlds() -> str:
     from guiderail.diagrams.tasks.registry import TASKS
 
     page = (
-        "# Worlds and stations\n\nA task names a `world_kind`, and its `world()` returns what a station of that kind "
+        "# Worlds and stations\n\nA task names a `workcell_kind`, and its `workcell()` returns what a station of that kind "
         "is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a world of another kind, "
         "`register_station(name, world=kind)` decorates a subclass of `Station` that is built from a world. Every "
         "station has the inputs and outputs below; sizes are those of a pose with six numbers.\n\n"
@@ -520,9 +520,9 @@ def worlds() -> str:
         )
     )
     page += table(["port", "size", "what it is"], rows)
-    tasks = {TASKS.get(name).world_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
+    tasks = {TASKS.get(name).workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
     for kind, task in tasks.items():
-        world = resolve(task, {}).task.world()
+        world = resolve(task, {}).task.workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
         page += f"`{type(world).__module__}.{type(world).__name__}`.\n\n"
         if kind == "workcell":
@@ -554,7 +554,7 @@ def studies() -> str:
         f"{', '.join(f'`{n}`' for n in declaration.shipped_studies())} come along. A field of two words is written "
         "with a space: `judged on`. What is unknown is refused.\n\n"
     )
-    kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.JudgedOn, declaration.Sweep)
+    kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.EvalSet, declaration.Sweep)
     for kind in (*kinds, declaration.Ratio, *declaration.PROGRAMS.values(), declaration.Certifiable):
         words, kinds_of = field_words(kind), field_types(kind)
         page += f"## {kind.__name__}\n\n{prose(inspect.getdoc(kind) or '')}\n\n"
@@ -578,7 +578,7 @@ def files() -> str:
     from guiderail.models.primitives.demonstrations import Demonstrations
     from guiderail.tools.evaluation.metrics import COLUMNS
     from guiderail.tools.evaluation.step_log import MEANINGS
-    from guiderail.tools.learning.config import PRESETS, Preset
+    from guiderail.tools.learning.config import PRESETS, LearnerConfig
     from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 
     page = (
@@ -592,12 +592,12 @@ def files() -> str:
         "| `learning_curve.png`, `replay.html` | to look at |\n\n"
     )
     page += "### config.yaml\n\n" + _fields(RunConfig)
-    page += f"### learner, in config.yaml\n\n{prose(inspect.getdoc(Preset) or '')} "
+    page += f"### learner, in config.yaml\n\n{prose(inspect.getdoc(LearnerConfig) or '')} "
     page += f"Presets are {', '.join(code(name) for name in PRESETS)}; `--set name=value` changes one setting.\n\n"
-    page += _fields(Preset)
+    page += _fields(LearnerConfig)
     page += (
         "### episodes.csv\n\nAnd `reward_…`, the sum of each of the reward's terms. `collisions` and `collision_steps` "
-        "are of the signal that `Task.collision` names. An episode that a `Condition` ends as `collision` counts only "
+        "are of the signal that `Task.collision` names. An episode that a `TerminationTerm` ends as `collision` counts only "
         "where that signal is above its limit too.\n\n"
     )
     page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.words)) for m in COLUMNS])
@@ -674,18 +674,18 @@ def wiring() -> str:
     import numpy as np
     from pydrake.math import RigidTransform
 
-    from guiderail.diagrams.guidance import GUIDANCE, Known, PrimitiveSkill, Template, build_guidance
+    from guiderail.diagrams.guidance import GUIDANCE, PrimitiveConfig, PriorKnowledge, Template, build_guidance
     from guiderail.models.control.keep_out import KeepOut
     from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-    from guiderail.models.templates import load_skill
+    from guiderail.models.templates import load_template
 
     period, box = 0.02, LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
     times = period * np.arange(20)
     reference = ReferenceTrajectory(times, np.column_stack([times, times]), np.tile(0.01 * np.eye(2), (20, 1, 1)))
     walls = KeepOut([[5.0, 5.0]], [[6.0, 6.0]], box, margin=0.0)
-    skill = PrimitiveSkill(reference, box, period, horizon=4, keep_out=walls)
-    shown = Known(period, demonstrations=skill, pose_size=2)
-    template = Known(period, template=Template(load_skill("grid_clamp"), {"hole": RigidTransform()}))
+    skill = PrimitiveConfig(reference, box, period, horizon=4, keep_out=walls)
+    shown = PriorKnowledge(period, demonstrations=skill, pose_size=2)
+    template = PriorKnowledge(period, template=Template(load_template("grid_clamp"), {"hole": RigidTransform()}))
     page = (
         "# Guidance as it is wired\n\nRead from the diagrams that `build_guidance` makes, here of demonstrations in a "
         "plane and of the grid clamp's template. A diagram's own ports have no system before the dot. "
@@ -694,7 +694,7 @@ def wiring() -> str:
     for name in GUIDANCE.names():
         if not GUIDANCE.get(name).build.__module__.startswith("guiderail."):
             continue
-        known = template if not GUIDANCE.get(name).lacks({"template"}) else shown
+        known = template if not GUIDANCE.get(name).missing_requirements({"template"}) else shown
         diagram = build_guidance(name, known)
         page += f"## {name}\n\n{prose(inspect.getdoc(GUIDANCE.get(name).build) or '').split(chr(10) * 2)[0]}\n\n"
         page += table(["from", "to"], [(code(one), code(other)) for one, other in connections(diagram)])

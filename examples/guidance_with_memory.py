@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOrderHold
 
-from guiderail import Guidance, Known, make_env, register_guidance
+from guiderail import Guidance, PriorKnowledge, make_env, register_guidance
 from guiderail.systems import ConstraintViolation
 
 STEP = 0.01  # of a full action [m]
@@ -16,7 +16,7 @@ STEP = 0.01  # of a full action [m]
 class Creep(LeafSystem):
     """Commands command[k] = command[k − 1] + STEP action[k], from where the robot is at first."""
 
-    def __init__(self, known: Known):
+    def __init__(self, known: PriorKnowledge):
         super().__init__()
         self.action = self.DeclareVectorInputPort("action", known.pose_size)
         self.pose = self.DeclareVectorInputPort("pose", known.pose_size)
@@ -34,7 +34,7 @@ class Creep(LeafSystem):
 
 
 @register_guidance("creep")
-def creep(known: Known) -> Guidance:
+def creep(known: PriorKnowledge) -> Guidance:
     guidance, builder = Guidance(), DiagramBuilder()
     command = builder.AddNamedSystem("creep", Creep(known))
     held = builder.AddNamedSystem("held_action", ZeroOrderHold(known.period, known.pose_size))
@@ -52,7 +52,7 @@ def creep(known: Known) -> Guidance:
     return guidance
 
 
-env = make_env("NarrowPassage", guidance="creep", hold=5)
+env = make_env("NarrowPassage", guidance="creep", action_repeat=5)
 for episode in range(2):
     env.reset(seed=0)
     for _ in range(4):

@@ -13,7 +13,7 @@ if __name__ == "__main__":  # each process imports this file first
         # Forks of a process that is begun anew: forks of this one would share its threads' locks.
         vector_kwargs={"context": "forkserver"},
         guidance="skgrl",
-        hold=5,
+        action_repeat=5,
     )
     observations, infos = envs.reset(seed=0)  # environment i has the seed 0 + i
     print("observations", observations.shape)

@@ -8,7 +8,7 @@ from pydantic import Field
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
 
-from guiderail import Known, Options, make_env, register_guidance
+from guiderail import Options, PriorKnowledge, make_env, register_guidance
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive import KgrlGuidance
 
@@ -23,7 +23,7 @@ class AlongOptions(Options):
 class KgrlAlong(Guidance):
     """action (1,) → direction · action (2,) → KGRL."""
 
-    def __init__(self, known: Known):
+    def __init__(self, known: PriorKnowledge):
         super().__init__()
         builder = DiagramBuilder()
         angle = np.deg2rad(known.options["angle"])

@@ -21,7 +21,7 @@ class Hurry(GridClamp):
         ]
 
 
-env = gr.make_env("examples/Hurry", guidance="sct", hold=10)
+env = gr.make_env("examples/Hurry", guidance="sct", action_repeat=10)
 env.reset(seed=0)
 sums = dict.fromkeys(("time_cost", "jump_cost"), 0.0)
 for _ in range(10):

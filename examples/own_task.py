@@ -19,9 +19,9 @@ STEPS, PERIOD = 80, 0.02
 class WideGap(gr.Task):
     """Through a wide gap to a goal beside the demonstrations."""
 
-    world_kind, num_steps, clip = "plane", STEPS, 1.0
+    workcell_kind, num_steps, clip = "plane", STEPS, 1.0
 
-    def world(self) -> PassageGeometry:
+    def workcell(self) -> PassageGeometry:
         return WORLD
 
     def reference(self) -> gr.ReferenceTrajectory:  # known: so kmp, residual, kgrl and skgrl can guide
@@ -31,16 +31,16 @@ class WideGap(gr.Task):
     def constraints(self) -> gr.LinearConstraints:
         return gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
 
-    def observed(self) -> Sequence[gr.Observed]:
-        return (gr.Observed("phase"), gr.Observed("pose", centre=0.5, scale=0.5))
+    def observation_terms(self) -> Sequence[gr.ObservationTerm]:
+        return (gr.ObservationTerm("phase"), gr.ObservationTerm("pose", centre=0.5, scale=0.5))
 
     def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
         return [
             gr.RewardTerm("nearness", {"pose": 2}, lambda pose: -float(np.linalg.norm(pose - np.array(WORLD.goal))))
         ]
 
-    def conditions(self) -> list[gr.Condition]:
-        return [gr.Condition("success", {"pose": 2}, WORLD.at_goal)]
+    def termination_terms(self) -> list[gr.TerminationTerm]:
+        return [gr.TerminationTerm("success", {"pose": 2}, WORLD.at_goal)]
 
     def reset(
         self, station: gr.Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
@@ -50,7 +50,7 @@ class WideGap(gr.Task):
 
 
 register_envs()
-env = gymnasium.make("examples/WideGap-v0", guidance="skgrl", hold=5)
+env = gymnasium.make("examples/WideGap-v0", guidance="skgrl", action_repeat=5)
 print("starts at", env.reset(seed=1)[1]["start"].round(3), "and ends as", end="")
 over = False
 while not over:

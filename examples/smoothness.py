@@ -14,7 +14,7 @@ reference = ReferenceTrajectory(times, means, wide[:, None, None] ** 2 * np.eye(
 
 for name, history, variance in (("no history (KGRL)", 0, 1.0), ("rho = 1e-4", 10, 1e-4), ("rho = 1e-8", 10, 1e-8)):
     primitive = LcNsKmp(reference, history=history, history_variance=variance)
-    gains = rms_gains(primitive, kappa=0.5, hold=HOLD)
+    gains = rms_gains(primitive, action_scale=0.5, action_repeat=HOLD)
     actions = np.repeat(np.random.default_rng(0).uniform(-1, 1, (primitive.num_steps, 2)), HOLD, axis=0)
     past = np.tile(primitive.reference.means[0], (primitive.history, 1))
     path = []

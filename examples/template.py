@@ -6,12 +6,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
-from guiderail import load_skill
+from guiderail import load_template
 from guiderail.diagrams.guidance.sct import SctGuidance
 from guiderail.models.common.poses import transform_to_pose
 
 PERIOD = 0.02
-skill = load_skill("pouring", mug_radius_m=0.05)  # a wider mug than the file's own
+skill = load_template("pouring", mug_radius_m=0.05)  # a wider mug than the file's own
 guidance = SctGuidance(skill, {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}, PERIOD)
 
 builder = DiagramBuilder()

@@ -12,15 +12,15 @@ import numpy as np
 from scipy import signal
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import Act
+from guiderail.tools.evaluation.rollout import PolicyFn
 
 RMS = 1.0 / np.sqrt(3.0)
 FEATURES = 64  # of gSDE: as wide as a small policy's last layer
 
 
-def white(rng: np.random.Generator, steps: int, size: int, hold: int = 1) -> np.ndarray:
-    """Uniform in [−1, 1], each held for `hold` control steps (action repeat)."""
-    return np.repeat(rng.uniform(-1.0, 1.0, (-(-steps // hold), size)), hold, axis=0)[:steps]
+def white(rng: np.random.Generator, steps: int, size: int, action_repeat: int = 1) -> np.ndarray:
+    """Uniform in [−1, 1], each held for `action_repeat` control steps (action repeat)."""
+    return np.repeat(rng.uniform(-1.0, 1.0, (-(-steps // action_repeat), size)), action_repeat, axis=0)[:steps]
 
 
 def pink(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
@@ -47,7 +47,7 @@ def _filtered(rng: np.random.Generator, steps: int, size: int, numerator: Any, d
 
 def open_loop(
     make: Callable[..., np.ndarray], rng: np.random.Generator, steps: int, size: int, **arguments: Any
-) -> Act:
+) -> PolicyFn:
     """Actions made for an episode in advance; they do not look at what is observed.
 
     Raises:
@@ -59,10 +59,10 @@ def open_loop(
     return lambda observation: next(sequence)
 
 
-def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: int) -> Act:
+def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: int) -> PolicyFn:
     """gSDE (Raffin et al., 2022): noise that is linear in features of the state, sampled anew every `interval` steps.
 
-    The features are those of an untrained network: rectified, not learned.
+    The features are those of an make_baseline network: rectified, not learned.
     """
     mix: np.ndarray | None = None
     weights = np.zeros((0, 0))

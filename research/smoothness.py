@@ -18,13 +18,13 @@ from guiderail.diagrams.envs.make import known
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
 from guiderail.diagrams.tasks.insertion import FARTHEST
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.insertion import RHO
+from guiderail.models.objects.insertion import HISTORY_VARIANCE
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.evaluate import cached
 from guiderail.tools.evaluation.metrics import jerk, summary
-from guiderail.tools.evaluation.rollout import Act, rollout
+from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import colour, new_figure, save_figure
 from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, white
@@ -78,7 +78,7 @@ ELSEWHERE = (FARTHEST, FARTHEST)  # m: where the jack is while the robot moves i
 ALONE = "demonstration alone"
 OUTPUTS = {"all": (0, 1, 2, 3, 4, 5), "xy": (0, 1)}
 
-Explore = Callable[[np.random.Generator, int, int], Act]
+Explore = Callable[[np.random.Generator, int, int], PolicyFn]
 
 
 @dataclass(frozen=True)
@@ -88,19 +88,19 @@ class Method:
     name: str
     guidance: str
     explore: Explore
-    hold: int = 1  # decisions that an action lasts; the environment itself takes one at every control step
+    action_repeat: int = 1  # decisions that an action lasts; the environment itself takes one at every control step
     environment: dict[str, Any] = field(default_factory=dict)
 
 
 def methods() -> list[Method]:
     """Everything that is compared."""
-    white_of = {n: partial(open_loop, white, hold=n) for n in (1, HOLD, SLOW)}
+    white_of = {n: partial(open_loop, white, action_repeat=n) for n in (1, HOLD, SLOW)}
     listed = [Method(ALONE, "kmp", lambda rng, steps, size: lambda observation: np.zeros(size))]
     listed.append(Method("KGRL", "kgrl", white_of[1]))
     for history, variance in ((10, 1e-8), (10, 1e-10), (10, 1e-11), (10, 1e-12), (2, 1e-11), (20, 1e-11)):
         settings = {"history": history, "history_variance": variance}
         listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", white_of[1], 1, settings))
-    usual = {"history": 10, "history_variance": RHO}
+    usual = {"history": 10, "history_variance": HISTORY_VARIANCE}
     listed.append(Method("sKGRL adaptive", "skgrl", white_of[1], 1, usual | {"adaptive_history": True}))
     listed.append(Method(f"KGRL repeat {HOLD}", "kgrl", white_of[HOLD], HOLD))
     listed += [Method(f"sKGRL repeat {n}", "skgrl", white_of[n], n, usual) for n in (HOLD, SLOW)]
@@ -112,32 +112,32 @@ def methods() -> list[Method]:
 
 
 def smoothness(
-    out: Path, *, episodes: int = 4, kappa: float = 1.0, outputs: str = "all", seed: int = 0
+    out: Path, *, episodes: int = 4, action_scale: float = 1.0, outputs: str = "all", seed: int = 0
 ) -> dict[str, Any]:
     """Runs the benchmark; writes `smoothness.csv`, `smoothness.md` and `smoothness.png`.
 
     Args:
         out: the folder.
         episodes: of each method, in free space and on the connector alike.
-        kappa: the common exploration RMS, in demonstration standard deviations.
+        action_scale: the common exploration RMS, in demonstration standard deviations.
         outputs: "all" six, as in the thesis, or "xy", which the connector is learned with.
         seed: of the random actions and of the connector's offsets (a new one in every episode).
 
     Raises:
         InputError: if a number is out of range.
     """
-    if episodes < 1 or not kappa > 0 or outputs not in OUTPUTS:
+    if episodes < 1 or not action_scale > 0 or outputs not in OUTPUTS:
         raise InputError(
-            f"give at least one episode, a positive kappa and outputs {' or '.join(OUTPUTS)}, "
-            f"not {episodes}, {kappa} and {outputs!r}"
+            f"give at least one episode, a positive action_scale and outputs {' or '.join(OUTPUTS)}, "
+            f"not {episodes}, {action_scale} and {outputs!r}"
         )
     quiet = quiet_commands()
     rows = []
     for method in methods():
         # A method that is measured already is not measured again: the benchmark goes on where it was interrupted.
-        words = [method.name, outputs, f"{kappa:g}", str(episodes), str(seed)]
+        words = [method.name, outputs, f"{action_scale:g}", str(episodes), str(seed)]
         file = out / "methods" / ("-".join(words).replace(" ", "_") + ".csv")
-        how: dict[str, Any] = {"episodes": episodes, "kappa": kappa, "seed": seed}
+        how: dict[str, Any] = {"episodes": episodes, "action_scale": action_scale, "seed": seed}
         found = cached(file, lambda: pd.DataFrame(measure(method, OUTPUTS[outputs], quiet, **how)))  # noqa: B023
         rows += found.to_dict("records")
     for row in rows:  # against white actions through KGRL, at the same place
@@ -147,14 +147,14 @@ def smoothness(
     return {
         "table": str(write_table(out / "smoothness", rows)),
         "picture": str(_draw(rows, out / "smoothness.png")),
-        "exploration_rms": f"{kappa:g} demonstration standard deviations, {outputs} outputs",
+        "exploration_rms": f"{action_scale:g} demonstration standard deviations, {outputs} outputs",
         **_claims(rows),
     }
 
 
 def quiet_commands() -> np.ndarray:
     """The commands of the demonstrations alone, (N, 6)."""
-    env: Any = make_environment(TASK, {"guidance": "kmp", "hold": 1, "uncertainty": "known"})
+    env: Any = make_environment(TASK, {"guidance": "kmp", "action_repeat": 1, "fixture_offset": "none"})
     rollout(env, still(env), seed=0, options={"offset": ELSEWHERE})
     commands = env.unwrapped.trace.commanded.copy()
     env.close()
@@ -162,7 +162,7 @@ def quiet_commands() -> np.ndarray:
 
 
 def measure(
-    method: Method, explored: tuple[int, ...], quiet: np.ndarray, *, episodes: int, kappa: float, seed: int
+    method: Method, action_dims: tuple[int, ...], quiet: np.ndarray, *, episodes: int, action_scale: float, seed: int
 ) -> list[dict[str, Any]]:
     """A row for free space and one for the connector.
 
@@ -171,49 +171,54 @@ def measure(
         explored: which outputs it moves.
         quiet: the commands of the demonstrations alone, (N, 6): see `quiet_commands`.
         episodes: in each place.
-        kappa: the exploration RMS, in demonstration standard deviations.
+        action_scale: the exploration RMS, in demonstration standard deviations.
         seed: of the random actions and of the connector's offsets.
     """
-    arguments = {"guidance": method.guidance, "uncertainty": "disc", "hold": 1, "explored": explored}
-    arguments |= method.environment | _strength(method, explored, kappa)
+    arguments = {
+        "guidance": method.guidance,
+        "fixture_offset": "per_episode",
+        "action_repeat": 1,
+        "action_dims": action_dims,
+    }
+    arguments |= method.environment | _strength(method, action_dims, action_scale)
     env: Any = make_environment(TASK, arguments)
-    unit = deviation(reference_trajectory("insert"))[list(explored)]
+    unit = deviation(reference_trajectory("insert"))[list(action_dims)]
     rows = []
     for place in PLACES:
         seen, moved, smooth, added = [], [], [], []
         for index in range(episodes):
             rng = np.random.default_rng([seed, index])
-            act = method.explore(rng, len(quiet), len(explored))
+            act = method.explore(rng, len(quiet), len(action_dims))
             options = {"offset": ELSEWHERE} if place == "free" else {"held_out": True}
             seen.append(rollout(env, act, seed=seed + index, options=options))
             trace = env.unwrapped.trace
             deviated = trace.commanded - quiet[: len(trace)]
             added.append(jerk(deviated, trace.period))
-            moved.append(deviated[:, list(explored)] / unit)
+            moved.append(deviated[:, list(action_dims)] / unit)
             smooth.append(_shape(trace))
         rows.append(_row(method, place, pd.DataFrame(seen), np.concatenate(moved), smooth, added))
     env.close()
     return rows
 
 
-def _strength(method: Method, explored: tuple[int, ...], kappa: float) -> dict[str, Any]:
+def _strength(method: Method, action_dims: tuple[int, ...], action_scale: float) -> dict[str, Any]:
     """Arguments with which random actions have an RMS of κ standard deviations where no constraint is in the way."""
     if method.guidance == "kmp":
         return {}
     # Built once more, only for its primitive: what the environment would explore with at κ = 1.
     histories = {key: value for key, value in method.environment.items() if key in ("history", "history_variance")}
-    skill = known(TASK, guidance=method.guidance, explored=None, **histories).demonstrations
+    skill = known(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
     assert skill is not None
-    indices = np.array(explored)
+    indices = np.array(action_dims)
     if method.guidance == "residual":  # the same for all outputs of a unit, whose deviations differ
         reached = RMS * (skill.residual_gains() / deviation(skill.reference))[indices]
-        return {"kappa": kappa / float(np.sqrt(np.mean(reached**2)))}
+        return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
     primitive = skill.primitive(history=method.guidance == "skgrl")
     if not method.environment.get("adaptive_history"):
-        return {"gains": tuple(rms_gains(primitive, kappa, method.hold, indices).tolist())}
+        return {"gains": tuple(rms_gains(primitive, action_scale, method.action_repeat, indices).tolist())}
     # Each length of an adaptive history has gains of its own, which one κ sets: it is the longest that is free.
-    reached = exploration_rms(primitive, skill.null_space_gains(primitive), method.hold)[indices]
-    return {"kappa": kappa / float(np.sqrt(np.mean(reached**2)))}
+    reached = exploration_rms(primitive, skill.null_space_gains(primitive), method.action_repeat)[indices]
+    return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
 
 
 def _shape(trace: Any) -> dict[str, float]:
@@ -243,7 +248,7 @@ def _row(
         **{f"jerk_added_{part}": float(np.mean([one[part] for one in added])) for part in added[0]},
         **{key: float(np.mean([one[key] for one in smooth])) for key in smooth[0]},
         # In free space nothing succeeds.
-        **summary(seen, ("peak_force", "mean_force", "success_rate", "ended_in_collision", "worst_violation")),
+        **summary(seen, ("peak_force", "mean_force", "success_rate", "ended_in_collision", "max_commanded_violation")),
     }
 
 
@@ -254,8 +259,8 @@ def _claims(rows: list[dict[str, Any]]) -> dict[str, Any]:
     others = {name: row for name, row in free.items() if name.startswith("residual")}
     kgrl = free[f"KGRL repeat {HOLD}"]
     claims: dict[str, Any] = {}
-    for hold in (HOLD, SLOW):
-        mine = f"sKGRL repeat {hold}"
+    for action_repeat in (HOLD, SLOW):
+        mine = f"sKGRL repeat {action_repeat}"
         ours = free[mine]
         claims[f"{mine} explores and locks"] = f"{success[mine]:.0%}"
         for part in ("linear", "angular"):

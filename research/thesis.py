@@ -16,7 +16,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.tools.learning.config import PRESETS, Preset, decision_discount
+from guiderail.tools.learning.config import PRESETS, LearnerConfig, action_gamma
 from guiderail.tools.learning.run_folder import RunConfig
 
 HISTORY = ("history", "history_variance", "history_source", "adaptive_history")
@@ -57,8 +57,8 @@ def _where(option: str, *values: Any) -> Callable[[Mapping[str, Any]], bool]:
 
 
 _PRIMITIVE = {
-    "hold": (1,),  # algorithms 2 and 3: an action every time step
-    "explored": (None,),
+    "action_repeat": (1,),  # algorithms 2 and 3: an action every time step
+    "action_dims": (None,),
     "history": (10,),
     "history_source": ("measured",),  # algorithm 3, line 18
     "adaptive_history": (False,),
@@ -67,9 +67,9 @@ _PRIMITIVE = {
     "beta": (6.0,),
     "inverse_length": (2.0,),  # section 4.3.3, "the same kernel in all our experiments"
 }
-_TOLD = ("kappa", "mouth_chamfer", "difficulty")  # options that remarks tell the value of
+_TOLD = ("action_scale", "mouth_chamfer", "difficulty")  # options that remarks tell the value of
 _SCALE = (
-    "actions of ±1 are κ = {kappa:g} standard deviations of the demonstrations (thesis: no scale is given)",
+    "actions of ±1 are κ = {action_scale:g} standard deviations of the demonstrations (thesis: no scale is given)",
     _always,
 )
 _SIMULATED = ("simulated (thesis: a real robot, the DLR SARA)", _always)
@@ -104,7 +104,7 @@ THESIS = {
             "observation": ("state",),
             "history_variance": (1e-8,),
             "bound": (2.0 * MM,),  # equation 4.26
-            "uncertainty": ("calibration",),
+            "fixture_offset": ("per_run",),
             "station": ("arm",),
         },
         "table_4_1_robot",
@@ -125,9 +125,9 @@ THESIS = {
         "3.4.2",
         # 9820 time steps are 17 minutes: ten decisions a second.
         {
-            "hold": (5,),
+            "action_repeat": (5,),
             "reward": ("shaped", "no_force"),
-            "uncertainty": ("calibration",),
+            "fixture_offset": ("per_run",),
             "station": ("arm",),
             "active_constraints": (None, True),
         },
@@ -144,7 +144,7 @@ THESIS = {
         "3.4.1",
         # 9700 time steps are 16 minutes: ten decisions a second.
         {
-            "hold": (10,),
+            "action_repeat": (10,),
             "reward": ("shaped", "sparse", "hand_shaped"),
             "input_speed": (None, 1.0),
             "mug_offset": (0.0,),
@@ -169,8 +169,12 @@ THESIS = {
 }  # fmt: skip
 
 # A setting of the learner that the thesis has no word for, and what it does.
-_ADDITIONS: tuple[tuple[str, Callable[[Preset], bool], str], ...] = (
-    ("greedy_share", lambda p: p.greedy_share > 0, "{greedy_share:.0%} of the episodes are greedy"),
+_ADDITIONS: tuple[tuple[str, Callable[[LearnerConfig], bool], str], ...] = (
+    (
+        "greedy_episode_fraction",
+        lambda p: p.greedy_episode_fraction > 0,
+        "{greedy_episode_fraction:.0%} of the episodes are greedy",
+    ),
     ("symmetry", lambda p: bool(p.symmetry), "what was seen is also learned from as seen from other sides"),
     (
         "selection_window",
@@ -178,7 +182,7 @@ _ADDITIONS: tuple[tuple[str, Callable[[Preset], bool], str], ...] = (
         "the policy is one of the run's actors: checkpoint selection",
     ),
     ("pipelined", lambda p: p.pipelined, "acting knows what was learned an episode before"),
-    ("averaging", lambda p: p.averaging > 0, "the policy is an average over actors"),
+    ("actor_ema", lambda p: p.actor_ema > 0, "the policy is an average over actors"),
     ("layer_norm", lambda p: p.layer_norm, "hidden layers are normalized"),
     (
         "constant_episodes",
@@ -193,7 +197,7 @@ _ADDITIONS: tuple[tuple[str, Callable[[Preset], bool], str], ...] = (
     ),
     ("n_steps", lambda p: p.n_steps > 1, "returns are of {n_steps} decisions"),
 )
-_COMPARED = ("learning_rate", "soft_update", "train_every", "gradient_steps", "entropy", "units", "buffer_size")
+_COMPARED = ("learning_rate", "tau", "train_freq", "gradient_steps", "ent_coef", "net_arch", "buffer_size")
 # What only one of its tables says.
 _TABLE_3_2_ONLY = ("learning_starts", "batch_size")
 
@@ -219,7 +223,7 @@ def differences(config: RunConfig, *, learns: bool = True) -> list[str]:
         found += _learner_differences(replace(config, learner=sided), setting)
     found += _unlike_defaults(config, setting)
     chamfer = environment.get("mouth_chamfer", BncDimensions().mouth_chamfer)
-    known = {"kappa": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
+    known = {"action_scale": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
     found += [words.format(**known) for words, holds in setting.remarks if holds(environment)]
     return found
 
@@ -271,8 +275,11 @@ def _learner_differences(config: RunConfig, setting: Setting) -> list[str]:
     for name in printed:
         if not _same(ours[name], theirs[name]):
             found.append(f"{_words(name)} {_value(ours[name])} (thesis: {_value(theirs[name])})")
-    (its_hold,) = setting.options["hold"]
-    per_step = [decision_discount(one, hold) ** (1 / hold) for one, hold in ((learner, config.hold), (table, its_hold))]
+    (its_hold,) = setting.options["action_repeat"]
+    per_step = [
+        action_gamma(one, action_repeat) ** (1 / action_repeat)
+        for one, action_repeat in ((learner, config.action_repeat), (table, its_hold))
+    ]
     if not math.isclose(*per_step, rel_tol=1e-9):
         found.append(f"discount of a control step {per_step[0]:.4g} (thesis: {per_step[1]:.4g})")
     return found + [words.format(**ours) for _, holds, words in _ADDITIONS if holds(learner)]
@@ -291,8 +298,8 @@ def _same(ours: Any, theirs: Any) -> bool:
 
 
 _NAMES = {
-    "hold": "control steps of a decision",
-    "explored": "explored outputs",
+    "action_repeat": "control steps of a decision",
+    "action_dims": "explored outputs",
     "history": "P =",
     "history_variance": "ρ =",
     "history_source": "history of poses that were",
@@ -300,8 +307,8 @@ _NAMES = {
     "horizon": "H =",
     "lambda_": "λ =",
     "beta": "β =",
-    "units": "hidden units",
-    "train_every": "decisions between trainings",
+    "net_arch": "hidden units",
+    "train_freq": "decisions between trainings",
 }
 
 

@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
-from guiderail.models.templates.template import INSIDE, Skill
+from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.skill_frames import SkillFrames
@@ -28,7 +28,7 @@ class ActiveConstraintProjector(LeafSystem):
 
         H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
-    (`Skill.command`). The last command is state; it is initialized with the measured pose, as far inside the
+    (`SharedControlTemplate.command`). The last command is state; it is initialized with the measured pose, as far inside the
     constraints as one period leads. Between two control instants the output is a pure function of it and of the
     request. The last safe command is repeated, and ``fallback`` is 1, where a request or the measured pose is not
     finite, and where the tracking error exceeds its bound and the request would not reduce it: the command waits for a
@@ -57,7 +57,11 @@ class ActiveConstraintProjector(LeafSystem):
     """
 
     def __init__(
-        self, skill: Skill, frames: Mapping[str, RigidTransform], period: float, max_tracking_error: float = np.inf
+        self,
+        skill: SharedControlTemplate,
+        frames: Mapping[str, RigidTransform],
+        period: float,
+        max_tracking_error: float = np.inf,
     ):
         """
         Args:

@@ -78,7 +78,7 @@ class CartesianImpedanceController(LeafSystem):
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``state`` is (2n,), joint
     positions and velocities. ``command_time`` is (1,), when ``desired_pose`` was given [s]; unconnected, commands never
     get stale. ``torque`` is (n,) [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T. ``saturation`` is 1
-    while the wrench or a motor is at its limit, ``holding`` 1 while the watchdog holds; both (1,).
+    while the wrench or a motor is at its limit, ``command_timed_out`` 1 while the watchdog holds; both (1,).
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class CartesianImpedanceController(LeafSystem):
             "saturation", 1, self._calc_saturation, prerequisites_of_calc=law
         )
         self._holding_port = self.DeclareVectorOutputPort(
-            "holding", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
+            "command_timed_out", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
         )
 
     def get_desired_pose_input_port(self) -> InputPort:

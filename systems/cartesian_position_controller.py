@@ -76,7 +76,7 @@ class CartesianPositionController(LeafSystem):
     at initialization, and the joint command starts there. ``command_time`` is (1,), when ``desired_pose`` was given
     [s]; unconnected, commands never get stale. ``joint_positions`` is the joint command, (n,) [rad]. ``pose`` is (6,),
     where the joint command puts the tool centre. ``stuck`` is 1 while the desired direction can't be followed,
-    ``holding`` 1 while the joint command is held; both (1,). All outputs are state or follow from it: nothing feeds
+    ``command_timed_out`` 1 while the joint command is held; both (1,). All outputs are state or follow from it: nothing feeds
     through.
     """
 
@@ -141,7 +141,7 @@ class CartesianPositionController(LeafSystem):
             "pose", 6, self._calc_pose, prerequisites_of_calc={self._plant_context.ticket()}
         )
         self._stuck_port = self.DeclareStateOutputPort("stuck", self._is_stuck)
-        self._holding_port = self.DeclareStateOutputPort("holding", self._is_holding)
+        self._holding_port = self.DeclareStateOutputPort("command_timed_out", self._is_holding)
         self.DeclareInitializationDiscreteUpdateEvent(self._start_at_measured_positions)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 

@@ -4,10 +4,10 @@ from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSyste
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import WRENCH_SIZE
-from guiderail.models.control.wrench import contact_lever
+from guiderail.models.control.wrench import center_of_pressure
 
 
-class ContactLever(LeafSystem):
+class CenterOfPressure(LeafSystem):
     """Measures the lever of a force along z about a tool centre.
 
         lever = (−τ_y, τ_x) / f_z where f_z ≥ least_force, and 0 elsewhere
@@ -17,7 +17,7 @@ class ContactLever(LeafSystem):
 
     .. pydrake_system::
 
-        name: ContactLever
+        name: CenterOfPressure
         input_ports:
         - wrench
         output_ports:
@@ -47,9 +47,9 @@ class ContactLever(LeafSystem):
         """Force and torque about the tool centre, (6,) [N, Nm]."""
         return self._wrench_port
 
-    def get_lever_output_port(self) -> OutputPort:
+    def get_center_of_pressure_output_port(self) -> OutputPort:
         """From the tool centre to where it pushes, (2,) [m]."""
         return self._lever_port
 
     def _calc_lever(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(contact_lever(self._wrench_port.Eval(context), self._least_force))
+        output.SetFromVector(center_of_pressure(self._wrench_port.Eval(context), self._least_force))

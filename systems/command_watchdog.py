@@ -25,7 +25,7 @@ class CommandWatchdog(LeafSystem):
         - holding
 
     ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``command_time`` is (1,),
-    when ``desired_pose`` was given [s]; unconnected, commands never get stale. ``holding`` is (1,): 1 while a pose is
+    when ``desired_pose`` was given [s]; unconnected, commands never get stale. ``command_timed_out`` is (1,): 1 while a pose is
     held.
     """
 
@@ -57,7 +57,7 @@ class CommandWatchdog(LeafSystem):
             "safe_pose", pose_size, self._calc_safe_pose, prerequisites_of_calc=self._watch.tickets
         )
         self._holding_port = self.DeclareVectorOutputPort(
-            "holding", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
+            "command_timed_out", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
         )
 
     def get_desired_pose_input_port(self) -> InputPort:

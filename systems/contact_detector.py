@@ -11,7 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 
-class ContactWatch(LeafSystem):
+class ContactDetector(LeafSystem):
     """Detects contact between bodies and obstacles, at the present plant step and since the episode began.
 
     The plant's contact results are evaluated at every plant step: a collision that is shorter than a control step
@@ -19,7 +19,7 @@ class ContactWatch(LeafSystem):
 
     .. pydrake_system::
 
-        name: ContactWatch
+        name: ContactDetector
         input_ports:
         - contact_results
         output_ports:

@@ -26,7 +26,7 @@ SUCCESS = TERMINATIONS.index("success")
 
 
 @dataclass(frozen=True)
-class Condition:
+class TerminationTerm:
     """A condition that terminates an episode.
 
     Args:
@@ -70,7 +70,7 @@ class EpisodeMonitor(LeafSystem):
     ``termination`` is (1,): an index into `TERMINATIONS`, 0 while the episode goes on.
     """
 
-    def __init__(self, conditions: Sequence[Condition], period: float, of: str = ""):
+    def __init__(self, conditions: Sequence[TerminationTerm], period: float, of: str = ""):
         """
         Args:
             conditions: where two hold in the same step, the first one counts.

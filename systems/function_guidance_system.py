@@ -11,7 +11,7 @@ from guiderail.systems.support.sampling import check_period
 Law = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
-class GuidanceLaw(LeafSystem):
+class FunctionGuidanceSystem(LeafSystem):
     """Samples a policy's action and the measurements once a control period, and commands what a law makes of them.
 
         desired_pose[k] = law(action[k], pose[k], wrench[k])
@@ -21,7 +21,7 @@ class GuidanceLaw(LeafSystem):
 
     .. pydrake_system::
 
-        name: GuidanceLaw
+        name: FunctionGuidanceSystem
         input_ports:
         - action
         - pose

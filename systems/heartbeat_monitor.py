@@ -13,32 +13,32 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import DeputyWord, Fault
+from guiderail.models.control.joint_status import Fault, Heartbeat
 from guiderail.systems.support.sampling import check_period
 
 # Entries of the state: the number of the last word, NaN before the first; and for how long there was no new one.
 _NUMBER, _SILENCE = range(2)
 
 
-class DeputyWatch(LeafSystem):
+class HeartbeatMonitor(LeafSystem):
     """Adds to the faults of a robot's status that its deputy has stopped it, or has fallen silent.
 
     A deputy that was never heard is not missed.
 
     .. pydrake_system::
 
-        name: DeputyWatch
+        name: HeartbeatMonitor
         input_ports:
         - word
         - status_fault
         output_ports:
         - fault
 
-    ``word`` is an abstract value: the newest `DeputyWord`, or None. ``status_fault`` and ``fault`` are (1,), codes of
+    ``word`` is an abstract value: the newest `Heartbeat`, or None. ``status_fault`` and ``fault`` are (1,), codes of
     `Fault`; one of the status comes first.
     """
 
-    def __init__(self, *, period: float, patience: float):
+    def __init__(self, *, period: float, command_timeout: float):
         """
         Args:
             period: at which is checked [s], positive.
@@ -49,9 +49,9 @@ class DeputyWatch(LeafSystem):
         """
         super().__init__()
         check_period(period)
-        if not 0.0 < patience < np.inf:
-            raise InputError(f"the time for which a deputy may say nothing must be positive, not {patience} s")
-        self._period, self._patience = period, patience
+        if not 0.0 < command_timeout < np.inf:
+            raise InputError(f"the time for which a deputy may say nothing must be positive, not {command_timeout} s")
+        self._period, self._patience = period, command_timeout
         self._word_port = self.DeclareAbstractInputPort("word", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
         self._memory = self.DeclareDiscreteState([np.nan, 0.0])
@@ -69,7 +69,7 @@ class DeputyWatch(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
 
     def get_word_input_port(self) -> InputPort:
-        """The deputy's newest word, an abstract `DeputyWord`; any other object is none."""
+        """The deputy's newest word, an abstract `Heartbeat`; any other object is none."""
         return self._word_port
 
     def get_status_fault_input_port(self) -> InputPort:
@@ -89,9 +89,9 @@ class DeputyWatch(LeafSystem):
         number, silence = context.get_discrete_state(self._memory).value()
         return word is not None and word.number == number and silence > self._patience
 
-    def _word(self, context: Context) -> DeputyWord | None:
+    def _word(self, context: Context) -> Heartbeat | None:
         found = self._word_port.Eval(context)
-        return found if isinstance(found, DeputyWord) else None
+        return found if isinstance(found, Heartbeat) else None
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value([np.nan, 0.0])
@@ -110,5 +110,5 @@ class DeputyWatch(LeafSystem):
         fault = float(self._status_fault_port.Eval(context)[0])
         word = self._word(context)
         if fault == Fault.NONE and word is not None and (word.is_acting or self._is_silent(context)):
-            fault = float(Fault.DEPUTY)
+            fault = float(Fault.MONITOR_STOP)
         output.SetAtIndex(0, fault)

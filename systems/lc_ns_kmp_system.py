@@ -163,7 +163,7 @@ class LcNsKmpSystem(LeafSystem):
             raise InputError("this system has one primitive, hence no such port: give it shorter ones")
         return self._history_length_port
 
-    def get_output_output_port(self) -> OutputPort:
+    def get_command_output_port(self) -> OutputPort:
         """The command, (O,)."""
         return self._output_port
 

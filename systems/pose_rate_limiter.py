@@ -15,7 +15,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 
-class DesiredPoseRamp(LeafSystem):
+class PoseRateLimiter(LeafSystem):
     """Follows a desired pose with limited speed, starting from the measured pose.
 
     While the authority is zero the output is the measured pose; where there is authority at initialization already, it
@@ -25,7 +25,7 @@ class DesiredPoseRamp(LeafSystem):
 
     .. pydrake_system::
 
-        name: DesiredPoseRamp
+        name: PoseRateLimiter
         input_ports:
         - desired_pose
         - pose
@@ -34,7 +34,7 @@ class DesiredPoseRamp(LeafSystem):
         - limited_pose
 
     ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians.
-    ``authority`` is (1,), a `TorqueGuard`'s.
+    ``blend_factor`` is (1,), a `TorqueSafetyLimiter`'s.
     """
 
     def __init__(self, *, period: float, speed: float = 0.25, angular_speed: float = 1.5):

@@ -1,4 +1,4 @@
-"""Statistics of an episode's safety: violations, forces, collisions, saturation, fallbacks."""
+"""Statistics of an episode's safety: violations, forces, collisions, saturation, fallback_steps."""
 
 from collections.abc import Mapping
 
@@ -18,7 +18,7 @@ from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.signal_ports import SignalPorts
 
 # The state: worst commanded and measured violation, peak force, sum of forces, collisions, steps in collision,
-# saturations, fallbacks, steps, and whether the last step was in collision.
+# saturated_steps, fallback_steps, steps, and whether the last step was in collision.
 _INITIAL_STATE = np.array([-np.inf, -np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -48,14 +48,14 @@ class SafetyLedger(LeafSystem):
     """
 
     FIELDS = (
-        "worst_commanded_violation",
-        "worst_measured_violation",
+        "max_commanded_violation",
+        "max_measured_violation",
         "peak_force",
         "mean_force",
         "collisions",
         "collision_steps",
-        "saturations",
-        "fallbacks",
+        "saturated_steps",
+        "fallback_steps",
         "steps",
     )
 
@@ -66,8 +66,8 @@ class SafetyLedger(LeafSystem):
         return {
             "collisions": float((touches[1:] & ~touches[:-1]).sum()),
             "collision_steps": float(touches.sum()),
-            "saturations": float(signals["saturation"].any(axis=1).sum()),
-            "fallbacks": float((signals["fallback"][:, 0] > 0).sum()),
+            "saturated_steps": float(signals["saturation"].any(axis=1).sum()),
+            "fallback_steps": float((signals["fallback"][:, 0] > 0).sum()),
         }
 
     def __init__(self, period: float, num_actuators: int = 1):

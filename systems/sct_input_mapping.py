@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
-from guiderail.models.templates.template import Skill
+from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.skill_frames import SkillFrames
 
@@ -37,7 +37,7 @@ class SctInputMapping(LeafSystem):
         frames: the poses of the skill's objects, which a reset can set.
     """
 
-    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float):
+    def __init__(self, skill: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         """
         Args:
             skill: the template.

@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.common.poses import pose_to_transform
-from guiderail.models.templates.template import Skill
+from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.skill_frames import SkillFrames
 
@@ -24,7 +24,7 @@ class SctStateMachine(LeafSystem):
 
         q → q' where d_q < threshold of the transition to q',  q' → q where d_q > threshold + hysteresis
 
-    (`Skill.next_state`), for the pose just before the control instant, and at most one transition at each. A transition
+    (`SharedControlTemplate.next_state`), for the pose just before the control instant, and at most one transition at each. A transition
     waits until one period leads from that pose into the next state's active constraints: so no command has to leave
     them, however the template's states meet. An episode begins in the state that the initial pose is in.
 
@@ -49,7 +49,7 @@ class SctStateMachine(LeafSystem):
         frames: the poses of the skill's objects, which a reset can set.
     """
 
-    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float):
+    def __init__(self, skill: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         """
         Args:
             skill: the template.

@@ -20,7 +20,7 @@ from guiderail.systems.support.sampling import check_period
 
 # Entries of the state besides the last readable status itself.
 _CLOCK, _TOLD, _TIME, _OFFSET, _HEARD_AT, _FAULT, _FAULT_AT, _DOUBTED_AT, _KNOWN_TIME, _KNOWN_OFFSET = range(10)
-_SOUND = (Fault.NONE, Fault.LATE)  # what is no fault of the status itself
+_SOUND = (Fault.NONE, Fault.DEADLINE_MISSED)  # what is no fault of the status itself
 # After the first three the clocks are synchronized anew, and how late a status is nobody knows: damping by speeds of
 # long ago drives an arm. So does damping by the inertia of another posture. Only a status that agrees with what was
 # known before is as good as any.
@@ -171,7 +171,7 @@ class StatusWatchdog(LeafSystem):
             last, is_known = known, True
         fault = judge_status(status, last, now, self._limits)
         if not fault and now - memory[_CLOCK] > self._limits.max_gap:
-            fault = Fault.LATE
+            fault = Fault.DEADLINE_MISSED
         since = memory[_KNOWN_TIME] + memory[_KNOWN_OFFSET]
         age = max(now - since, 0.0) if np.isfinite(since) else now
         if status is None or fault in (Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE):

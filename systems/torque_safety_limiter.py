@@ -23,10 +23,10 @@ from guiderail.systems.support.sampling import check_period
 # Entries of the state.
 _PHASE, _FAULT, _PHASE_TIME, _AUTHORITY = range(4)
 # For how long no torque is said once more before a silent robot is sent nothing [s].
-FAREWELL = 0.05
+ZERO_TORQUE_TIME = 0.05
 
 
-class Phase(IntEnum):
+class ArmState(IntEnum):
     """What a guarded arm does: wait for its robot, take over, follow, come to rest, be free of torque."""
 
     WAITING = 0
@@ -75,7 +75,7 @@ class SafetyLimits:
 OLDEST_SPEED = 0.1  # [s] after which nobody knows how fast an arm is
 
 
-class TorqueGuard(LeafSystem):
+class TorqueSafetyLimiter(LeafSystem):
     """Passes wanted torques on while nothing is wrong; otherwise the arm is brought to rest, and then has no torque.
 
         τ = clip(a f τ_wanted + (1 − a) τ_damping)
@@ -94,7 +94,7 @@ class TorqueGuard(LeafSystem):
 
     .. pydrake_system::
 
-        name: TorqueGuard
+        name: TorqueSafetyLimiter
         input_ports:
         - torque
         - state
@@ -116,10 +116,10 @@ class TorqueGuard(LeafSystem):
 
     ``torque`` and ``safe_torque`` are (n,) [Nm], ``state`` (2n,), ``external_torque`` (n,) [Nm], ``wrench`` (6,), force
     first. ``pose`` and ``desired_pose`` are (6,), of which the positions are watched. ``status_fault``, ``status_age``
-    and ``status_is_new`` are (1,), a `StatusWatchdog`'s. ``holding`` is (1,): 1 while a command watchdog holds.
+    and ``status_is_new`` are (1,), a `StatusWatchdog`'s. ``command_timed_out`` is (1,): 1 while a command watchdog holds.
 
     ``fault`` is (1,), a code of `Fault`: why the arm is stopped, or 0. ``phase`` is (1,), a number of `Phase`, and
-    ``authority`` (1,). ``sending`` is (1,): 1 while commands may go out. ``not_following`` is (1,): 1 while the arm
+    ``blend_factor`` (1,). ``sending`` is (1,): 1 while commands may go out. ``not_following`` is (1,): 1 while the arm
     isn't told to go where it is commanded, as it is stopped, takes over, or a command watchdog holds.
     """
 
@@ -152,7 +152,7 @@ class TorqueGuard(LeafSystem):
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._status_is_new_port = self.DeclareVectorInputPort("status_is_new", 1)
-        self._holding_port = self.DeclareVectorInputPort("holding", 1)
+        self._holding_port = self.DeclareVectorInputPort("command_timed_out", 1)
         self._memory = self.DeclareDiscreteState(4)
         self._given = self.DeclareDiscreteState(num_joints)  # momentum since the last status [Nms]
 
@@ -256,7 +256,7 @@ class TorqueGuard(LeafSystem):
         return self._fault_port
 
     def get_phase_output_port(self) -> OutputPort:
-        """What the arm does, (1,): a number of `Phase`."""
+        """What the arm does, (1,): a number of `ArmState`."""
         return self._phase_port
 
     def get_authority_output_port(self) -> OutputPort:
@@ -274,11 +274,11 @@ class TorqueGuard(LeafSystem):
     def stop(self, context: Context) -> None:
         """Stops the arm because somebody asks for it; `context` is this system's."""
         phase = context.get_discrete_state(self._memory).value()[_PHASE]
-        if phase == Phase.WAITING:
+        if phase == ArmState.WAITING:
             # Of an arm that was never taken over no speed is believed yet, and there is no last command to take back.
-            context.SetDiscreteState(self._memory, [Phase.OFF, Fault.ASKED, np.inf, 0.0])
-        elif phase in (Phase.RAMPING, Phase.RUNNING):
-            context.SetDiscreteState(self._memory, [Phase.DAMPING, Fault.ASKED, 0.0, 0.0])
+            context.SetDiscreteState(self._memory, [ArmState.OFF, Fault.USER_STOP, np.inf, 0.0])
+        elif phase in (ArmState.RAMPING, ArmState.RUNNING):
+            context.SetDiscreteState(self._memory, [ArmState.DAMPING, Fault.USER_STOP, 0.0, 0.0])
 
     def resume(self, context: Context) -> None:
         """Goes on after a stop, from where the arm is; `context` is this system's.
@@ -287,12 +287,14 @@ class TorqueGuard(LeafSystem):
             InputError: if the arm is not stopped, not yet at rest, or something is wrong still.
         """
         phase = context.get_discrete_state(self._memory).value()[_PHASE]
-        if phase != Phase.OFF:
-            raise InputError(f"only an arm that is stopped can go on, and this one is {Phase(int(phase)).name.lower()}")
+        if phase != ArmState.OFF:
+            raise InputError(
+                f"only an arm that is stopped can go on, and this one is {ArmState(int(phase)).name.lower()}"
+            )
         found = self._found.Eval(context)
         if found:
             raise InputError(f"the arm can't go on yet: {FAULTS[found]}")
-        context.SetDiscreteState(self._memory, [Phase.RAMPING, Fault.NONE, 0.0, 0.0])
+        context.SetDiscreteState(self._memory, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
         self._plant.SetPositionsAndVelocities(plant_context, self._state_port.Eval(context))
@@ -315,7 +317,7 @@ class TorqueGuard(LeafSystem):
         if not (np.abs(state[n:]) <= limits.velocity).all():
             return Fault.VELOCITY
         places = [self._pose_port.Eval(context)[:3]]
-        if self._memory_of(context)[_PHASE] in (Phase.RAMPING, Phase.RUNNING):
+        if self._memory_of(context)[_PHASE] in (ArmState.RAMPING, ArmState.RUNNING):
             places.append(self._desired_pose_port.Eval(context)[:3])
         for place in places:
             if not ((place >= limits.lower) & (place <= limits.upper)).all():
@@ -329,46 +331,46 @@ class TorqueGuard(LeafSystem):
         return Fault.NONE
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._memory, [Phase.WAITING, Fault.NONE, 0.0, 0.0])
+        discrete_state.set_value(self._memory, [ArmState.WAITING, Fault.NONE, 0.0, 0.0])
         discrete_state.set_value(self._given, np.zeros(self._num_joints))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        phase, fault, phase_time, authority = self._memory_of(context)
+        phase, fault, phase_time, blend_factor = self._memory_of(context)
         phase_time += self._period
         found = self._found.Eval(context)
         given = self._given_until_now(context)
-        if phase in (Phase.RAMPING, Phase.RUNNING) and not found:
+        if phase in (ArmState.RAMPING, ArmState.RUNNING) and not found:
             push = self._safe_torque_port.Eval(context)
             push = push + self._freshness(context) * self._external_torque_port.Eval(context)
             given = given + self._period * push
         discrete_state.set_value(self._given, given)
-        if phase == Phase.WAITING:
+        if phase == ArmState.WAITING:
             if not found:
-                phase, phase_time = Phase.RAMPING, 0.0
-        elif phase in (Phase.RAMPING, Phase.RUNNING):
+                phase, phase_time = ArmState.RAMPING, 0.0
+        elif phase in (ArmState.RAMPING, ArmState.RUNNING):
             if found:
-                phase, fault, phase_time, authority = Phase.DAMPING, found, 0.0, 0.0
+                phase, fault, phase_time, blend_factor = ArmState.DAMPING, found, 0.0, 0.0
             else:
-                authority = min(authority + self._period / self._limits.ramp_time, 1.0)
-                if phase == Phase.RAMPING and authority == 1.0:
-                    phase, phase_time = Phase.RUNNING, 0.0
-        elif phase == Phase.DAMPING and (phase_time >= self._limits.damping_time or self._is_started_anew(context)):
-            phase, phase_time = Phase.OFF, 0.0
-        discrete_state.set_value(self._memory, [phase, fault, phase_time, authority])
+                blend_factor = min(blend_factor + self._period / self._limits.ramp_time, 1.0)
+                if phase == ArmState.RAMPING and blend_factor == 1.0:
+                    phase, phase_time = ArmState.RUNNING, 0.0
+        elif phase == ArmState.DAMPING and (phase_time >= self._limits.damping_time or self._is_started_anew(context)):
+            phase, phase_time = ArmState.OFF, 0.0
+        discrete_state.set_value(self._memory, [phase, fault, phase_time, blend_factor])
         return EventStatus.Succeeded()
 
     def _calc_safe_torque(self, context: Context, output: BasicVector) -> None:
-        phase, _, phase_time, authority = self._memory_of(context)
-        is_active = phase in (Phase.RAMPING, Phase.RUNNING)
+        phase, _, phase_time, blend_factor = self._memory_of(context)
+        is_active = phase in (ArmState.RAMPING, ArmState.RUNNING)
         torque = np.zeros(self._num_joints)
         if is_active and not self._found.Eval(context):
-            torque = authority * self._freshness(context) * self._torque_port.Eval(context)
-            if authority < 1.0:
-                torque = torque + (1.0 - authority) * self._damping_torque(context, np.inf)
+            torque = blend_factor * self._freshness(context) * self._torque_port.Eval(context)
+            if blend_factor < 1.0:
+                torque = torque + (1.0 - blend_factor) * self._damping_torque(context, np.inf)
         elif is_active:
             torque = self._damping_torque(context, 0.0)
-        elif phase == Phase.DAMPING and not self._is_started_anew(context):
+        elif phase == ArmState.DAMPING and not self._is_started_anew(context):
             torque = self._damping_torque(context, phase_time + self._period)
         torque = np.where(np.isfinite(torque), torque, 0.0)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
@@ -408,7 +410,7 @@ class TorqueGuard(LeafSystem):
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         phase, fault, _, _ = self._memory_of(context)
-        is_stopped = phase in (Phase.DAMPING, Phase.OFF)
+        is_stopped = phase in (ArmState.DAMPING, ArmState.OFF)
         output.SetAtIndex(0, float(fault if is_stopped else self._found.Eval(context)))
 
     def _calc_phase(self, context: Context, output: BasicVector) -> None:
@@ -419,11 +421,11 @@ class TorqueGuard(LeafSystem):
 
     def _calc_sending(self, context: Context, output: BasicVector) -> None:
         phase, _, phase_time, _ = self._memory_of(context)
-        is_sending = phase in (Phase.RAMPING, Phase.RUNNING, Phase.DAMPING)
-        if phase == Phase.OFF:
-            is_sending = phase_time <= FAREWELL or self._status_fault_port.Eval(context)[0] == Fault.NONE
+        is_sending = phase in (ArmState.RAMPING, ArmState.RUNNING, ArmState.DAMPING)
+        if phase == ArmState.OFF:
+            is_sending = phase_time <= ZERO_TORQUE_TIME or self._status_fault_port.Eval(context)[0] == Fault.NONE
         output.SetAtIndex(0, float(is_sending))
 
     def _calc_not_following(self, context: Context, output: BasicVector) -> None:
         holds = self._holding_port.Eval(context)[0] > 0.0
-        output.SetAtIndex(0, float(holds or self._memory_of(context)[_PHASE] != Phase.RUNNING))
+        output.SetAtIndex(0, float(holds or self._memory_of(context)[_PHASE] != ArmState.RUNNING))

@@ -20,7 +20,7 @@ from guiderail.models.certificate.adversary import QUANTITIES, Adversary
 from guiderail.models.certificate.bounds import Certified, certify
 from guiderail.models.certificate.files import CERTIFICATE, certificate_files
 from guiderail.models.certificate.lagrange_bounds import Budget
-from guiderail.models.certificate.loop import Bounds, Skill
+from guiderail.models.certificate.loop import Bounds, SharedControlTemplate
 from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.files import write_atomically
@@ -83,7 +83,7 @@ def certify_skill(
     within = _declared_start(task, options, len(start)) if start_within is None else np.full(len(start), start_within)
     if not (np.isfinite(within).all() and (within >= 0.0).all()):
         raise InputError(f"the robot begins within a distance that is not negative, not {within.min()}")
-    skill = Skill(
+    skill = SharedControlTemplate(
         primitive,
         demonstrated.null_space_gains(primitive) if acted else np.zeros(primitive.num_outputs),
         demonstrated.control_period,
@@ -123,7 +123,7 @@ def certify_skill(
     return found
 
 
-def _attacked(skill: Skill, certified: Certified, steps: int, out: Path) -> dict[str, Any]:
+def _attacked(skill: SharedControlTemplate, certified: Certified, steps: int, out: Path) -> dict[str, Any]:
     """What an adversary came to against each bound, as a table in the folder."""
     can_be_corrected = corrected_steps(skill, certified)
     adversary = Adversary(skill, can_be_corrected)
@@ -158,7 +158,7 @@ def _attacked(skill: Skill, certified: Certified, steps: int, out: Path) -> dict
     return found
 
 
-def corrected_steps(skill: Skill, certified: Certified) -> np.ndarray:
+def corrected_steps(skill: SharedControlTemplate, certified: Certified) -> np.ndarray:
     """(N,), at which steps a command, its speed or its acceleration can depend on a correction."""
     touched = certified.touched
     if skill.primitive.history:

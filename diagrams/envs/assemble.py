@@ -18,8 +18,8 @@ from guiderail.diagrams.envs.env import RECORDED, SAID
 from guiderail.diagrams.envs.observation import Observation, affine
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.task import Task
@@ -63,41 +63,41 @@ def add_ledger(
 HALF_TURN_MARGIN = 0.1  # [rad] what actions and contact turn a motion further by
 
 
-def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidance: Mapping[str, Any]) -> Known:
+def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidance: Mapping[str, Any]) -> PriorKnowledge:
     """What a task knows, for guidance on a station.
 
     Args:
         task: the declaration.
         station: for its period and sizes.
-        primitive: options of `PrimitiveSkill` by name.
+        primitive: options of `PrimitiveConfig` by name.
         guidance: the kind of guidance's own options by name.
 
     Raises:
         InputError: if the reference trajectory has another clock than the station, or turns to where the station's
             angles jump.
     """
-    knows = task.knows()
+    provides = task.provides()
     skill = None
-    if "demonstrations" in knows:
+    if "demonstrations" in provides:
         options = dict(primitive)
         reference = through(task.reference(), options.pop("via_points", ()), options.get("inverse_length", 2.0))
         _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
             _refuse_half_turns(reference.means)
-        skill = PrimitiveSkill(
+        skill = PrimitiveConfig(
             reference=reference,
             constraints=task.constraints() or LinearConstraints.none(station.pose_size),
             control_period=station.control_period,
             isotropic_groups=task.isotropic_groups,
-            keep_out=task.keep_out() if "keep_out" in knows else None,
+            keep_out=task.keep_out() if "keep_out" in provides else None,
             wrench_size=station.wrench_size,
             **options,
         )
-    return Known(
+    return PriorKnowledge(
         period=station.control_period,
         demonstrations=skill,
-        template=task.template() if "template" in knows else None,
-        approach=task.approach() if "approach" in knows else None,
+        template=task.template() if "template" in provides else None,
+        approach=task.approach() if "approach" in provides else None,
         options=guidance,
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
@@ -197,7 +197,7 @@ class Loop:
         self.space, self.observation = self._add_observation(task)
 
     def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
-        observed, station = task.observed(), self.station
+        observed, station = task.observation_terms(), self.station
         if isinstance(observed, Camera):
             query = station.GetOutputPort("query")
             image = add_camera(self.builder, station.scene_graph, query, "observation_camera", observed)
@@ -215,7 +215,9 @@ class Loop:
         return diagram.space, diagram.get_observation_output_port()
 
 
-def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None) -> TaskDiagram:
+def build_task_diagram(
+    task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None
+) -> TaskDiagram:
     """Wires a task: its loop, and reward, monitor and ledger beside it. The policy's `action` is an input.
 
     Args:
@@ -233,7 +235,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
     builder.ExportInput(guidance.GetInputPort("action"), "action")
 
     violations = _add_violations(builder, task, station, guidance)
-    conditions = task.conditions()
+    conditions = task.termination_terms()
     monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period, task.name))
     watched = {name: size for condition in conditions for name, size in condition.inputs.items()}
     signals.connect(monitor, watched, f"the end of an episode of {task.name}")
@@ -268,7 +270,7 @@ def assemble(task: Task, station: Station, guidance: Diagram, *, render_mode: st
         "wrench": station.get_wrench_output_port(),
         "saturation": station.get_saturation_output_port(),
         "collision": too_much.get_output_port(),
-        "holding": station.get_holding_output_port(),
+        "command_timed_out": station.get_holding_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
     taken = {*exported, *SAID, *RECORDED}
@@ -324,7 +326,7 @@ class SkillDiagram:
     meshcat: Meshcat | None = None
 
 
-def assemble_skill(
+def build_skill_diagram(
     task: Task,
     station: Station,
     guidance: Diagram,
@@ -336,20 +338,20 @@ def assemble_skill(
 
     Args:
         task: what it is a skill of.
-        station, guidance: as for `assemble`.
-        policy: from an observation to an action, called at every `hold` control periods by a `PolicySystem`; or any
+        station, guidance: as for `build_task_diagram`.
+        policy: from an observation to an action, called at every `action_repeat` control periods by a `PolicySystem`; or any
             system with an input `observation` and an output `action`.
         render_mode: None, or "human" for a view in the browser.
 
     Raises:
-        InputError: as `assemble`, or if the policy's ports have other sizes.
+        InputError: as `build_task_diagram`, or if the policy's ports have other sizes.
     """
     loop = Loop(task, station, guidance)
     builder, action = loop.builder, guidance.GetInputPort("action")
     if not isinstance(policy, System):
         port = loop.observation
         seen_as = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
-        policy = PolicySystem(policy, seen_as, action.size(), task.choice.hold * station.control_period)
+        policy = PolicySystem(policy, seen_as, action.size(), task.choice.action_repeat * station.control_period)
     builder.AddNamedSystem("policy", policy)
     seen, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
     if seen.size() != loop.observation.size() or acts.size() != action.size():

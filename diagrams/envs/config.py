@@ -42,10 +42,12 @@ Numbers = Annotated[tuple[Number, ...], BeforeValidator(_listed)]
 
 
 class PrimitiveOptions(Options):
-    """Of every guidance made of demonstrations; see `PrimitiveSkill`."""
+    """Of every guidance made of demonstrations; see `PrimitiveConfig`."""
 
-    kappa: Number = Field(1.0, gt=0, description="κ: a constant action of ±1 ends √3 κ standard deviations away")
-    explored: Integers | None = Field(None, description="the outputs that an action moves, by number; none named: all")
+    action_scale: Number = Field(1.0, gt=0, description="κ: a constant action of ±1 ends √3 κ standard deviations away")
+    action_dims: Integers | None = Field(
+        None, description="the outputs that an action moves, by number; none named: all"
+    )
     history: Integer = Field(10, ge=1, le=1000, description="P, past outputs that sKGRL's motion passes through")
     history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], how exactly it does")
     history_source: Literal["commanded", "measured"] = Field("commanded", description="what counts as the past")

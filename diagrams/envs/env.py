@@ -14,7 +14,7 @@ from pydrake.systems.framework import PortDataType
 
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
-from guiderail.diagrams.envs.trace import Trace
+from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.policy_system import PolicyError
@@ -25,7 +25,7 @@ RECORDED = (
     "wrench",
     "saturation",
     "collision",
-    "holding",
+    "command_timed_out",
     "fallback",
     "state",
 )
@@ -58,7 +58,7 @@ class GuidedEnv(DrakeGymEnv):
 
     It keeps `DrakeGymEnv`'s interface and replaces its `reset` and `step`. The diagram is built once. A reset restores
     the context to how it was built, lets the task randomize it from `self.np_random`, writes the neutral action and
-    initializes. A step checks the action before anything moves, advances `hold` control steps by an integer count, and
+    initializes. A step checks the action before anything moves, advances `action_repeat` control steps by an integer count, and
     reads every port at the end of each of them, before the events of that instant.
 
     `info` has at every step, and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
@@ -74,7 +74,7 @@ class GuidedEnv(DrakeGymEnv):
     Attributes:
         task: the `TaskDiagram`.
         hold: control steps for which an action is held.
-        trace: the `Trace` of the current episode.
+        trace: the `EpisodeTrace` of the current episode.
         drawn: what the task drew for it.
     """
 
@@ -84,7 +84,7 @@ class GuidedEnv(DrakeGymEnv):
         self,
         task: TaskDiagram,
         *,
-        hold: int = 1,
+        action_repeat: int = 1,
         render_mode: str | None = None,
         release: Callable[[], None] | None = None,
     ):
@@ -96,20 +96,25 @@ class GuidedEnv(DrakeGymEnv):
             release: called once, when the environment is closed or nobody has it any more.
 
         Raises:
-            InputError: if `hold` is no positive integer, or the task can't be rendered that way.
+            InputError: if `action_repeat` is no positive integer, or the task can't be rendered that way.
         """
-        if isinstance(hold, bool) or not isinstance(hold, int | np.integer) or hold < 1:
-            raise InputError(f"hold is the number of control steps an action lasts: give an integer from 1, not {hold}")
+        if isinstance(action_repeat, bool) or not isinstance(action_repeat, int | np.integer) or action_repeat < 1:
+            raise InputError(
+                f"hold is the number of control steps an action lasts: give an integer from 1, not {action_repeat}"
+            )
         diagram = task.diagram
         _check_view(task, render_mode)
         view = None if render_mode != "human" or task.query is None else View(task.query)
         self.task = task = replace(task, view=view)
-        self.hold = int(hold)
+        self.action_repeat = int(action_repeat)
         # The parent class writes into whatever `metadata` it finds; this one is our own, not every environment's.
-        self.metadata = {"render_modes": ["human", "rgb_array"], "render_fps": round(1 / (hold * task.control_period))}
+        self.metadata = {
+            "render_modes": ["human", "rgb_array"],
+            "render_fps": round(1 / (action_repeat * task.control_period)),
+        }
         super().__init__(
             simulator=Simulator(diagram),
-            time_step=hold * task.control_period,
+            time_step=action_repeat * task.control_period,
             action_space=gymnasium.spaces.Box(-1.0, 1.0, (diagram.GetInputPort("action").size(),), np.float32),
             observation_space=task.observation_space,
             reward="reward",
@@ -137,7 +142,7 @@ class GuidedEnv(DrakeGymEnv):
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
         self._pose_port = diagram.GetOutputPort("pose")
         sizes = {name: port.size() for name, port in self._recorded}
-        self.trace = Trace(task.num_steps, self._pose_port.size(), task.control_period, sizes)
+        self.trace = EpisodeTrace(task.num_steps, self._pose_port.size(), task.control_period, sizes)
         self.drawn: dict[str, Any] = {}
         self._control_steps = 0
         self._running = False
@@ -199,7 +204,7 @@ class GuidedEnv(DrakeGymEnv):
         return self._observation, info
 
     def step(self, action):
-        """Holds `action` for `hold` control steps, or until the episode ends.
+        """Holds `action` for `action_repeat` control steps, or until the episode ends.
 
         Raises:
             InputError: if the action is not finite or of the wrong shape; finite ones outside [-1, 1] are clipped. If
@@ -218,7 +223,7 @@ class GuidedEnv(DrakeGymEnv):
         termination = 0
         fallback, failure = False, None
         first_step = self._control_steps
-        for _ in range(self.hold):
+        for _ in range(self.action_repeat):
             try:
                 self._advance()
                 pose = self._pose_port.Eval(context)

@@ -13,7 +13,7 @@ from pydantic import Field
 from pydrake.systems.framework import Diagram, System
 from threadpoolctl import threadpool_limits
 
-from guiderail.diagrams.envs.assemble import SkillDiagram, assemble, assemble_skill, known_of, randomizes
+from guiderail.diagrams.envs.assemble import SkillDiagram, build_skill_diagram, build_task_diagram, known_of, randomizes
 from guiderail.diagrams.envs.config import (
     STANDARD,
     Integer,
@@ -25,7 +25,7 @@ from guiderail.diagrams.envs.config import (
 )
 from guiderail.diagrams.envs.env import GuidedEnv, check_render_mode
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import GUIDANCE, build_guidance, check_guidance, possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances, disturbed
 from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
@@ -38,7 +38,7 @@ from guiderail.models.common.registry import did_you_mean
 Built = TypeVar("Built")
 
 
-class Pool(Generic[Built]):
+class DiagramPool(Generic[Built]):
     """Keeps what was built until somebody needs the same again.
 
     A diagram with a LeafSystem of Python in it is never freed: C++ holds the system's methods, these hold the system,
@@ -67,7 +67,7 @@ class CommonOptions(Options):
     reward: str = Field("", description="what is rewarded")
     observation: str = Field("", description="what the policy sees")
     difficulty: str = Field(STANDARD, description="which of the task's declared settings")
-    hold: Integer = Field(1, ge=1, description="control steps per decision")
+    action_repeat: Integer = Field(1, ge=1, description="control steps per decision")
 
 
 @dataclass(frozen=True)
@@ -93,15 +93,15 @@ class Resolved:
 
 def option_models(task: type[Task], guidance: str, station: str) -> dict[str, type[Options]]:
     """The models of all options that an environment has, by whom they concern."""
-    kind = check_guidance(guidance, task.knows(), task.name)
+    kind = check_guidance(guidance, task.provides(), task.name)
     return {
         "common": CommonOptions,
         "task": task.Options,
         "station": STATIONS.get(station).options or Options,
-        "primitive": PrimitiveOptions if "demonstrations" in task.knows() else Options,
-        "template": TemplateOptions if "template" in task.knows() else Options,
+        "primitive": PrimitiveOptions if "demonstrations" in task.provides() else Options,
+        "template": TemplateOptions if "template" in task.provides() else Options,
         "guidance": kind.options or Options,
-        "disturbances": Disturbances if task.world_kind == "workcell" else Options,
+        "disturbances": Disturbances if task.workcell_kind == "workcell" else Options,
     }
 
 
@@ -114,17 +114,17 @@ def resolve(name: str, given: Mapping[str, Any]) -> Resolved:
     if name not in TASKS.names() and is_task_folder(name):
         name = register_task_folder(name)
     declared = TASKS.get(name)
-    places = stations_for(declared.world_kind)
+    places = stations_for(declared.workcell_kind)
     if not places:
         kinds = {STATIONS.get(place).world for place in STATIONS.names()}
         raise InputError(
-            f"no station works on a world of the kind {brief(declared.world_kind)}, which {name} has: "
-            f"{did_you_mean(declared.world_kind, kinds)}"
+            f"no station works on a world of the kind {brief(declared.workcell_kind)}, which {name} has: "
+            f"{did_you_mean(declared.workcell_kind, kinds)}"
         )
-    if not possible_guidance(declared.knows()):
+    if not possible_guidance(declared.provides()):
         raise InputError(f"nothing guides {name}, as it knows nothing: write its reference(), template() or approach()")
     difficulty = choose("difficulty", given.get("difficulty", STANDARD), list(declared.difficulties), name)
-    first = {"guidance": possible_guidance(declared.knows())[0], "station": places[0]}
+    first = {"guidance": possible_guidance(declared.provides())[0], "station": places[0]}
     first |= {"reward": declared.rewards[0], "observation": declared.observations[0]}
     merged = first | dict(declared.defaults) | dict(declared.difficulties[difficulty]) | dict(given)
     station = STATIONS.get(choose("station", merged["station"], places, name))
@@ -156,8 +156,8 @@ def _known_anywhere(task: type[Task]) -> set[str]:
     """The options that a task has with any guidance on any of its stations."""
     models = {
         model
-        for guidance in possible_guidance(task.knows())
-        for station in stations_for(task.world_kind)
+        for guidance in possible_guidance(task.provides())
+        for station in stations_for(task.workcell_kind)
         for model in option_models(task, guidance, station).values()
     }
     return {key for model in models for key in model.model_fields}
@@ -167,10 +167,10 @@ def make_station(resolved: Resolved) -> Station:
     """The station of an environment, its world in it."""
     kind, disturbances = resolved.station, resolved.models["disturbances"]
     check_num_steps(resolved.task.name, getattr(resolved.task, "num_steps", None))
-    world = resolved.task.world()
+    world = resolved.task.workcell()
     if world is None:
         raise InputError(
-            f"world() of {resolved.task.name} returns nothing: let it return what station={kind.name!r} works on"
+            f"workcell() of {resolved.task.name} returns nothing: let it return what station={kind.name!r} works on"
         )
     build = partial(kind.build, world, **_values(resolved.models["station"]))
     return (
@@ -183,7 +183,7 @@ def make_guidance(resolved: Resolved, station: Station) -> Diagram:
     return build_guidance(resolved.task.choice.guidance, _known(resolved, station), resolved.task.name)
 
 
-def known(task: str, **options: Any) -> Known:
+def known(task: str, **options: Any) -> PriorKnowledge:
     """What is known about a task, with the options of an environment: for whoever wants its primitive or template.
 
     Raises:
@@ -193,7 +193,7 @@ def known(task: str, **options: Any) -> Known:
     return _known(resolved, make_station(resolved))
 
 
-def _known(resolved: Resolved, station: Station) -> Known:
+def _known(resolved: Resolved, station: Station) -> PriorKnowledge:
     models = resolved.models
     return known_of(resolved.task, station, _values(models["primitive"]), _values(models["guidance"]))
 
@@ -231,7 +231,9 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     diagram = replace(built.diagram, randomize=reset, declaration=resolved.task)
     release = partial(_POOL.give_back, key, built)
     try:
-        return GuidedEnv(diagram, hold=resolved.task.choice.hold, render_mode=render_mode, release=release)
+        return GuidedEnv(
+            diagram, action_repeat=resolved.task.choice.action_repeat, render_mode=render_mode, release=release
+        )
     except BaseException:  # such as a view that finds no port
         release()
         raise
@@ -244,13 +246,13 @@ class _Built:
     guidance: Diagram
 
 
-_POOL: Pool[_Built] = Pool()
+_POOL: DiagramPool[_Built] = DiagramPool()
 
 
 def _build(resolved: Resolved, render_mode: str | None) -> _Built:
     station = make_station(resolved)
     guidance = make_guidance(resolved, station)
-    return _Built(assemble(resolved.task, station, guidance, render_mode=render_mode), station, guidance)
+    return _Built(build_task_diagram(resolved.task, station, guidance, render_mode=render_mode), station, guidance)
 
 
 def _key(resolved: Resolved, render_mode: str | None) -> Hashable:
@@ -286,7 +288,7 @@ def make_skill(
     threadpool_limits(1)
     station = make_station(resolved)
     guidance = make_guidance(resolved, station)
-    return assemble_skill(resolved.task, station, guidance, policy, render_mode=render_mode)
+    return build_skill_diagram(resolved.task, station, guidance, policy, render_mode=render_mode)
 
 
 def _values(model: Options) -> dict[str, Any]:

@@ -18,7 +18,7 @@ CLOCKS = ("time", "phase")
 
 
 @dataclass(frozen=True)
-class Observed:
+class ObservationTerm:
     """A signal that a policy sees, as (value − centre) / scale.
 
     Attributes:
@@ -48,7 +48,7 @@ class Observation(Diagram):
     """
 
     def __init__(
-        self, observed: Sequence[Observed], sizes: Mapping[str, int], duration: float, clip: float, of: str = ""
+        self, observed: Sequence[ObservationTerm], sizes: Mapping[str, int], duration: float, clip: float, of: str = ""
     ):
         """
         Args:
@@ -68,7 +68,9 @@ class Observation(Diagram):
         rows = [_rows(one, sizes[one.signal], f" of {of}" if of else "") for one in observed]
         self.size = sum(len(scale) for _, _, scale in rows)
         if not self.size:
-            raise InputError(f"the observation{f' of {of}' if of else ''} is of nothing: let observed() list a signal")
+            raise InputError(
+                f"the observation{f' of {of}' if of else ''} is of nothing: let observation_terms() list a signal"
+            )
         together = builder.AddNamedSystem("observed", Multiplexer([sizes[one.signal] for one in observed]))
         exported: set[str] = set()
         for index, one in enumerate(observed):
@@ -115,7 +117,7 @@ def _add_clock(builder: DiagramBuilder, name: str, duration: float) -> OutputPor
     return builder.AddNamedSystem(name, clock).get_output_port()
 
 
-def _rows(one: Observed, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _rows(one: ObservationTerm, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which entries (n, size), their centres (n,) and scales (n,)."""
     try:
         selection = np.eye(size) if one.entries is None else np.eye(size)[list(one.entries)]
@@ -136,7 +138,7 @@ def _rows(one: Observed, size: int, of: str) -> tuple[np.ndarray, np.ndarray, np
     return selection, centre, scale
 
 
-def _numbers(one: Observed, name: str, number: int, of: str) -> np.ndarray:
+def _numbers(one: ObservationTerm, name: str, number: int, of: str) -> np.ndarray:
     """The centre or the scale of each entry, (n,)."""
     given = getattr(one, name)
     try:

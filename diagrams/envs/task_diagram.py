@@ -32,7 +32,7 @@ PORTS = (
 """The output ports that every task's diagram exports, beside one per reward term."""
 
 
-def exact_period(seconds: float) -> float:
+def round_period(seconds: float) -> float:
     """The period nearest to `seconds` (a picosecond away at most) whose multiples are exact in double precision.
 
     Drake triggers two events together only where their times are the same number, and fl(10 k · 0.002),
@@ -104,7 +104,7 @@ class TaskDiagram:
     ``wrench``              of the surroundings on the tool, where the diagram has one; as are the next three
     ``saturation``          (A,) the demand on each actuator beyond its limit
     ``collision``           (1,) positive while the robot touches what it must not
-    ``holding``             (1,) 1 while the last safe pose is held, as commands stopped or are no numbers
+    ``command_timed_out``             (1,) 1 while the last safe pose is held, as commands stopped or are no numbers
     ``rgb_image``           an abstract `ImageRgba8U`; only where the task was built with a camera
     ======================= ================================================================================
 
@@ -115,7 +115,7 @@ class TaskDiagram:
 
     Args:
         diagram: the root diagram.
-        control_period: seconds between control steps; best an integer multiple of the plant's `exact_period`.
+        control_period: seconds between control steps; best an integer multiple of the plant's `round_period`.
         num_steps: control steps after which an episode is truncated.
         observation_space: the space of observations; its dtype is what the environment returns.
         reward_terms: names of the reward's terms, which are ports of the diagram and keys of `info`.

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 
-class Trace:
+class EpisodeTrace:
     """Commanded and measured pose, contact force and reward of every control step of an episode, and further signals.
 
     The arrays are views of storage that the next episode writes into: copy what should outlive a reset.

@@ -1,8 +1,8 @@
-from .function import LawGuidance as LawGuidance
+from .function import FunctionGuidance as FunctionGuidance
 from .guidance import Guidance as Guidance
-from .primitive_config import PrimitiveSkill as PrimitiveSkill
-from .prior import Approach as Approach
-from .prior import Known as Known
+from .primitive_config import PrimitiveConfig as PrimitiveConfig
+from .prior import PriorKnowledge as PriorKnowledge
+from .prior import ScriptedApproach as ScriptedApproach
 from .prior import Template as Template
 from .registry import GUIDANCE as GUIDANCE
 from .registry import GuidanceKind as GuidanceKind

@@ -5,18 +5,18 @@ from __future__ import annotations
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.function_guidance_system import GuidanceLaw, Law
+from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, Law
 
 
-class LawGuidance(Guidance):
-    """Commands law(action, pose, wrench) once a control step; see `GuidanceLaw`.
+class FunctionGuidance(Guidance):
+    """Commands law(action, pose, wrench) once a control step; see `FunctionGuidanceSystem`.
 
     Nothing is constrained by it: ``constraint_violation`` says by how much the law left the task's constraints.
     """
 
-    def __init__(self, known: Known, law: Law, action_size: int):
+    def __init__(self, known: PriorKnowledge, law: Law, action_size: int):
         """
         Args:
             known: for the control period, the station's sizes and the task's constraints.
@@ -28,7 +28,7 @@ class LawGuidance(Guidance):
         """
         super().__init__()
         builder = DiagramBuilder()
-        system = GuidanceLaw(law, action_size, known.pose_size, known.wrench_size, known.period)
+        system = FunctionGuidanceSystem(law, action_size, known.pose_size, known.wrench_size, known.period)
         builder.AddNamedSystem("law", system)
         judge = builder.AddNamedSystem("violation", ConstraintViolation(known.constraints, known.period))
         builder.Connect(system.get_desired_pose_output_port(), judge.get_pose_input_port())

@@ -7,8 +7,8 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.history_buffer import HistoryBuffer
@@ -16,7 +16,7 @@ from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
-def skill_of(known: Known) -> PrimitiveSkill:
+def skill_of(known: PriorKnowledge) -> PrimitiveConfig:
     """The demonstrations that are known; whoever registered its needs has them."""
     assert known.demonstrations is not None
     return known.demonstrations
@@ -25,11 +25,11 @@ def skill_of(known: Known) -> PrimitiveSkill:
 class PrimitiveGuidance(Guidance):
     """A diagram with the ports of all guidance, around a movement primitive.
 
-    ``action`` has one entry per explored output. ``constraint_violation`` is judged of the command as it comes out,
+    ``action`` has one entry per action_dims output. ``constraint_violation`` is judged of the command as it comes out,
     whether or not this kind keeps the constraints.
     """
 
-    def _export_inputs(self, builder: DiagramBuilder, skill: PrimitiveSkill) -> tuple[OutputPort, OutputPort]:
+    def _export_inputs(self, builder: DiagramBuilder, skill: PrimitiveConfig) -> tuple[OutputPort, OutputPort]:
         """Exports the inputs and returns where the held action, spread over all outputs (O,), and the pose come out."""
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(skill.control_period, skill.num_actions))
         action = hold.get_output_port()
@@ -46,7 +46,7 @@ class PrimitiveGuidance(Guidance):
         return action, pose.get_output_port()
 
     def _finish(
-        self, builder: DiagramBuilder, skill: PrimitiveSkill, desired_pose: OutputPort, fallback: OutputPort
+        self, builder: DiagramBuilder, skill: PrimitiveConfig, desired_pose: OutputPort, fallback: OutputPort
     ) -> None:
         """Exports the outputs and builds."""
         violation = builder.AddNamedSystem(
@@ -60,7 +60,7 @@ class PrimitiveGuidance(Guidance):
         builder.BuildInto(self)
 
 
-def add_demonstration(builder: DiagramBuilder, skill: PrimitiveSkill, action: OutputPort) -> LcNsKmpSystem:
+def add_demonstration(builder: DiagramBuilder, skill: PrimitiveConfig, action: OutputPort) -> LcNsKmpSystem:
     """Adds the primitive without actions, constraints or history: what the demonstrations alone command."""
     primitive = skill.primitive(history=False, constrained=False)
     kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, skill.control_period))
@@ -83,12 +83,12 @@ def add_demonstration(builder: DiagramBuilder, skill: PrimitiveSkill, action: Ou
 class KmpGuidance(PrimitiveGuidance):
     """Commands the demonstrations' mean; the action changes nothing."""
 
-    def __init__(self, known: Known):
+    def __init__(self, known: PriorKnowledge):
         super().__init__()
         skill, builder = skill_of(known), DiagramBuilder()
         action, _ = self._export_inputs(builder, skill)
         kmp = add_demonstration(builder, skill, action)
-        self._finish(builder, skill, kmp.get_output_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, skill, kmp.get_command_output_port(), kmp.get_fallback_output_port())
 
 
 @register_guidance(
@@ -102,7 +102,7 @@ class KmpGuidance(PrimitiveGuidance):
 class KgrlGuidance(PrimitiveGuidance):
     """A policy's actions deviate where the demonstrations did, and every command keeps the constraints."""
 
-    def __init__(self, known: Known):
+    def __init__(self, known: PriorKnowledge):
         super().__init__()
         skill, builder = skill_of(known), DiagramBuilder()
         action, _ = self._export_inputs(builder, skill)
@@ -110,7 +110,7 @@ class KgrlGuidance(PrimitiveGuidance):
         gains = skill.null_space_gains(primitive)
         kmp = builder.AddNamedSystem("lc_ns_kmp", LcNsKmpSystem(primitive, gains, skill.control_period))
         builder.Connect(action, kmp.get_null_space_action_input_port())
-        self._finish(builder, skill, kmp.get_output_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, skill, kmp.get_command_output_port(), kmp.get_fallback_output_port())
 
 
 @register_guidance(
@@ -129,7 +129,7 @@ class SkgrlGuidance(PrimitiveGuidance):
     begins where the last one ended, whatever the length does.
     """
 
-    def __init__(self, known: Known):
+    def __init__(self, known: PriorKnowledge):
         super().__init__()
         skill, builder = skill_of(known), DiagramBuilder()
         action, pose = self._export_inputs(builder, skill)
@@ -151,10 +151,10 @@ class SkgrlGuidance(PrimitiveGuidance):
         history = builder.AddNamedSystem(
             "history", HistoryBuffer(skill.num_outputs, skill.history, skill.control_period)
         )
-        past = kmp.get_output_output_port() if skill.history_source == "commanded" else pose
+        past = kmp.get_command_output_port() if skill.history_source == "commanded" else pose
         builder.Connect(action, kmp.get_null_space_action_input_port())
         builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
         builder.Connect(past, history.get_output_input_port())
         # Either way it starts from where the robot is: a command from anywhere else would be a jump.
         builder.Connect(pose, history.get_initial_output_input_port())
-        self._finish(builder, skill, kmp.get_output_output_port(), kmp.get_fallback_output_port())
+        self._finish(builder, skill, kmp.get_command_output_port(), kmp.get_fallback_output_port())

@@ -15,7 +15,7 @@ HISTORY_SOURCES = ("commanded", "measured")
 
 
 @dataclass(frozen=True)
-class PrimitiveSkill:
+class PrimitiveConfig:
     """Demonstrations, constraints, and how a policy may move between them.
 
     Attributes:
@@ -30,7 +30,7 @@ class PrimitiveSkill:
         horizon: H, future points that constraints are kept at.
         lambda_, beta: λ and β of problem 4.5.
         inverse_length: of the kernel.
-        kappa: κ, where a constant action of ±1 ends up: √3 κ demonstration standard deviations away.
+        action_scale: κ, where a constant action of ±1 ends up: √3 κ demonstration standard deviations away.
         explored: indices of the outputs that the policy moves; all unless given. An action has one entry for each.
         gains: (O,) raw null-space units per action, instead of those computed from κ.
         isotropic_groups: outputs of one unit each; a residual moves all outputs of a group alike. One group unless
@@ -51,8 +51,8 @@ class PrimitiveSkill:
     lambda_: float = 6.0
     beta: float = 6.0
     inverse_length: float = 2.0
-    kappa: float = 1.0
-    explored: tuple[int, ...] | None = None
+    action_scale: float = 1.0
+    action_dims: tuple[int, ...] | None = None
     gains: tuple[float, ...] | None = None
     isotropic_groups: tuple[tuple[int, ...], ...] | None = None
     solver: str = "daqp"
@@ -62,16 +62,16 @@ class PrimitiveSkill:
     def __post_init__(self):
         if self.history_source not in HISTORY_SOURCES:
             raise InputError(f"a history is {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
-        if not (np.isfinite(self.kappa) and self.kappa > 0):
-            raise InputError(f"kappa is how far a policy may go and must be positive, not {self.kappa}")
+        if not (np.isfinite(self.action_scale) and self.action_scale > 0):
+            raise InputError(f"action_scale is how far a policy may go and must be positive, not {self.action_scale}")
         if self.history < 1:
             raise InputError(f"history is how many past outputs sKGRL remembers, at least 1, not {self.history}")
-        if self.explored is not None and not self.explored:
+        if self.action_dims is not None and not self.action_dims:
             raise InputError("a policy must move at least one output: name it in explored")
-        if len(set(self.explored or ())) < len(self.explored or ()):
-            raise InputError(f"explored names an output twice, {self.explored}: each has one action")
-        if any(not 0 <= o < self.num_outputs for o in self.explored or ()):
-            raise InputError(f"explored names outputs 0 … {self.num_outputs - 1}, not {self.explored}")
+        if len(set(self.action_dims or ())) < len(self.action_dims or ()):
+            raise InputError(f"explored names an output twice, {self.action_dims}: each has one action")
+        if any(not 0 <= o < self.num_outputs for o in self.action_dims or ()):
+            raise InputError(f"explored names outputs 0 … {self.num_outputs - 1}, not {self.action_dims}")
 
     @property
     def num_outputs(self) -> int:
@@ -81,7 +81,7 @@ class PrimitiveSkill:
     @property
     def explored_outputs(self) -> tuple[int, ...]:
         """The outputs that an action moves, in the order of its entries."""
-        return tuple(range(self.num_outputs)) if self.explored is None else self.explored
+        return tuple(range(self.num_outputs)) if self.action_dims is None else self.action_dims
 
     @property
     def num_actions(self) -> int:
@@ -127,7 +127,7 @@ class PrimitiveSkill:
             InputError: if `gains` are not O finite numbers, or actions do nothing to this primitive.
         """
         if self.gains is None:
-            return authority_gains(primitive, self.kappa, outputs=np.array(self.explored_outputs))
+            return authority_gains(primitive, self.action_scale, outputs=np.array(self.explored_outputs))
         gains = np.array(self.gains, dtype=float)
         if gains.shape != (self.num_outputs,) or not np.isfinite(gains).all():
             raise InputError(f"gains are {self.num_outputs} finite numbers, one per output, not {self.gains}")
@@ -142,5 +142,5 @@ class PrimitiveSkill:
         variances = np.mean(self.reference.standard_deviations**2, axis=0)
         gains = np.zeros(self.num_outputs)
         for group in self.isotropic_groups or (tuple(range(self.num_outputs)),):
-            gains[list(group)] = np.sqrt(3.0) * self.kappa * np.sqrt(variances[list(group)].mean())
+            gains[list(group)] = np.sqrt(3.0) * self.action_scale * np.sqrt(variances[list(group)].mean())
         return gains

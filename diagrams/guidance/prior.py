@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import LinearConstraints
-from guiderail.models.templates import Skill
+from guiderail.models.templates import SharedControlTemplate
 
 
 @dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Template:
         leash: [m] how far the robot may be from its command before that waits.
     """
 
-    skill: Skill
+    skill: SharedControlTemplate
     frames: Mapping[str, RigidTransform]
     active_constraints: bool | None = None
-    leash: float = np.inf
+    max_tracking_error: float = np.inf
 
     def constrained(self, by_default: bool) -> bool:
         """Whether the active constraints hold for a kind of guidance that says so `by_default`."""
@@ -37,7 +37,7 @@ class Template:
 
 
 @dataclass(frozen=True)
-class Approach:
+class ScriptedApproach:
     """A straight line along z that needs no demonstrations, and how far a policy may lead away from it.
 
     Attributes:
@@ -52,7 +52,7 @@ class Approach:
 
 
 @dataclass(frozen=True)
-class Known:
+class PriorKnowledge:
     """What a task knows; None where the task does not override the method of that name.
 
     Attributes:
@@ -66,9 +66,9 @@ class Known:
     """
 
     period: float
-    demonstrations: PrimitiveSkill | None = None
+    demonstrations: PrimitiveConfig | None = None
     template: Template | None = None
-    approach: Approach | None = None
+    approach: ScriptedApproach | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     pose_size: int = POSE_SIZE
     wrench_size: int = WRENCH_SIZE

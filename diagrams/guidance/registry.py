@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from pydrake.systems.framework import Diagram
 
     from guiderail.diagrams.envs.config import Options
-    from guiderail.diagrams.guidance.prior import Known
+    from guiderail.diagrams.guidance.prior import PriorKnowledge
 
-INGREDIENTS = {
+REQUIREMENTS = {
     "demonstrations": "demonstrations",
     "keep_out": "walls to keep out of",
     "template": "a shared control template",
@@ -31,7 +31,7 @@ class GuidanceKind:
     Attributes:
         name: what `guidance=` calls it.
         build: from what is known to a diagram with the ports of `Guidance`.
-        needs: alternatives, each a tuple of names out of `INGREDIENTS`; the task must declare all names of one of them.
+        needs: alternatives, each a tuple of names out of `REQUIREMENTS`; the task must declare all names of one of them.
         label: what a legend calls it.
         colour: what it is drawn with, "#rrggbb".
         demonstrates: whether an action of zero is the demonstrations or the script alone, so that success before
@@ -42,7 +42,7 @@ class GuidanceKind:
     """
 
     name: str
-    build: Callable[[Known], Diagram]
+    build: Callable[[PriorKnowledge], Diagram]
     needs: tuple[tuple[str, ...], ...]
     label: str
     colour: str
@@ -50,7 +50,7 @@ class GuidanceKind:
     displaces: bool = False
     options: type[Options] | None = None
 
-    def lacks(self, known: Collection[str]) -> tuple[str, ...]:
+    def missing_requirements(self, known: Collection[str]) -> tuple[str, ...]:
         """The names in `needs` that `known` lacks, of the alternative that lacks fewest; empty if one is complete."""
         lacking = [tuple(one for one in needed if one not in known) for needed in self.needs]
         return min(lacking, key=len, default=())
@@ -73,8 +73,8 @@ def register_guidance(
     demonstrates: bool = False,
     displaces: bool = False,
     options: type[Options] | None = None,
-) -> Callable[[Callable[[Known], Diagram]], Callable[[Known], Diagram]]:
-    """A decorator that adds a kind of guidance; it decorates a function or a class that takes a `Known`.
+) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
+    """A decorator that adds a kind of guidance; it decorates a function or a class that takes a `PriorKnowledge`.
 
     Args:
         name: what `guidance=` calls it.
@@ -82,7 +82,7 @@ def register_guidance(
         label: what a legend calls it; its name unless given.
     """
 
-    def add(build: Callable[[Known], Diagram]) -> Callable[[Known], Diagram]:
+    def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
         kind = GuidanceKind(name, build, needs, label or name, colour, demonstrates, displaces, options)
         GUIDANCE.register(name, kind)
         return build
@@ -92,7 +92,7 @@ def register_guidance(
 
 def possible_guidance(known: Collection[str]) -> list[str]:
     """The names of all kinds of guidance whose `needs` are among `known`."""
-    return [name for name in GUIDANCE.names() if not GUIDANCE.get(name).lacks(known)]
+    return [name for name in GUIDANCE.names() if not GUIDANCE.get(name).missing_requirements(known)]
 
 
 def check_guidance(name: str, known: Collection[str], task: str = "this task") -> GuidanceKind:
@@ -102,16 +102,16 @@ def check_guidance(name: str, known: Collection[str], task: str = "this task") -
         InputError: if there is no such kind, or something that it needs is missing: then it says what.
     """
     kind = GUIDANCE.get(name)
-    lacking = kind.lacks(known)
+    lacking = kind.missing_requirements(known)
     if lacking:
-        words = " and ".join(INGREDIENTS.get(one, one) for one in lacking)
+        words = " and ".join(REQUIREMENTS.get(one, one) for one in lacking)
         raise InputError(
             f"guidance '{name}' needs {words}, which {task} doesn't have: use {', '.join(possible_guidance(known))}"
         )
     return kind
 
 
-def build_guidance(name: str, known: Known, task: str = "this task") -> Diagram:
+def build_guidance(name: str, known: PriorKnowledge, task: str = "this task") -> Diagram:
     """The guidance of that name, made of what is known.
 
     Args:
@@ -122,7 +122,7 @@ def build_guidance(name: str, known: Known, task: str = "this task") -> Diagram:
     Raises:
         InputError: if there is no such kind, or something that it needs is missing.
     """
-    kind = check_guidance(name, [one for one in INGREDIENTS if known.has(one)], task)
+    kind = check_guidance(name, [one for one in REQUIREMENTS if known.has(one)], task)
     guidance = kind.build(known)
     guidance.set_name("guidance")
     return guidance

@@ -9,7 +9,7 @@ from pydrake.trajectories import PiecewisePolynomial
 
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive import PrimitiveGuidance, add_demonstration, skill_of
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter
 from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE
@@ -23,7 +23,7 @@ class ResidualDescent(Guidance):
     ``action`` is (3,); what is commanded also keeps the skill's greatest speeds. Exports ``measured_violation`` too.
     """
 
-    def __init__(self, known: Known):
+    def __init__(self, known: PriorKnowledge):
         """
         Args:
             known: its approach, and a template whose active constraints are kept; that one has one object's frame, in
@@ -63,7 +63,7 @@ class ResidualDescent(Guidance):
 class ResidualGuidance(PrimitiveGuidance):
     """Adds to the demonstrations: p̂_t = p_t^kmp + Δp_t."""
 
-    def __init__(self, known: Known, *, safe: bool = False):
+    def __init__(self, known: PriorKnowledge, *, safe: bool = False):
         """
         Args:
             known: with demonstrations; with `safe`, also what to keep away from.
@@ -75,7 +75,7 @@ class ResidualGuidance(PrimitiveGuidance):
         action, pose = self._export_inputs(builder, skill)
         kmp = add_demonstration(builder, skill, action)
         residual = builder.AddNamedSystem("residual", Residual(skill.residual_gains()))
-        builder.Connect(kmp.get_output_output_port(), residual.get_reference_input_port())
+        builder.Connect(kmp.get_command_output_port(), residual.get_reference_input_port())
         builder.Connect(action, residual.get_action_input_port())
         desired, fallback = residual.get_desired_pose_output_port(), kmp.get_fallback_output_port()
         if safe:
@@ -95,7 +95,7 @@ class ResidualGuidance(PrimitiveGuidance):
     demonstrates=True,
     displaces=True,
 )
-def residual(known: Known) -> Diagram:
+def residual(known: PriorKnowledge) -> Diagram:
     """Adds to the demonstrations, or to a scripted approach behind a template's active constraints."""
     return ResidualGuidance(known) if known.demonstrations is not None else ResidualDescent(known)
 
@@ -108,6 +108,6 @@ def residual(known: Known) -> Diagram:
     demonstrates=True,
     displaces=True,
 )
-def safe_residual(known: Known) -> Diagram:
+def safe_residual(known: PriorKnowledge) -> Diagram:
     """Residual learning that stops before walls."""
     return ResidualGuidance(known, safe=True)

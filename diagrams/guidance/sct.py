@@ -10,10 +10,10 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.models.common.poses import WRENCH_SIZE
-from guiderail.models.templates import Skill, load_skill
+from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 from guiderail.systems.sct_input_mapping import SctInputMapping
 from guiderail.systems.sct_state_machine import SctStateMachine
@@ -39,7 +39,13 @@ class ActiveConstraintFilter(Diagram):
         - measured_violation
     """
 
-    def __init__(self, skill: Skill, frames: Mapping[str, RigidTransform], period: float, leash: float = np.inf):
+    def __init__(
+        self,
+        skill: SharedControlTemplate,
+        frames: Mapping[str, RigidTransform],
+        period: float,
+        max_tracking_error: float = np.inf,
+    ):
         """
         Args:
             skill: the template.
@@ -49,7 +55,7 @@ class ActiveConstraintFilter(Diagram):
         """
         super().__init__()
         builder = DiagramBuilder()
-        self._projector = ActiveConstraintProjector(skill, frames, period, leash)
+        self._projector = ActiveConstraintProjector(skill, frames, period, max_tracking_error)
         builder.AddNamedSystem("projector", self._projector)
         self._machine = SctStateMachine(skill, frames, period)
         builder.AddNamedSystem("state_machine", self._machine)
@@ -92,13 +98,13 @@ class SctGuidance(Guidance):
 
     def __init__(
         self,
-        skill: Skill,
+        skill: SharedControlTemplate,
         frames: Mapping[str, RigidTransform],
         period: float,
         *,
-        input_mapping: Skill | None = None,
+        input_mapping: SharedControlTemplate | None = None,
         active_constraints: bool = True,
-        leash: float = np.inf,
+        max_tracking_error: float = np.inf,
     ):
         """
         Args:
@@ -116,7 +122,7 @@ class SctGuidance(Guidance):
         self._mapping = SctInputMapping(input_mapping or skill, frames, period)
         builder.AddNamedSystem("input_mapping", self._mapping)
         constrained = skill if active_constraints else skill.without_active_constraints()
-        self._filter = ActiveConstraintFilter(constrained, frames, period, leash)
+        self._filter = ActiveConstraintFilter(constrained, frames, period, max_tracking_error)
         builder.AddNamedSystem("active_constraints", self._filter)
         if input_mapping is None:
             state = self._filter.GetOutputPort("state")
@@ -145,7 +151,9 @@ class SctGuidance(Guidance):
         self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), known)
 
 
-def _through_template(known: Known, input_mapping: Skill | None, constrained: bool) -> SctGuidance:
+def _through_template(
+    known: PriorKnowledge, input_mapping: SharedControlTemplate | None, constrained: bool
+) -> SctGuidance:
     assert known.template is not None
     template = known.template
     return SctGuidance(
@@ -154,19 +162,19 @@ def _through_template(known: Known, input_mapping: Skill | None, constrained: bo
         known.period,
         input_mapping=input_mapping,
         active_constraints=constrained,
-        leash=template.leash if constrained else np.inf,
+        max_tracking_error=template.max_tracking_error if constrained else np.inf,
     )
 
 
 @register_guidance("sct", needs=(("template",),), label="RL-SCT", colour="#9467bd")
-def sct(known: Known) -> SctGuidance:
+def sct(known: PriorKnowledge) -> SctGuidance:
     """A few inputs through the template, its active constraints behind them."""
     assert known.template is not None
     return _through_template(known, None, known.template.constrained(True))
 
 
 @register_guidance("none", needs=(("template",),), label="RL", colour="#7f7f7f")
-def unguided(known: Known) -> SctGuidance:
+def unguided(known: PriorKnowledge) -> SctGuidance:
     """Six inputs as the end effector's velocity; the template says only how far it is, unless it is to constrain."""
     assert known.template is not None
-    return _through_template(known, load_skill("end_effector_velocity"), known.template.constrained(False))
+    return _through_template(known, load_template("end_effector_velocity"), known.template.constrained(False))

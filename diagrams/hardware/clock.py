@@ -34,7 +34,7 @@ class Clocked(Protocol):
         """The time on the wall [s]; `context` is the root's."""
 
 
-class Pace(Protocol):
+class Clock(Protocol):
     """How time passes."""
 
     def begin(self) -> None:
@@ -76,7 +76,7 @@ def check_rate(rate: float) -> None:
         raise InputError(f"a simulated robot's clock goes at a rate up to 1 of the wall's, not {rate:g}")
 
 
-class NewMessages:
+class MessageCounter:
     """Counts the messages of a channel; one that is sent again counts once, whatever torques it says by then.
 
     Attributes:
@@ -106,7 +106,7 @@ class NewMessages:
             self.repeats += 1
 
 
-class Gaps:
+class IntervalHistogram:
     """How regularly something happened: seconds between one time and the next, in a histogram."""
 
     def __init__(self) -> None:
@@ -126,7 +126,7 @@ class Gaps:
         return (int(np.searchsorted(np.cumsum(self._counts), share * total)) + 1) * BIN
 
 
-def hurry() -> bool:
+def set_realtime_priority() -> bool:
     """Asks the system to serve this process before others, as a robot waits for it; whether it will."""
     try:
         # Processes that this one starts are as any other.
@@ -136,12 +136,12 @@ def hurry() -> bool:
     return True
 
 
-class RealTime:
+class WallClock:
     """Advances a hardware station by the wall's clock: a step for each status, as it arrives.
 
     Where none comes for one and a half periods a step goes without, and the station's watchdog notices. Of statuses
     that came while this program was held up only the newest counts: it never hurries after the time that it lost. Nor
-    does a robot that speaks more often than every period hurry it: a station's time is never more than half a period
+    does a robot that speaks more often than every period set_realtime_priority it: a station's time is never more than half a period
     ahead of the wall's.
 
     Attributes:
@@ -160,9 +160,9 @@ class RealTime:
             InputError: if the rate is not positive, or above 1.
         """
         check_rate(rate)
-        self.gaps = Gaps()
+        self.gaps = IntervalHistogram()
         self._lcm, self._period, self._rate = lcm, period, rate
-        self._statuses = NewMessages(lcm, channel)
+        self._statuses = MessageCounter(lcm, channel)
         self._taken, self._last = 0, time.monotonic()
         self._due = self._last  # the next step's time
 
@@ -198,7 +198,7 @@ class RealTime:
         self._lcm.HandleSubscriptions(0)
 
 
-class StepByStep:
+class LockstepClock:
     """Advances a hardware station at the pace of a simulated robot: a step for each new status that arrives.
 
     Before each it says which status it had last, for `serve`, which waits for this word and for no other: one that
@@ -206,7 +206,7 @@ class StepByStep:
     whoever drives it does anything else, and what comes of a run does not depend on how long that takes.
     """
 
-    def __init__(self, lcm: DrakeLcmInterface, patience: float, channel: str, period: float = STATUS_PERIOD):
+    def __init__(self, lcm: DrakeLcmInterface, command_timeout: float, channel: str, period: float = STATUS_PERIOD):
         """
         Args:
             lcm: the bus.
@@ -214,8 +214,8 @@ class StepByStep:
             channel: of the statuses.
             period: in which they come [s].
         """
-        self._lcm, self._patience, self._answers, self._period = lcm, patience, channel + TAKEN, period
-        self._statuses = NewMessages(lcm, channel)
+        self._lcm, self._patience, self._answers, self._period = lcm, command_timeout, channel + TAKEN, period
+        self._statuses = MessageCounter(lcm, channel)
         self._taken = b""
         self._is_silent = False
 
@@ -229,9 +229,9 @@ class StepByStep:
         start = simulator.get_context().get_time()
         for step in range(steps):
             # A robot that has fallen silent is not waited for again and again.
-            patience = self._period if self._is_silent else self._patience
+            command_timeout = self._period if self._is_silent else self._patience
             self._ask()
-            end = time.monotonic() + patience
+            end = time.monotonic() + command_timeout
             while self._statuses.last == self._taken and (left := end - time.monotonic()) > 0.0:
                 repeats = self._statuses.repeats
                 self._lcm.HandleSubscriptions(max(1, int(1000 * left)))
@@ -247,11 +247,11 @@ class StepByStep:
 
 
 def serve(
-    simulator: Simulator, within: DrakeLcm, lcm: DrakeLcm, driver: Driver, seconds: float, patience: float
+    simulator: Simulator, within: DrakeLcm, lcm: DrakeLcm, driver: Driver, seconds: float, command_timeout: float
 ) -> float:
     """Runs a simulated arm for another process: one step, then it waits until its status was answered.
 
-    So neither side ever outruns the other, however slow a machine is. The answer is the word of a `StepByStep` that it
+    So neither side ever outruns the other, however slow a machine is. The answer is the word of a `LockstepClock` that it
     has taken this very status in; where no word ever came, it is a command. The arm has a bus of its own, so that
     nothing reaches it in the midst of a step: what was sent by then counts for the next one, whoever was faster.
 
@@ -266,13 +266,13 @@ def serve(
     Returns:
         The simulated time at which it ended: less than `seconds` if answers stopped.
     """
-    words, commands = NewMessages(lcm, driver.status_channel + TAKEN), list[bytes]()
+    words, commands = MessageCounter(lcm, driver.status_channel + TAKEN), list[bytes]()
     lcm.Subscribe(driver.command_channel, commands.append)
     # What the deputy says of a status goes out before it, so that who waits for the status has both.
     said = dict.fromkeys((word_channel(driver.command_channel), driver.status_channel), b"")
     for channel in said:
         within.Subscribe(channel, partial(said.__setitem__, channel))
-    steps, repeats = 0, max(1, round(patience / REPEAT))
+    steps, repeats = 0, max(1, round(command_timeout / REPEAT))
 
     def is_answered() -> bool:
         if not words.count:

@@ -29,7 +29,7 @@ class Driver:
         command_type: its message, with the field `joint_torque`.
         encode: from the time [s] and torques (n,) to a command.
         trips: external torques at which it stops by itself when it is controlled by torque, (n,) [Nm].
-        stops_by_itself: whether it brings the arm to rest where commands stop; otherwise it needs a `Deputy`.
+        has_command_timeout: whether it brings the arm to rest where commands stop; otherwise it needs a `SafetyMonitor`.
         hold_off: for how long after its first status it wants no command [s].
         period: at which commands are sent to it [s].
     """
@@ -42,8 +42,8 @@ class Driver:
     external_torque_sign: float
     command_type: Any
     encode: Callable[[float, np.ndarray], bytes]
-    trips: tuple[float, ...]
-    stops_by_itself: bool
+    torque_reflex_limits: tuple[float, ...]
+    has_command_timeout: bool
     hold_off: float = 0.25
     period: float = STATUS_PERIOD
 

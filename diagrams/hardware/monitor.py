@@ -13,15 +13,15 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.lcm import SerializerInterface
 
 from guiderail.diagrams.hardware.driver import Driver
-from guiderail.models.control.joint_status import MISSED, DeputyWord, JointStatus, damping_torque
-from guiderail.systems.torque_safety_limiter import FAREWELL, SafetyLimits
+from guiderail.models.control.joint_status import MISSED, Heartbeat, JointStatus, damping_torque
+from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimits
 
 _WORD = struct.Struct(">q?")
 
 
 def word_channel(command_channel: str) -> str:
     """Of what a deputy says."""
-    return command_channel + "_DEPUTY"
+    return command_channel + "_MONITOR"
 
 
 class WordSerializer(SerializerInterface):
@@ -35,12 +35,12 @@ class WordSerializer(SerializerInterface):
         return Value[object]()
 
     def Deserialize(self, buffer: bytes, abstract_value: Value) -> None:
-        """A message as a `DeputyWord`."""
+        """A message as a `Heartbeat`."""
         if len(buffer) == _WORD.size:
-            abstract_value.set_value(DeputyWord(*_WORD.unpack(bytes(buffer))))
+            abstract_value.set_value(Heartbeat(*_WORD.unpack(bytes(buffer))))
 
 
-class Duty(IntEnum):
+class MonitorState(IntEnum):
     """What a deputy does: nobody commands; somebody does; it damps; it says that there is no torque."""
 
     IDLE = 0
@@ -49,7 +49,7 @@ class Duty(IntEnum):
     RESTING = 3
 
 
-class Deputy:
+class SafetyMonitor:
     """Listens to a robot's statuses and commands, and brings the arm to rest where commands stop.
 
     A driver may repeat the last torque for ever when the program that sent it is killed, or when its commands get lost.
@@ -77,7 +77,7 @@ class Deputy:
             limits: of the torques, and how a stop damps.
             silence: of the commands, beyond which it acts [s]; some of them may be lost unless given.
         """
-        self.duty = Duty.IDLE
+        self.duty = MonitorState.IDLE
         self._lcm, self._driver, self._plant, self._limits = lcm, driver, plant, limits
         self._silence = MISSED * driver.period if silence is None else silence
         self._context = plant.CreateDefaultContext()
@@ -95,8 +95,8 @@ class Deputy:
         if torque is None:
             return
         self._commanded_at, self._has_torque = self._now, bool(np.any(torque))
-        if self.duty == Duty.IDLE:
-            self.duty = Duty.WATCHING
+        if self.duty == MonitorState.IDLE:
+            self.duty = MonitorState.WATCHING
 
     def _hear_status(self, message: bytes) -> None:
         status = self._driver.decode(message)
@@ -106,29 +106,32 @@ class Deputy:
             return
         if self._now - self._silence <= status.time < self._now:
             return  # another one overtook it
-        if self.duty == Duty.WATCHING and (status.time < self._now or not np.isfinite(self._now)):
+        if self.duty == MonitorState.WATCHING and (status.time < self._now or not np.isfinite(self._now)):
             self._commanded_at = status.time  # the robot's clock went back, or only began
             if self._now - status.time > self._silence and self._has_torque:
-                self.duty, self._since = Duty.DAMPING, status.time  # a torque may be on its way that is of another time
+                self.duty, self._since = (
+                    MonitorState.DAMPING,
+                    status.time,
+                )  # a torque may be on its way that is of another time
         self._now = status.time
         self._act(status)
         self._words += 1
-        is_acting = self.duty in (Duty.DAMPING, Duty.RESTING)
+        is_acting = self.duty in (MonitorState.DAMPING, MonitorState.RESTING)
         self._lcm.Publish(word_channel(self._driver.command_channel), _WORD.pack(self._words, is_acting))
 
     def _act(self, status: JointStatus) -> None:
-        if self.duty == Duty.WATCHING and self._now - self._commanded_at > self._silence:
-            self.duty, self._since = (Duty.DAMPING if self._has_torque else Duty.IDLE), self._now
-        if self.duty in (Duty.DAMPING, Duty.RESTING) and self._now < self._since:
+        if self.duty == MonitorState.WATCHING and self._now - self._commanded_at > self._silence:
+            self.duty, self._since = (MonitorState.DAMPING if self._has_torque else MonitorState.IDLE), self._now
+        if self.duty in (MonitorState.DAMPING, MonitorState.RESTING) and self._now < self._since:
             self._since = self._now
-        if self.duty == Duty.DAMPING and self._now - self._since >= self._limits.damping_time:
-            self.duty, self._since = Duty.RESTING, self._now
-        if self.duty == Duty.RESTING and self._now - self._since > FAREWELL:
-            self.duty = Duty.IDLE
-        if self.duty not in (Duty.DAMPING, Duty.RESTING):
+        if self.duty == MonitorState.DAMPING and self._now - self._since >= self._limits.damping_time:
+            self.duty, self._since = MonitorState.RESTING, self._now
+        if self.duty == MonitorState.RESTING and self._now - self._since > ZERO_TORQUE_TIME:
+            self.duty = MonitorState.IDLE
+        if self.duty not in (MonitorState.DAMPING, MonitorState.RESTING):
             return
         torque = np.zeros(len(status.positions))
-        if self.duty == Duty.DAMPING:
+        if self.duty == MonitorState.DAMPING:
             self._plant.SetPositions(self._context, status.positions)
             M = self._plant.CalcMassMatrix(self._context)
             limits = np.array(self._limits.torque)

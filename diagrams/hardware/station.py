@@ -23,7 +23,7 @@ from guiderail.diagrams.envs.config import Number, Options
 from guiderail.diagrams.hardware.bus import open_bus
 from guiderail.diagrams.hardware.driver import MICROSECOND, Driver
 from guiderail.diagrams.hardware.monitor import WordSerializer, word_channel
-from guiderail.diagrams.stations.arm import ArmModel, KnownArm, add_arm
+from guiderail.diagrams.stations.arm import ArmControllerPlant, ArmModel, add_arm
 from guiderail.diagrams.stations.impedance_control import add_controller
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
@@ -42,12 +42,12 @@ from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.panda import PANDA
 from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector, Robot, find_robot
 from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.heartbeat_monitor import DeputyWatch
+from guiderail.systems.heartbeat_monitor import HeartbeatMonitor
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
-from guiderail.systems.pose_rate_limiter import DesiredPoseRamp
+from guiderail.systems.pose_rate_limiter import PoseRateLimiter
 from guiderail.systems.status_watchdog import StatusWatchdog
 from guiderail.systems.torque_publisher import TorquePublisher
-from guiderail.systems.torque_safety_limiter import SafetyLimits, TorqueGuard
+from guiderail.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
 
 # Of what a driver stops at by itself: how much is sent, how much of the surroundings' is borne, and of a joint's speed.
 TORQUE_SHARE, EXTERNAL_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
@@ -78,8 +78,8 @@ IIWA_DRIVER = Driver(
     external_torque_sign=1.0,
     command_type=lcmt_iiwa_command,
     encode=_encode_iiwa,
-    stops_by_itself=False,
-    trips=tuple(60.0 * share for share in (1.0, 1.0, 1.0, 0.5, 0.2, 0.2, 0.1)),
+    has_command_timeout=False,
+    torque_reflex_limits=tuple(60.0 * share for share in (1.0, 1.0, 1.0, 0.5, 0.2, 0.2, 0.1)),
 )
 # Franka's external torque is what the arm does to the surroundings. The trips are those of libfranka's examples.
 PANDA_DRIVER = Driver(
@@ -91,8 +91,8 @@ PANDA_DRIVER = Driver(
     external_torque_sign=-1.0,
     command_type=lcmt_panda_command,
     encode=_encode_panda,
-    stops_by_itself=True,
-    trips=(20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0),
+    has_command_timeout=True,
+    torque_reflex_limits=(20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0),
 )
 DRIVERS = {IIWA14.name: IIWA_DRIVER, PANDA.name: PANDA_DRIVER}
 """By the name of the robot."""
@@ -117,11 +117,11 @@ def safety_limits(plant: MultibodyPlant, driver: Driver) -> SafetyLimits:
         plant: the arm as its controller knows it.
         driver: of the arm.
     """
-    trips = np.array(driver.trips)
+    torque_reflex_limits = np.array(driver.torque_reflex_limits)
     return SafetyLimits(
         velocity=tuple((VELOCITY_SHARE * plant.GetVelocityUpperLimits()).tolist()),
-        torque=tuple(np.minimum(TORQUE_SHARE * trips, plant.GetEffortUpperLimits()).tolist()),
-        external_torque=tuple((EXTERNAL_SHARE * trips).tolist()),
+        torque=tuple(np.minimum(TORQUE_SHARE * torque_reflex_limits, plant.GetEffortUpperLimits()).tolist()),
+        external_torque=tuple((EXTERNAL_SHARE * torque_reflex_limits).tolist()),
     )
 
 
@@ -159,7 +159,7 @@ class HardwareStation(Station):
     external torques; there is no wrist sensor. `start` waits for the robot's first status. Then nothing is sent until
     statuses have come for the settling time, and from there the arm takes over gradually, where it is.
 
-    A `StatusWatchdog` judges what comes, a `DeputyWatch` hears whoever stands by at the robot, and a `TorqueGuard`
+    A `StatusWatchdog` judges what comes, a `HeartbeatMonitor` hears whoever stands by at the robot, and a `TorqueSafetyLimiter`
     judges what is measured and sent; they stop the arm, `fault` says why, and `resume` goes on. In real time
     `tell_time` says before each step what the clock on the wall shows. Beside every station's ports it has these
     outputs, the last of them under the names that they have in Drake's own stations, after the name of the driver and a
@@ -169,7 +169,7 @@ class HardwareStation(Station):
     output                 size   meaning
     =====================  =====  =====================================================================================
     `fault`                1      why the arm is stopped: a code of `Fault`
-    `phase`                1      what it does: a number of `Phase`
+    `phase`                1      what it does: a number of `ArmState`
     `position_measured`    n      of the joints [rad]
     `velocity_estimated`   n      [rad/s]
     `state_estimated`      2n     both
@@ -218,7 +218,7 @@ class HardwareStation(Station):
         self.lcm = bus = lcm or open_bus(lcm_url)
         self.lcm_url = lcm_url
         self.period = period = driver.period if period is None else period
-        self.known = known = KnownArm(workcell, robot, end_effector)
+        self.known = known = ArmControllerPlant(workcell, robot, end_effector)
         self.limits = limits = limits or safety_limits(known.plant, driver)
         self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
         self._robot_timeout, self._wrench_time_constant = robot_timeout, wrench_time_constant
@@ -237,7 +237,7 @@ class HardwareStation(Station):
         )
         # A deputy speaks as often as the robot; it may be late by as much again.
         self._deputy = deputy = builder.AddNamedSystem(
-            "deputy", DeputyWatch(period=period, patience=2.0 * MISSED * period)
+            "deputy", HeartbeatMonitor(period=period, command_timeout=2.0 * MISSED * period)
         )
         positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
         velocities = builder.AddNamedSystem("velocities", MatrixGain(np.eye(num_joints, 2 * num_joints, num_joints)))
@@ -252,9 +252,9 @@ class HardwareStation(Station):
             ),
         )
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(period))
-        ramp = builder.AddNamedSystem("ramp", DesiredPoseRamp(period=period))
+        ramp = builder.AddNamedSystem("ramp", PoseRateLimiter(period=period))
         controller, monitor = add_controller(builder, known, impedance, period, compensate_gravity=False)
-        self._guard = guard = builder.AddNamedSystem("guard", TorqueGuard(known.plant, limits, period=period))
+        self._guard = guard = builder.AddNamedSystem("guard", TorqueSafetyLimiter(known.plant, limits, period=period))
         publisher = builder.AddNamedSystem(
             "command_publisher",
             TorquePublisher(bus, driver.command_channel, driver.encode, num_joints, period=period),
@@ -298,7 +298,7 @@ class HardwareStation(Station):
             wrench=wrench.get_wrench_output_port(),
             contact_force=monitor.get_contact_force_output_port(),
             saturation=controller.get_saturation_output_port(),
-            holding=guard.get_not_following_output_port(),
+            command_timed_out=guard.get_not_following_output_port(),
         )
         builder.ExportOutput(guard.get_fault_output_port(), "fault")
         builder.ExportOutput(guard.get_phase_output_port(), "phase")
@@ -317,7 +317,7 @@ class HardwareStation(Station):
         return self.GetOutputPort("fault")
 
     def get_phase_output_port(self):
-        """What the arm does, (1,): a number of `Phase`."""
+        """What the arm does, (1,): a number of `ArmState`."""
         return self.GetOutputPort("phase")
 
     def start(self, simulator: Simulator) -> None:
@@ -355,11 +355,11 @@ class HardwareStation(Station):
         """
         self._status.get_clock_input_port().FixValue(self._status.GetMyMutableContextFromRoot(context), [clock])
 
-    def has_deputy(self, context: Context) -> bool:
+    def has_safety_monitor(self, context: Context) -> bool:
         """Whether somebody stands by at the robot, and still speaks; `context` is this station's own."""
         return self._deputy.is_heard(self.GetSubsystemContext(self._deputy, context))
 
-    def take_over(self, context: Context, before: Context) -> None:
+    def copy_state_from(self, context: Context, before: Context) -> None:
         """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.
 
         Args:
@@ -376,7 +376,7 @@ class HardwareStation(Station):
         """
         raise InputError("a real arm can't be put to a pose by a reset: move it there by desired poses")
 
-    def alike(self, workcell: Workcell) -> HardwareStation:
+    def clone(self, workcell: Workcell) -> HardwareStation:
         """Another station of the same arm on the same bus, with the same limits."""
         return HardwareStation(
             workcell,
@@ -451,7 +451,7 @@ class SimulatedIiwa(Diagram):
             return arm
 
         self.plant, self.scene_graph, self.arm = add_workcell_plant(builder, workcell, time_step, add)
-        self.known = KnownArm(workcell, IIWA14, end_effector)
+        self.known = ArmControllerPlant(workcell, IIWA14, end_effector)
         BuildIiwaControl(
             builder,
             lcm,

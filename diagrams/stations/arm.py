@@ -120,7 +120,7 @@ def controller_model(
     return plant, arm
 
 
-class KnownArm:
+class ArmControllerPlant:
     """The arm as its controller knows it, and what follows from that alone.
 
     Attributes:
@@ -244,7 +244,7 @@ class ArmStation(Station):
         end_effector = find_end_effector(end_effector)
         if time_step is None:
             time_step = PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD
-        self._known = KnownArm(workcell, robot, end_effector)
+        self._known = ArmControllerPlant(workcell, robot, end_effector)
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)
         )

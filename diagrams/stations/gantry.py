@@ -79,7 +79,7 @@ class RailsOptions(ContactOptions):
     )
 
 
-@register_station("rails", world="workcell", options=RailsOptions)
+@register_station("gantry", world="workcell", options=RailsOptions)
 class RailsStation(Station):
     """Joints x, y, z, Rz, Ry, Rx from the target frame to the tool centre, each with a spring, a damper and a limit.
 
@@ -166,7 +166,7 @@ def _refuse_long_step(impedance: Impedance, time_step: float) -> None:
 
 
 @dataclass(frozen=True)
-class KnownRails:
+class GantryControllerPlant:
     """The rails as their controller knows them: with the workpiece, without the fixture and without offsets."""
 
     plant: MultibodyPlant
@@ -175,12 +175,12 @@ class KnownRails:
     posture: np.ndarray
 
 
-def _known(workcell: Workcell, impedance: Impedance) -> KnownRails:
+def _known(workcell: Workcell, impedance: Impedance) -> GantryControllerPlant:
     plant = MultibodyPlant(0.0)
     _add_rails(plant, workcell, impedance, with_gains=False)
     plant.Finalize()
     target, tool_centre = (plant.GetFrameByName(name) for name in ("target", "tool_centre"))
-    return KnownRails(plant, target, tool_centre, np.zeros(POSE_SIZE))
+    return GantryControllerPlant(plant, target, tool_centre, np.zeros(POSE_SIZE))
 
 
 def _add_joint_control(
@@ -209,7 +209,7 @@ def _add_joint_control(
         wrench=wrench,
         contact_force=monitor.get_contact_force_output_port(),
         saturation=monitor.get_saturation_output_port(),
-        holding=watchdog.get_holding_output_port(),
+        command_timed_out=watchdog.get_holding_output_port(),
     )
 
 
@@ -217,7 +217,7 @@ def _add_rails(
     plant: MultibodyPlant, workcell: Workcell, impedance: Impedance, *, with_gains: bool
 ) -> ModelInstanceIndex:
     """Adds the rails and behind them the tool with the workpiece, all weightless, with springs and dampers or none."""
-    model = plant.AddModelInstance("rails")
+    model = plant.AddModelInstance("gantry")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     for (name, joint_type, axis), stiffness, damps, limit in zip(
         RAILS, impedance.stiffness, damping(impedance), impedance.limits, strict=True

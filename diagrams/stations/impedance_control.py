@@ -14,7 +14,7 @@ from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceC
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 
 
-class KnownRobot(Protocol):
+class ControllerPlant(Protocol):
     """A robot as its controller knows it: with what it carries, without the fixture and without offsets."""
 
     @property
@@ -45,7 +45,7 @@ def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains
 
 
 def add_controller(
-    builder: DiagramBuilder, known: KnownRobot, impedance: Impedance, period: float, *, compensate_gravity: bool
+    builder: DiagramBuilder, known: ControllerPlant, impedance: Impedance, period: float, *, compensate_gravity: bool
 ) -> tuple[CartesianImpedanceController, ImpedanceMonitor]:
     """Adds a robot's controller, sampled once in `period` [s], and what watches its wrench; the caller wires both."""
     controller = builder.AddNamedSystem(
@@ -65,7 +65,7 @@ def add_controller(
 
 def add_impedance_control(
     builder: DiagramBuilder,
-    known: KnownRobot,
+    known: ControllerPlant,
     impedance: Impedance,
     period: float,
     *,
@@ -88,6 +88,6 @@ def add_impedance_control(
         wrench=wrench,
         contact_force=monitor.get_contact_force_output_port(),
         saturation=controller.get_saturation_output_port(),
-        holding=controller.get_holding_output_port(),
+        command_timed_out=controller.get_holding_output_port(),
     )
     return controller.get_torque_output_port()

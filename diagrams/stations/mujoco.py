@@ -204,7 +204,7 @@ class MujocoStation(Station):
         surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
         rails = MujocoRails(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
-        self.rails = builder.AddNamedSystem("rails", rails)
+        self.rails = builder.AddNamedSystem("gantry", rails)
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
         monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
         builder.Connect(plant.get_body_poses_output_port(), rails.get_nominal_body_poses_input_port())
@@ -222,7 +222,7 @@ class MujocoStation(Station):
             wrench=rails.get_wrench_output_port(),
             contact_force=monitor.get_contact_force_output_port(),
             saturation=monitor.get_saturation_output_port(),
-            holding=watchdog.get_holding_output_port(),
+            command_timed_out=watchdog.get_holding_output_port(),
         )
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.ExportOutput(rails.get_body_poses_output_port(), "body_poses")
@@ -245,7 +245,7 @@ def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Work
         raise InputError(f"station='mujoco' knows a fixture of one body, and {type(workcell).__name__} adds another")
     fixture = plant.get_body(BodyIndex(1))
     target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
-    model = plant.AddModelInstance("rails")
+    model = plant.AddModelInstance("gantry")
     tool = plant.AddRigidBody("tool_centre", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
     plant.WeldFrames(target, tool.body_frame())
     workpiece = workcell.add_workpiece(plant, tool.body_frame())

@@ -10,7 +10,7 @@ from pydrake.multibody.tree import FixedOffsetFrame, ModelInstanceIndex, Prismat
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Multiplexer, Saturation
 
-from guiderail.diagrams.envs.task_diagram import exact_period
+from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import Station, checked_pose, export_station_ports
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
@@ -40,7 +40,7 @@ class PlaneConfig:
         stiffness: N/m, of the contact.
     """
 
-    plant_period: float = exact_period(0.002)
+    plant_period: float = round_period(0.002)
     substeps: int = 10
     mass: float = 0.001
     max_force: float = 50.0
@@ -143,7 +143,7 @@ class PlaneStation(Station):
             wrench=mean_force.get_force_output_port(),
             contact_force=mean_force.get_magnitude_output_port(),
             saturation=excess.get_output_port(),
-            holding=watchdog.get_holding_output_port(),
+            command_timed_out=watchdog.get_holding_output_port(),
         )
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)

@@ -11,7 +11,7 @@ from pydrake.multibody.tree import FixedOffsetFrame, Frame, ModelInstanceIndex, 
 from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
-from guiderail.diagrams.envs.task_diagram import exact_period
+from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import POSE_SIZE, Station, checked_pose, export_station_ports
 from guiderail.models.common.errors import InputError
@@ -21,7 +21,7 @@ from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import DEFAULT_ROBOT, Robot, find_robot
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
-from guiderail.systems.contact_detector import ContactWatch
+from guiderail.systems.contact_detector import ContactDetector
 from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor
@@ -67,7 +67,7 @@ class PouringConfig:
     stand_height: float = 0.06
     grip: float = 0.08
     grip_height: float = 0.045
-    plant_period: float = exact_period(0.005)
+    plant_period: float = round_period(0.005)
     substeps: int = 2
     robot: Robot | str = DEFAULT_ROBOT
 
@@ -200,7 +200,7 @@ class PouringStation(Station):
         builder.AddNamedSystem("pose", measured)
         links = [plant.get_body(index) for index in plant.GetBodyIndices(self.arm)]
         period = config.plant_period
-        watch = ContactWatch(plant, [*links, thermos], [plant.world_body(), self._mug], period)
+        watch = ContactDetector(plant, [*links, thermos], [plant.world_body(), self._mug], period)
         builder.AddNamedSystem("contact_watch", watch)
         axes = config.X_WT.rotation()
         sensor = WrenchSensor(plant, wrist, [thermos], self._tip, axes, config.control_period, WRENCH_TIME_CONSTANT)
@@ -226,7 +226,7 @@ class PouringStation(Station):
             wrench=sensor.get_wrench_output_port(),
             contact_force=watch.get_contact_force_output_port(),
             saturation=controller.get_stuck_output_port(),
-            holding=controller.get_holding_output_port(),
+            command_timed_out=controller.get_holding_output_port(),
         )
         for name, system in seen:
             builder.AddNamedSystem(name, system)

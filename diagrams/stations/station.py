@@ -17,7 +17,7 @@ output             size   meaning
                           without the tool's own weight and inertia, low-pass filtered
 `contact_force`    1      size of the force with which the impedance pushes [N]: what a collision is judged by
 `saturation`       1      1 while the controller is at a limit of force or torque, otherwise 0
-`holding`          1      1 while commands have stopped, or are no numbers, and the last safe pose is held
+`command_timed_out`          1      1 while commands have stopped, or are no numbers, and the last safe pose is held
 =================  =====  ==========================================================================================
 
 A simulated station also has `query` (the scene graph's) and `body_poses` (the plant's): for cameras, and for judging
@@ -43,7 +43,7 @@ from pydrake.multibody.tree import Frame, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
 from guiderail.diagrams.envs.config import Number, Options
-from guiderail.diagrams.envs.task_diagram import exact_period
+from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.wrench_sensor import WrenchSensor
@@ -51,11 +51,11 @@ from guiderail.systems.wrench_sensor import WrenchSensor
 Robot = TypeVar("Robot")
 
 INPUTS = ("desired_pose", "command_time")
-OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "holding")
+OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 """The ports of every station."""
 
 POSE_SIZE = 6
-CONTROL_PERIOD = 4 * exact_period(0.005)  # [s]
+CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
 # `guiderail bench time_step` shows by how much a longer and a shorter one are wrong, and what they cost.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
 MAX_HALVINGS = 7
@@ -79,7 +79,7 @@ class ContactOptions(Options):
                 f"it is the control period, {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} "
                 "times halved"
             )
-        # Whose multiples are exact: see `exact_period`.
+        # Whose multiples are exact: see `round_period`.
         return CONTROL_PERIOD / 2 ** round(halvings)
 
 
@@ -151,7 +151,7 @@ class Station(Diagram):
 
     def get_holding_output_port(self):
         """1 while the last safe pose is held, (1,)."""
-        return self.GetOutputPort("holding")
+        return self.GetOutputPort("command_timed_out")
 
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
@@ -265,7 +265,7 @@ def export_station_ports(
     wrench: OutputPort,
     contact_force: OutputPort,
     saturation: OutputPort,
-    holding: OutputPort,
+    command_timed_out: OutputPort,
 ) -> None:
     """Exports the ports of the table above."""
     builder.ExportInput(desired_pose, "desired_pose")
@@ -274,7 +274,7 @@ def export_station_ports(
     builder.ExportOutput(wrench, "wrench")
     builder.ExportOutput(contact_force, "contact_force")
     builder.ExportOutput(saturation, "saturation")
-    builder.ExportOutput(holding, "holding")
+    builder.ExportOutput(command_timed_out, "command_timed_out")
 
 
 def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.observation import affine
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets
 from guiderail.diagrams.tasks.task import Task
-from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.relative_poses import RelativePoses
 
 FARTHEST = 0.3  # [m] along x or y: out of the way of every tool; what is more was meant in millimetres
@@ -49,7 +49,7 @@ class InsertionTask(Task):
     """
 
     Reset: ClassVar[type[ResetOptions]] = InsertionReset
-    draws_held_out = True
+    has_held_out_distribution = True
     workpiece: ClassVar[str]
     fixture: ClassVar[str]
     simulated_rewards: ClassVar[tuple[str, ...]] = ()
@@ -63,7 +63,7 @@ class InsertionTask(Task):
         Only a simulation knows that; a robot has what it can tell from its own pose, where somebody wrote that down.
         """
         if not station.HasOutputPort("body_poses"):
-            seen = self.seen_by_robot()
+            seen = self.observable_success()
             if seen is None:
                 return {}
             told = builder.AddNamedSystem(f"{self.workpiece}_as_seen", affine(*seen))
@@ -75,29 +75,29 @@ class InsertionTask(Task):
         builder.Connect(station.GetOutputPort("body_poses"), relative.get_body_poses_input_port())
         return {self.workpiece: relative.get_relative_poses_output_port()}
 
-    def seen_by_robot(self) -> tuple[np.ndarray, np.ndarray] | None:
+    def observable_success(self) -> tuple[np.ndarray, np.ndarray] | None:
         """D (6, 6) and y0 (6,) of D X_TP + y0: where a robot without eyes would say that the workpiece is.
 
         None where nobody wrote it down: then the task can't be learned on a robot.
         """
         return None
 
-    def force_limit(self) -> Condition:
+    def force_limit(self) -> TerminationTerm:
         """Ends an episode as a collision where the impedance pushes harder than `collision.above` [N]."""
         limit = self.collision.above
-        return Condition("collision", {"contact_force": 1}, lambda contact_force: contact_force[0] > limit)
+        return TerminationTerm("collision", {"contact_force": 1}, lambda contact_force: contact_force[0] > limit)
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
         """Draws the offsets, moves fixture and workpiece, and puts the tool to where an episode starts."""
         fixture, workpiece = self.offsets.draw(rng, options)
-        self.move(station, context, fixture, workpiece)
-        station.set_pose(context, self.start(rng))
+        self.set_part_offsets(station, context, fixture, workpiece)
+        station.set_pose(context, self.start_pose(rng))
         return {f"{self.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 
     @abstractmethod
-    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+    def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Moves fixture and workpiece by their offsets, as this task draws them; `context` is the root context.
 
         Args:
@@ -107,5 +107,5 @@ class InsertionTask(Task):
         """
 
     @abstractmethod
-    def start(self, rng: np.random.Generator) -> np.ndarray:
+    def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """The pose at which an episode starts, (6,)."""

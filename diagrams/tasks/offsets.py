@@ -20,11 +20,11 @@ from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 LARGEST_OFFSET = 4.0 * MM  # farther away a plug no longer stands on the rim of what it belongs in
 
 
-class HiddenPlace(Options):
+class FixtureOffsetOptions(Options):
     """Of a task whose fixed part is not where it should be."""
 
-    uncertainty: Literal["calibration", "disc", "known"] = Field(
-        "calibration", description="where the fixed part may be: one place for a run, one for each episode, or known"
+    fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
+        "per_run", description="where the fixed part may be: one place for a run, one for each episode, or known"
     )
     offset_range: Numbers | None = Field(
         None,

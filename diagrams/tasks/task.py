@@ -1,4 +1,4 @@
-"""A task as a declaration: what `assemble` needs to know to make a diagram of it."""
+"""A task as a declaration: what `build_task_diagram` needs to know to make a diagram of it."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.diagrams.envs import config as declared
 from guiderail.diagrams.envs.cameras import Camera
-from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.task_diagram import Symmetry
-from guiderail.diagrams.guidance.prior import Approach, Template
+from guiderail.diagrams.guidance.prior import ScriptedApproach, Template
 from guiderail.diagrams.stations.station import Station
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 
-class Drawn:
+class EpisodeConstant:
     """Numbers that are constant during an episode, for whoever observes, rewards or ends it."""
 
     def __init__(self, builder: DiagramBuilder, name: str, size: int):
@@ -47,7 +47,7 @@ class Threshold:
     """A signal that means a collision while it is above a limit.
 
     The safety ledger counts these collisions, in `collisions` and `collision_steps`. They do not end an episode: a
-    `Condition` does.
+    `TerminationTerm` does.
 
     Attributes:
         signal: the name of a signal of one number.
@@ -73,20 +73,20 @@ class Choice:
     reward: str
     observation: str
     difficulty: str
-    hold: int
+    action_repeat: int
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Task(ABC):
     """What is done, in what world, for what reward, and how an episode begins and ends.
 
-    A subclass says what there is, and `assemble` wires it. Reward terms, conditions and observations name signals. A
+    A subclass says what there is, and `build_task_diagram` wires it. Reward terms, conditions and observations name signals. A
     signal is an output port of the station, of the guidance or of `signals`; `action` and `termination` are signals
     too. "last_" before a name means its value of the control step before.
 
     Attributes:
         name: set by `register_task`.
-        world_kind: the kind of world, "workcell" unless given: only stations that are registered for it can be used.
+        workcell_kind: the kind of world, "workcell" unless given: only stations that are registered for it can be used.
         Options: the model of the task's own options, a subclass of `guiderail.Options`.
         Reset: the model of the options of a reset, a subclass of `guiderail.ResetOptions`.
         rewards: names that `reward=` chooses from; the first one unless given. `choice.reward` is the chosen one.
@@ -98,32 +98,32 @@ class Task(ABC):
         num_steps: control steps after which an episode is over; must be given, in the class or in `__init__`.
         clip: the largest absolute value in an observation; larger ones are clipped.
         collision: the signal that the ledger's `collisions` counts, and its limit; any contact force unless given, and
-            then an evaluation leaves the count out. A `Condition` that ends an episode as a collision is not counted by
+            then an evaluation leaves the count out. A `TerminationTerm` that ends an episode as a collision is not counted by
             itself.
         isotropic_groups: indices of outputs of one unit, group by group; residual learning moves all outputs of a group
             alike. None is one group of all.
         pushable: whether `GuidedEnv.push` may displace the robot.
         options: the task's own options, checked: an instance of `Options`.
         choice: what every environment is made with.
-        draws_held_out: whether `reset` draws from conditions that training never draws where `options.held_out` is
+        has_held_out_distribution: whether `reset` draws from conditions that training never draws where `options.held_out` is
             true. Without it an evaluation repeats conditions of training, and says so.
         drawn: what `signals` adds to a diagram and a reset sets, by name. A diagram is used again by whoever asks for
             the same, whose task gets these with it: systems that a task keeps anywhere else are missing there.
     """
 
     name: ClassVar[str] = ""
-    world_kind: ClassVar[str] = "workcell"
+    workcell_kind: ClassVar[str] = "workcell"
     Options: ClassVar[type[declared.Options]] = declared.Options
     Reset: ClassVar[type[declared.ResetOptions]] = declared.ResetOptions
     rewards: ClassVar[tuple[str, ...]] = ("sparse",)
     observations: ClassVar[tuple[str, ...]] = ("state",)
     defaults: ClassVar[Mapping[str, Any]] = {}
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {declared.STANDARD: {}}
-    learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "robust"}
+    learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "tqc_contact"}
     num_steps: int
     clip: ClassVar[float] = 3.0
     collision: Threshold = Threshold()
-    draws_held_out: ClassVar[bool] = False
+    has_held_out_distribution: ClassVar[bool] = False
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
 
@@ -135,13 +135,13 @@ class Task(ABC):
         """
         self.options = options
         self.choice = choice
-        self.drawn: dict[str, Drawn] = {}
+        self.drawn: dict[str, EpisodeConstant] = {}
 
     # What there is.
 
     @abstractmethod
-    def world(self) -> Any:
-        """What a station of `world_kind` works on: the first argument that the station is built with."""
+    def workcell(self) -> Any:
+        """What a station of `workcell_kind` works on: the first argument that the station is built with."""
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Further signals: a mapping from names to output ports of systems that this adds to the builder.
@@ -154,7 +154,7 @@ class Task(ABC):
         """
         return {}
 
-    # What is known of it. Guidance can be made of what a task overrides here (see `knows`).
+    # What is known of it. Guidance can be made of what a task overrides here (see `provides`).
 
     def reference(self) -> ReferenceTrajectory:
         """What demonstrations have in common; its clock is the control period."""
@@ -168,7 +168,7 @@ class Task(ABC):
         """A shared control template."""
         raise NotImplementedError
 
-    def approach(self) -> Approach:
+    def approach(self) -> ScriptedApproach:
         """A scripted approach."""
         raise NotImplementedError
 
@@ -179,7 +179,7 @@ class Task(ABC):
     # What a policy sees, and what it is told.
 
     @abstractmethod
-    def observed(self) -> Sequence[Observed] | Camera:
+    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
         """What a policy sees, for `choice.observation`."""
 
     @abstractmethod
@@ -187,7 +187,7 @@ class Task(ABC):
         """The terms of a control step's reward, for `choice.reward`."""
 
     @abstractmethod
-    def conditions(self) -> Sequence[Condition]:
+    def termination_terms(self) -> Sequence[TerminationTerm]:
         """What ends an episode; the first that holds counts."""
 
     def symmetry(self) -> Symmetry | None:
@@ -220,10 +220,10 @@ class Task(ABC):
         """How far beside the demonstrations' first pose a reset may put the robot at most: certificates assume it.
 
         Of each output, (O,), in its unit, or one number for all of them. It covers all that a reset draws, held out or
-        not, and no place that somebody names in a reset's options. The option `start_beside` unless overridden, 0 for a
+        not, and no place that somebody names in a reset's options. The option `start_offset_max` unless overridden, 0 for a
         task that has none.
         """
-        return float(getattr(self.options, "start_beside", 0.0))
+        return float(getattr(self.options, "start_offset_max", 0.0))
 
     # How it is drawn.
 
@@ -241,7 +241,7 @@ class Task(ABC):
         return cls.collision is not Task.collision or cls.__init__ is not Task.__init__
 
     @classmethod
-    def knows(cls) -> tuple[str, ...]:
+    def provides(cls) -> tuple[str, ...]:
         """Which of "demonstrations" (`reference`), "keep_out", "template" and "approach" the task overrides."""
         hooks = {
             "demonstrations": "reference",

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from guiderail.models.certificate.loop import Skill, reach
+from guiderail.models.certificate.loop import SharedControlTemplate, reach
 
 QUANTITIES = ("pose", "speed", "acceleration")
 DWELLS = (1, 1, 2, 3, 5, 10, 20, 50, 100)  # steps that a full deflection lasts
@@ -29,7 +29,7 @@ class Found:
             over a sequence.
         residue: (2, O), what corrections did to outputs that no action moves, beyond what the action does that moves
             the others as far: at one step, and added up over a sequence.
-        steps, corrected, fallbacks: how many there were.
+        steps, corrected, fallback_steps: how many there were.
     """
 
     most: dict[str, np.ndarray]
@@ -45,7 +45,7 @@ class Found:
 class Adversary:
     """Looks for the worst sequences of actions of a skill."""
 
-    def __init__(self, skill: Skill, constrained: np.ndarray, seed: int = 0, spends: bool = False):
+    def __init__(self, skill: SharedControlTemplate, constrained: np.ndarray, seed: int = 0, spends: bool = False):
         """
         Args:
             skill: what is attacked.

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from guiderail.models.certificate.lagrange_bounds import Budget, Budgeted, budgeted
-from guiderail.models.certificate.loop import Bounds, Skill, caps, reach
+from guiderail.models.certificate.loop import Bounds, SharedControlTemplate, caps, reach
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
@@ -55,7 +55,7 @@ class Certified:
     budgeted: Budgeted | None = None
 
 
-def certify(skill: Skill, budget: Budget | None = None) -> Certified:
+def certify(skill: SharedControlTemplate, budget: Budget | None = None) -> Certified:
     """The bounds of a skill; of the budgeted regime as well, with a budget and where a history feeds corrections back.
 
     Raises:
@@ -99,7 +99,7 @@ def nodes(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
     return raw, cells
 
 
-def _of_zonotope(middle: np.ndarray, generators: np.ndarray, skill: Skill) -> Bounds:
+def _of_zonotope(middle: np.ndarray, generators: np.ndarray, skill: SharedControlTemplate) -> Bounds:
     steps = skill.primitive.num_steps
     size = np.abs(generators).sum(axis=2)
     changes = []
@@ -110,7 +110,7 @@ def _of_zonotope(middle: np.ndarray, generators: np.ndarray, skill: Skill) -> Bo
     return Bounds((middle - size)[-steps:], (middle + size)[-steps:], *changes)
 
 
-def _touched(skill: Skill, middle: np.ndarray, generators: np.ndarray) -> np.ndarray:
+def _touched(skill: SharedControlTemplate, middle: np.ndarray, generators: np.ndarray) -> np.ndarray:
     primitive, past = skill.primitive, skill.primitive.history
     moved = np.flatnonzero(skill.gains)
     touched = np.zeros(primitive.num_steps, dtype=bool)
@@ -125,7 +125,7 @@ def _touched(skill: Skill, middle: np.ndarray, generators: np.ndarray) -> np.nda
     return touched
 
 
-def _cellwise(skill: Skill, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _cellwise(skill: SharedControlTemplate, touched: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest commands (2, N, O) at touched steps, NaN at others, and the multipliers that prove them."""
     primitive = skill.primitive
     reached, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
@@ -179,7 +179,7 @@ def _coupled(primitive: LcNsKmp) -> np.ndarray:
     return reached
 
 
-def _always(skill: Skill, free: Bounds, reached: np.ndarray) -> Bounds:
+def _always(skill: SharedControlTemplate, free: Bounds, reached: np.ndarray) -> Bounds:
     corrected = ~np.isnan(reached[0])
     least, greatest = caps(skill)
     lower = np.where(corrected, np.maximum(reached[0], least), free.lower)

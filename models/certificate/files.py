@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.certificate.bounds import Certified
-from guiderail.models.certificate.loop import Bounds, Skill
+from guiderail.models.certificate.loop import Bounds, SharedControlTemplate
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import SquaredExponential
 
@@ -38,7 +38,7 @@ CLOCK_AGREES = 1e-6  # of that: how well the two are the same
 
 
 def certificate_files(
-    skill: Skill,
+    skill: SharedControlTemplate,
     certified: Certified,
     stiffness: np.ndarray | None,
     limits: np.ndarray | None,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from guiderail.models.certificate.loop import Bounds, Skill, caps
+from guiderail.models.certificate.loop import Bounds, SharedControlTemplate, caps
 
 ROUNDS = 4  # commands at other steps that a bound is lowered by
 AWAY, STRIDE = 48, 3  # how far away these are at most, and how many steps apart
@@ -52,7 +52,7 @@ class Budgeted:
 
 
 def budgeted(
-    skill: Skill, free: Bounds, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
+    skill: SharedControlTemplate, free: Bounds, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
 ) -> Budgeted:
     """The bounds while corrections, which there are from a step `first` on, keep a budget."""
     primitive, past = skill.primitive, skill.primitive.history
@@ -79,7 +79,7 @@ def budgeted(
     return Budgeted(budget, Bounds(*found), at, of, prices)
 
 
-def _of_residue(skill: Skill, first: int) -> np.ndarray:
+def _of_residue(skill: SharedControlTemplate, first: int) -> np.ndarray:
     """What a residue of one, of every output that no action moves at every step from `first` on, does to commands."""
     primitive, past = skill.primitive, skill.primitive.history
     steps, others = primitive.num_steps, np.flatnonzero(skill.gains == 0.0)
@@ -94,7 +94,9 @@ def _of_residue(skill: Skill, first: int) -> np.ndarray:
 class _Market:
     """Where prices are found, and what a direction is worth at some."""
 
-    def __init__(self, skill: Skill, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget):
+    def __init__(
+        self, skill: SharedControlTemplate, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget
+    ):
         self._generators, self._first, self._past = generators, first, skill.primitive.history
         self._steps, outputs = skill.primitive.num_steps, skill.primitive.num_outputs
         moved = skill.gains != 0.0

@@ -11,7 +11,7 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 
 @dataclass(frozen=True)
-class Skill:
+class SharedControlTemplate:
     """A primitive in its loop.
 
     Attributes:
@@ -41,7 +41,7 @@ class Bounds:
     acceleration: np.ndarray
 
 
-def reach(skill: Skill) -> tuple[np.ndarray, np.ndarray]:
+def reach(skill: SharedControlTemplate) -> tuple[np.ndarray, np.ndarray]:
     """The motion without actions (P + N, O), the start before it, and the generators around it (P + N, O, B)."""
     primitive, past = skill.primitive, skill.primitive.history
     steps, outputs = primitive.num_steps, primitive.num_outputs
@@ -61,7 +61,7 @@ def reach(skill: Skill) -> tuple[np.ndarray, np.ndarray]:
     return middle, generators
 
 
-def caps(skill: Skill) -> tuple[np.ndarray, np.ndarray]:
+def caps(skill: SharedControlTemplate) -> tuple[np.ndarray, np.ndarray]:
     """The least and the greatest value (N, O) that the constraints on a single output leave it."""
     primitive = skill.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))

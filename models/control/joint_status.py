@@ -50,9 +50,9 @@ class Fault(IntEnum):
     FORCE = 12
     EXTERNAL_TORQUE = 13
     TORQUE = 14
-    ASKED = 15
-    LATE = 16
-    DEPUTY = 17
+    USER_STOP = 15
+    DEADLINE_MISSED = 16
+    MONITOR_STOP = 17
 
 
 FAULTS = {
@@ -71,9 +71,9 @@ FAULTS = {
     Fault.FORCE: "the force on the tool is too great",
     Fault.EXTERNAL_TORQUE: "the surroundings load a joint too much",
     Fault.TORQUE: "the wanted torques are no numbers",
-    Fault.ASKED: "somebody asked for it",
-    Fault.LATE: "this program was held up, and sent nothing for too long",
-    Fault.DEPUTY: "the deputy at the robot has stopped it, or is gone",
+    Fault.USER_STOP: "somebody asked for it",
+    Fault.DEADLINE_MISSED: "this program was held up, and sent nothing for too long",
+    Fault.MONITOR_STOP: "the deputy at the robot has stopped it, or is gone",
 }
 """Each fault in words."""
 
@@ -107,7 +107,7 @@ class JointStatus:
 
 
 @dataclass(frozen=True)
-class DeputyWord:
+class Heartbeat:
     """What a robot's deputy says with every status.
 
     Attributes:
@@ -118,7 +118,7 @@ class DeputyWord:
     number: int
     is_acting: bool
 
-    def __deepcopy__(self, memo: object) -> DeputyWord:
+    def __deepcopy__(self, memo: object) -> Heartbeat:
         """Itself: nobody writes into this one."""
         return self
 

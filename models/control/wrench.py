@@ -7,7 +7,7 @@ import numpy as np
 from guiderail.models.common.arrays import cross
 
 
-def contact_lever(wrench: np.ndarray, least_force: float) -> np.ndarray:
+def center_of_pressure(wrench: np.ndarray, least_force: float) -> np.ndarray:
     """(−τ_y, τ_x) / f_z of a wrench (6,) about a tool centre: from there to where it pushes, (2,) [m].
 
     Zero where f_z is less than `least_force` [N]: a torque divided by next to nothing says nothing.

@@ -13,7 +13,7 @@ _FOLDERS: list[TemporaryDirectory[str]] = []
 
 
 @cache
-def made(files: Callable[..., dict[str, str]], *dimensions: Hashable) -> Path:
+def generate_assets(files: Callable[..., dict[str, str]], *dimensions: Hashable) -> Path:
     """The folder that holds `files(*dimensions)`, which gives what each file holds by its name."""
     folder = TemporaryDirectory(prefix="guiderail-")
     _FOLDERS.append(folder)

@@ -21,13 +21,13 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
 
     An output that is not explored (see `outputs`) has authority zero.
     """
-    explored = _explored(primitive, outputs)
+    action_dims = _explored(primitive, outputs)
     response = _constant_response(primitive)
     authority = np.sqrt(np.mean(np.einsum("noo->no", response) ** 2, axis=0))
-    return np.where(explored, authority, 0.0)
+    return np.where(action_dims, authority, 0.0)
 
 
-def authority_gains(primitive: LcNsKmp, kappa: float = 1.0, outputs: np.ndarray | None = None) -> np.ndarray:
+def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.ndarray | None = None) -> np.ndarray:
     """Gains (O,) with which a constant ±1 action ends up √3 κ demonstration standard deviations away.
 
     √3 because that is KGRL's own relation: uniform actions in ±1 then have an RMS of κ standard deviations. Both are
@@ -36,21 +36,23 @@ def authority_gains(primitive: LcNsKmp, kappa: float = 1.0, outputs: np.ndarray 
 
     Args:
         primitive: whose loop is calibrated.
-        kappa: κ, positive.
+        action_scale: κ, positive.
         outputs: indices of the outputs that are explored; all unless given. The others get a gain of zero.
 
     Raises:
         InputError: if κ is not positive, an index does not exist, or the primitive has no null space (β = 0).
     """
-    _check_kappa(kappa)
-    explored = _explored(primitive, outputs)
+    _check_kappa(action_scale)
+    action_dims = _explored(primitive, outputs)
     authority = unit_authority(primitive, outputs)
-    _refuse_deaf(primitive, authority[explored])
-    target = np.sqrt(3) * kappa * deviation(primitive.reference)
-    return np.divide(target, authority, out=np.zeros_like(target), where=explored)
+    _refuse_deaf(primitive, authority[action_dims])
+    target = np.sqrt(3) * action_scale * deviation(primitive.reference)
+    return np.divide(target, authority, out=np.zeros_like(target), where=action_dims)
 
 
-def rms_gains(primitive: LcNsKmp, kappa: float = 1.0, hold: int = 1, outputs: np.ndarray | None = None) -> np.ndarray:
+def rms_gains(
+    primitive: LcNsKmp, action_scale: float = 1.0, action_repeat: int = 1, outputs: np.ndarray | None = None
+) -> np.ndarray:
     """Gains (O,) with which uniform white actions in ±1 stir up an RMS of κ demonstration standard deviations.
 
     This is what exploration strategies must share before their smoothness is compared. Outputs are coupled through the
@@ -58,28 +60,30 @@ def rms_gains(primitive: LcNsKmp, kappa: float = 1.0, hold: int = 1, outputs: np
 
     Args:
         primitive: whose loop is calibrated.
-        kappa: κ, positive.
+        action_scale: κ, positive.
         hold: control steps an action lasts, at least 1.
         outputs: indices of the outputs that are explored; all unless given. The others get a gain of zero.
 
     Raises:
         InputError: as `authority_gains`, or if the demonstrations' correlations leave no gains that reach κ everywhere.
     """
-    _check_kappa(kappa)
-    explored = np.flatnonzero(_explored(primitive, outputs))
-    power = _white_power(primitive, hold)[np.ix_(explored, explored)]
+    _check_kappa(action_scale)
+    action_dims = np.flatnonzero(_explored(primitive, outputs))
+    power = _white_power(primitive, action_repeat)[np.ix_(action_dims, action_dims)]
     _refuse_deaf(primitive, np.sqrt(power.diagonal()))
-    squared = np.linalg.solve(power, (kappa * deviation(primitive.reference)[explored]) ** 2)
+    squared = np.linalg.solve(power, (action_scale * deviation(primitive.reference)[action_dims]) ** 2)
     if (squared <= 0).any():
         raise InputError("the outputs are too correlated to explore all of them alike: name fewer in outputs=")
     gains = np.zeros(primitive.num_outputs)
-    gains[explored] = np.sqrt(squared)
+    gains[action_dims] = np.sqrt(squared)
     return gains
 
 
-def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, hold: int = 1) -> np.ndarray:
+def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 1) -> np.ndarray:
     """RMS over the motion, in demonstration standard deviations, of uniform white actions in ±1 times `gains`, (O,)."""
-    return np.sqrt(_white_power(primitive, hold) @ np.asarray(gains, dtype=float) ** 2) / deviation(primitive.reference)
+    return np.sqrt(_white_power(primitive, action_repeat) @ np.asarray(gains, dtype=float) ** 2) / deviation(
+        primitive.reference
+    )
 
 
 def authority(primitive: LcNsKmp, gains: np.ndarray) -> np.ndarray:
@@ -92,9 +96,11 @@ def deviation(reference: ReferenceTrajectory) -> np.ndarray:
     return np.sqrt(np.mean(reference.standard_deviations**2, axis=0))
 
 
-def _check_kappa(kappa: float) -> None:
-    if not (np.isfinite(kappa) and kappa > 0):
-        raise InputError(f"kappa is how many standard deviations are explored and must be positive, not {kappa}")
+def _check_kappa(action_scale: float) -> None:
+    if not (np.isfinite(action_scale) and action_scale > 0):
+        raise InputError(
+            f"action_scale is how many standard deviations are explored and must be positive, not {action_scale}"
+        )
 
 
 def _refuse_deaf(primitive: LcNsKmp, response: np.ndarray) -> None:
@@ -132,13 +138,13 @@ def _constant_response(primitive: LcNsKmp) -> np.ndarray:
     return _closed_loop(primitive, actions)
 
 
-def _white_power(primitive: LcNsKmp, hold: int) -> np.ndarray:
+def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:
     """(O, O): mean square of output i over the motion per squared gain of output j, uniform white actions, held."""
-    if int(hold) != hold or hold < 1:
-        raise InputError(f"hold is how many control steps an action lasts, at least 1, not {hold}")
+    if int(action_repeat) != action_repeat or action_repeat < 1:
+        raise InputError(f"hold is how many control steps an action lasts, at least 1, not {action_repeat}")
     steps, outputs = primitive.num_steps, primitive.num_outputs
-    decisions = -(-steps // hold)
-    pulses = np.repeat(np.eye(decisions), hold, axis=0)[:steps]
+    decisions = -(-steps // action_repeat)
+    pulses = np.repeat(np.eye(decisions), action_repeat, axis=0)[:steps]
     power = np.zeros((outputs, outputs))
     for j in range(outputs):
         actions = np.zeros((steps, outputs, decisions))

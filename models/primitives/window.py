@@ -188,7 +188,7 @@ class StepFactor:
         v, signed = self.correct(free, solver)
         return y + (solution.L @ (self._basis @ v)).reshape(wish.shape), signed
 
-    def worst_violation(self, trajectory: np.ndarray) -> float:
+    def max_commanded_violation(self, trajectory: np.ndarray) -> float:
         """max(c − G y) over a whole window (H+1, O); −inf where there is no constraint."""
         short = self._window.c - np.einsum("nfo,no->nf", self._window.G, trajectory)
         return float(short.max(initial=-np.inf))

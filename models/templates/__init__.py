@@ -1,6 +1,6 @@
 """Shared control templates: what is known about a task, as data (thesis, section 2.3)."""
 
-from guiderail.models.templates.schema import load_skill, parse_skill
-from guiderail.models.templates.template import Command, Skill, SkillState, Transition
+from guiderail.models.templates.schema import load_template, parse_template
+from guiderail.models.templates.template import Command, SharedControlTemplate, TemplateState, Transition
 
-__all__ = ["Command", "Skill", "SkillState", "Transition", "load_skill", "parse_skill"]
+__all__ = ["Command", "SharedControlTemplate", "TemplateState", "Transition", "load_template", "parse_template"]

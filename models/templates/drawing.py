@@ -7,17 +7,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.templates.template import Skill, SkillState
+from guiderail.models.templates.template import SharedControlTemplate, TemplateState
 
 
-def state_lines(state: SkillState) -> list[str]:
+def state_lines(state: TemplateState) -> list[str]:
     """What a state does, one short line a mapping, constraint and distance, in the order they apply."""
     mappings = [f"{type(m).__name__} ← {', '.join(f'u{i + 1}' for i in m.used_inputs)}" for m in state.input_mapping]
     constraints = [f"{i + 1}. {type(c).__name__}" for i, c in enumerate(state.active_constraints)]
     return [*mappings, *constraints, f"d: {type(state.transition_distance).__name__}"]
 
 
-def edges(skill: Skill) -> list[tuple[str, str, str]]:
+def edges(skill: SharedControlTemplate) -> list[tuple[str, str, str]]:
     """(from, to, condition) of every transition, the ways back included."""
     arrows = []
     for state in skill.states:
@@ -31,7 +31,7 @@ def edges(skill: Skill) -> list[tuple[str, str, str]]:
     return arrows
 
 
-def to_dot(skill: Skill) -> str:
+def to_dot(skill: SharedControlTemplate) -> str:
     """The state machine in Graphviz's language."""
     lines = [f"digraph {_quoted(skill.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
     for number, state in enumerate(skill.states):
@@ -48,7 +48,7 @@ def _quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def draw(skill: Skill, path: str | Path) -> None:
+def draw(skill: SharedControlTemplate, path: str | Path) -> None:
     """Writes the state machine to a file: .dot or .gv as text, .png, .svg or .pdf as a picture."""
     path = Path(path)
     if path.suffix in (".dot", ".gv"):
@@ -59,7 +59,7 @@ def draw(skill: Skill, path: str | Path) -> None:
     drawn(skill).savefig(path, dpi=120)
 
 
-def drawn(skill: Skill) -> "Figure":
+def drawn(skill: SharedControlTemplate) -> "Figure":
     """The state machine as a Matplotlib figure, which a notebook shows."""
     from matplotlib.figure import Figure
 

@@ -24,7 +24,7 @@ from guiderail.models.templates.kinds import (
     did_you_mean,
 )
 from guiderail.models.templates.mappings import TOOL
-from guiderail.models.templates.template import Skill, SkillState, Transition
+from guiderail.models.templates.template import SharedControlTemplate, TemplateState, Transition
 
 # Importing them is what registers the kinds.
 KINDS = (active_constraints, input_mappings, transition_distances)
@@ -52,7 +52,7 @@ SKILL_FIELDS = {
 }
 
 
-def load_skill(source: str | Path, **parameters: float) -> Skill:
+def load_template(source: str | Path, **parameters: float) -> SharedControlTemplate:
     """Reads a skill.
 
     Args:
@@ -73,7 +73,7 @@ def load_skill(source: str | Path, **parameters: float) -> Skill:
     return _skill(load_yaml(path, "skill"), path.name, parameters)
 
 
-def shipped_skills() -> list[str]:
+def shipped_templates() -> list[str]:
     """The names of guiderail's own skills."""
     return sorted(_shipped_files())
 
@@ -89,12 +89,12 @@ def _shipped(path: Path) -> Any:
     return load_yaml(path, "skill")
 
 
-def parse_skill(text: str, where: str = "skill", **parameters: float) -> Skill:
-    """Like load_skill, from the YAML text itself; `where` names it in messages."""
+def parse_template(text: str, where: str = "skill", **parameters: float) -> SharedControlTemplate:
+    """Like load_template, from the YAML text itself; `where` names it in messages."""
     return _skill(parse_yaml(text, where), where, parameters)
 
 
-def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> Skill:
+def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> SharedControlTemplate:
     data = _mapping(data, where, SKILL_FIELDS, required=SKILL_FIELDS - {"frames", "parameters", "initial_state"})
     number = _Numbers(_parameters(data.get("parameters", {}), parameters, where))
 
@@ -128,7 +128,7 @@ def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> Skill:
         if not speed > 0:
             raise InputError(f"{where}: {key} must be positive, not {speed}.")
     built = tuple(_state(name, state, f"{where}, state {name}", number) for name, state in states.items())
-    skill = Skill(
+    skill = SharedControlTemplate(
         name=data["name"],
         inputs=inputs,
         frames=tuple(frames),
@@ -236,7 +236,7 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _state(name: str, data: Any, where: str, number: _Numbers) -> SkillState:
+def _state(name: str, data: Any, where: str, number: _Numbers) -> TemplateState:
     if not isinstance(data, dict) or "transition_distance" not in data:
         raise InputError(f"{where} must be a mapping with input_mapping, active_constraints and transition_distance.")
     distance = build(TRANSITION_DISTANCES, data["transition_distance"], f"{where}, transition_distance", number)
@@ -255,7 +255,7 @@ def _state(name: str, data: Any, where: str, number: _Numbers) -> SkillState:
         _transition(entry, unit, si, f"{where}, transition {i + 1}", number)
         for i, entry in enumerate(_list(data, "transitions", where))
     )
-    state = SkillState(
+    state = TemplateState(
         name=name,
         input_mapping=tuple(
             build(INPUT_MAPPINGS, entry, f"{where}, input_mapping {i + 1}", number)
@@ -298,7 +298,7 @@ def _transition(data: Any, unit: str, si: float, where: str, number: _Numbers) -
     return Transition(data["to"], si * number(data[below], f"{where}, {below}"), margin)
 
 
-def _check_names(skill: Skill, where: str) -> None:
+def _check_names(skill: SharedControlTemplate, where: str) -> None:
     """Refuses states, frames and inputs that are named but not there."""
     states = [state.name for state in skill.states]
     for state in skill.states:

@@ -32,7 +32,7 @@ class Transition:
 
 
 @dataclass(frozen=True)
-class SkillState:
+class TemplateState:
     """One phase: what inputs do, where the end effector may be, and how far it is to the next phase."""
 
     name: str
@@ -66,7 +66,7 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Skill:
+class SharedControlTemplate:
     """What is known about a task, written down once; a person and a policy act through it alike.
 
     States are numbered in the order of the file. `frames` are the names of the objects' frames; wherever a method
@@ -85,7 +85,7 @@ class Skill:
     name: str
     inputs: int
     frames: tuple[str, ...]
-    states: tuple[SkillState, ...]
+    states: tuple[TemplateState, ...]
     initial_state: int
     max_speed_m_per_s: float
     max_speed_rad_per_s: float
@@ -102,7 +102,7 @@ class Skill:
                 return number
         raise InputError(f"{self.name} has no state {state!r}; {did_you_mean(state, [s.name for s in self.states])}")
 
-    def without_active_constraints(self) -> "Skill":
+    def without_active_constraints(self) -> "SharedControlTemplate":
         """The same skill with its input mappings, states and distances, and nothing that holds anyone back."""
         return replace(self, states=tuple(replace(state, active_constraints=()) for state in self.states))
 

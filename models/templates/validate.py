@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.templates.geometry import Frames, angle_between
-from guiderail.models.templates.template import Skill
+from guiderail.models.templates.template import SharedControlTemplate
 
 SAMPLES = 200
 REACH = 0.6  # [m] how far from an object poses are sampled
@@ -33,7 +33,7 @@ class Finding:
     message: str
 
 
-def validate(skill: Skill, seed: int = 0) -> list[Finding]:
+def validate(skill: SharedControlTemplate, seed: int = 0) -> list[Finding]:
     """Everything that was found, errors first."""
     rng = np.random.default_rng(seed)
     scenes = [_scene(skill, rng) for _ in range(SAMPLES)]
@@ -47,7 +47,7 @@ def validate(skill: Skill, seed: int = 0) -> list[Finding]:
     return sorted(findings, key=lambda finding: not finding.is_error)
 
 
-def _scene(skill: Skill, rng: np.random.Generator) -> tuple[RigidTransform, dict[str, RigidTransform]]:
+def _scene(skill: SharedControlTemplate, rng: np.random.Generator) -> tuple[RigidTransform, dict[str, RigidTransform]]:
     """An end effector at random near upright objects that stand at random."""
     frames = {}
     for name in skill.frames:
@@ -61,7 +61,7 @@ def _scene(skill: Skill, rng: np.random.Generator) -> tuple[RigidTransform, dict
     return RigidTransform(X_WF.rotation() @ R_FE, X_WF @ p_FE), frames
 
 
-def _unused(skill: Skill) -> Iterator[Finding]:
+def _unused(skill: SharedControlTemplate) -> Iterator[Finding]:
     used = {i for state in skill.states for mapping in state.input_mapping for i in mapping.used_inputs}
     for i in sorted(set(range(skill.inputs)) - used):
         yield Finding(False, f"input {i} moves nothing in any state; lower `inputs` or map it")
@@ -70,7 +70,7 @@ def _unused(skill: Skill) -> Iterator[Finding]:
         yield Finding(False, f"the frame {frame} is never used; leave it out")
 
 
-def _unreachable(skill: Skill) -> Iterator[Finding]:
+def _unreachable(skill: SharedControlTemplate) -> Iterator[Finding]:
     reached, waiting = set(), [skill.initial_state]
     while waiting:
         number = waiting.pop()
@@ -82,7 +82,7 @@ def _unreachable(skill: Skill) -> Iterator[Finding]:
             yield Finding(True, f"no transition leads to the state {state.name}; add one, or leave the state out")
 
 
-def _constraints(skill: Skill, scenes: Scenes) -> Iterator[Finding]:
+def _constraints(skill: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
     """Each constraint idempotent; their sequence too, and inside every one of them."""
     for number, state in enumerate(skill.states):
         for i, constraint in enumerate(state.active_constraints):
@@ -118,7 +118,7 @@ def _difference(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
     )
 
 
-def _transitions(skill: Skill, scenes: Scenes, rng: np.random.Generator) -> Iterator[Finding]:
+def _transitions(skill: SharedControlTemplate, scenes: Scenes, rng: np.random.Generator) -> Iterator[Finding]:
     """Some inputs, from some pose inside a state's constraints, bring its distance below every threshold."""
     for number, state in enumerate(skill.states):
         goals = [(f"the transition to {t.to}", t.below) for t in state.transitions]
@@ -148,7 +148,12 @@ def _transitions(skill: Skill, scenes: Scenes, rng: np.random.Generator) -> Iter
 
 
 def _greedy(
-    skill: Skill, number: int, X_WE: RigidTransform, frames: Frames, enough: float, period: float = GREEDY_PERIOD
+    skill: SharedControlTemplate,
+    number: int,
+    X_WE: RigidTransform,
+    frames: Frames,
+    enough: float,
+    period: float = GREEDY_PERIOD,
 ) -> tuple[float, RigidTransform]:
     """The least distance that the single input that lowers it most, chosen anew at every step, reaches, and where."""
     candidates = [sign * row for row in np.eye(skill.inputs) for sign in (1.0, -1.0)]
@@ -168,7 +173,7 @@ def _greedy(
     return best, X_WE
 
 
-def _jumps(skill: Skill, scenes: Scenes) -> Iterator[Finding]:
+def _jumps(skill: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
     """Where a transition is due, one control step leads into the next state's constraints; otherwise it waits."""
     reach = GREEDY_PERIOD * max(skill.max_speed_m_per_s, skill.max_speed_rad_per_s)
     for number, state in enumerate(skill.states):

@@ -14,7 +14,7 @@ import numpy as np
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.tools.evaluation.rollout import Decision, EnvObserver
+from guiderail.tools.evaluation.rollout import EnvCallback, Transition
 from research.action_fuzzing.campaign import Campaign, Case
 
 
@@ -90,22 +90,22 @@ LIMITS = {
 }
 
 
-class Penetration(EnvObserver):
+class Penetration(EnvCallback):
     """How deep jack and plug are within each other at the end of each control step [mm]."""
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """Nothing was measured yet."""
         self._context = self.base.simulator.get_context()
         self._plant = self.base.task.diagram.GetSubsystemByName("station").plant
         self._depths: list[tuple[float, float]] = []
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Measures."""
         plant_context = self._plant.GetMyContextFromRoot(self._context)
         X_JP = self._plant.GetFrameByName("plug").CalcPose(plant_context, self._plant.GetFrameByName("jack"))
         self._depths.append(interference(_D, X_JP.rotation().matrix(), X_JP.translation()))
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """How deep lugs and barrel were in the plug, and what either didn't come out of for `STANDING` steps."""
         depths = np.array(self._depths) / MM
         windows = np.lib.stride_tricks.sliding_window_view(depths.max(axis=1), min(STANDING, len(depths)))
@@ -118,21 +118,21 @@ class Penetration(EnvObserver):
 
 def campaign() -> Campaign:
     """Guidance, uncertainty and explored outputs, everything with everything; each episode is a run of its own."""
-    kinds = itertools.product(("kgrl", "skgrl", "residual", "safe_residual"), ("calibration", "disc"), EXPLORED)
+    kinds = itertools.product(("kgrl", "skgrl", "residual", "safe_residual"), ("per_run", "per_episode"), EXPLORED)
     cases = [
         Case(
-            name=f"{guidance}, {uncertainty}, {outputs}",
+            name=f"{guidance}, {fixture_offset}, {outputs}",
             environment={
                 "guidance": guidance,
-                "uncertainty": uncertainty,
-                "explored": EXPLORED[outputs],
-                "hold": 1,
+                "fixture_offset": fixture_offset,
+                "action_dims": EXPLORED[outputs],
+                "action_repeat": 1,
             },
             constrained=guidance != "residual",
             options={"new_run": True},
             waits=guidance == "safe_residual",
         )
-        for guidance, uncertainty, outputs in kinds
+        for guidance, fixture_offset, outputs in kinds
     ]
-    cases.append(Case("kmp, disc", {"guidance": "kmp", "uncertainty": "disc"}, False, {"new_run": True}))
+    cases.append(Case("kmp, disc", {"guidance": "kmp", "fixture_offset": "per_episode"}, False, {"new_run": True}))
     return Campaign("BncConnector", cases, LIMITS, witness=Penetration)

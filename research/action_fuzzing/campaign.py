@@ -20,10 +20,10 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.environments import check_environment, make_environment
-from guiderail.tools.evaluation.baselines import NULL_POLICIES, Choose
+from guiderail.tools.evaluation.baselines import BASELINES, Choose
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import Decision, EnvObserver, Observer, rollout
-from guiderail.tools.evaluation.step_log import Ledger
+from guiderail.tools.evaluation.rollout import Callback, EnvCallback, Transition, rollout
+from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import read_table, table_text
 from research.action_fuzzing import EVERY, STRESSED
@@ -31,26 +31,26 @@ from research.action_fuzzing.recompute import Frames, RecomputedViolation, nothi
 
 # Columns of an episode's row that a campaign's table has.
 COLUMNS = (
-    "termination", "steps", "peak_force", "collisions", "saturations", "fallbacks", "worst_violation",
-    "worst_measured_violation",
+    "termination", "steps", "peak_force", "collisions", "saturated_steps", "fallback_steps", "max_commanded_violation",
+    "max_measured_violation",
 )  # fmt: skip
 
 
-ACTIONS = {name: NULL_POLICIES[name] for name in ("white", "held", "corners", "stuck")}
+ACTIONS = {name: BASELINES[name] for name in ("uniform_random", "random_hold", "bang_bang", "random_corner")}
 
 
-class Finite(EnvObserver):
+class Finite(EnvCallback):
     """Counts the numbers of an episode that are none."""
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """None yet."""
         self._count = 0
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Counts those that a policy saw."""
         self._count += int(np.sum(~np.isfinite(decision.following))) + (not np.isfinite(decision.reward))
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """`not_finite`, with those of the trace."""
         trace = self.base.trace
         recorded = (trace.commanded, trace.measured, trace.force)
@@ -81,7 +81,7 @@ class Campaign:
     cases: Sequence[Case]
     limits: Mapping[str, float]  # of columns, the witness's among them
     # Makes what watches an environment's episodes for what their rows don't tell, in numbers: the greater, the worse.
-    witness: Callable[[gymnasium.Env], Observer] | None = None
+    witness: Callable[[gymnasium.Env], Callback] | None = None
     actions: Mapping[str, Choose] = field(default_factory=lambda: ACTIONS)
     frames: Frames | None = nothing_moves  # where a template's objects are, by what a reset drew; None: nobody knows
 
@@ -125,15 +125,15 @@ def run_campaign(
             "recomputed_violation" not in row
         ):
             raise InputError(f"{out} holds another campaign: name another file")
-    environments: dict[str, tuple[gymnasium.Env, list[Observer]]] = {}
+    environments: dict[str, tuple[gymnasium.Env, list[Callback]]] = {}
     said, began = len(rows), time.process_time()
     while not enough(rows):
         case, name = kinds[len(rows) % len(kinds)]
         if case.name not in environments:
             env = make_environment(campaign.task, wheres[case.name])
-            watching: list[Observer] = [Finite(env), RecomputedViolation(env, campaign.frames)]
+            watching: list[Callback] = [Finite(env), RecomputedViolation(env, campaign.frames)]
             watching += [campaign.witness(env)] if campaign.witness else []
-            watching += [Ledger(env, ledger)] if ledger is not None else []
+            watching += [StepLog(env, ledger)] if ledger is not None else []
             environments[case.name] = env, watching
         env, watching = environments[case.name]
         own = seed + len(rows)
@@ -162,7 +162,7 @@ def _digest(task: str, environment: Mapping[str, Any]) -> str:
 def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What episodes came to: counts, and the worst of everything; a violation is of constrained guidance's commands.
 
-    `worst_violation` is the greater of what the environment says and what was recomputed from the commands;
+    `max_commanded_violation` is the greater of what the environment says and what was recomputed from the commands;
     `disagreement` is the greatest difference of the two.
     """
     table = pd.DataFrame(rows)
@@ -171,7 +171,7 @@ def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "recomputed_violation",
     ]  # fmt: skip
     witnessed = table.columns.drop(own, errors="ignore")
-    said, recomputed = (table[name].to_numpy(float) for name in ("worst_violation", "recomputed_violation"))
+    said, recomputed = (table[name].to_numpy(float) for name in ("max_commanded_violation", "recomputed_violation"))
     constrained, bounded = table["constrained"].to_numpy() == 1, recomputed > -np.inf
 
     def worst(of: np.ndarray) -> float | None:
@@ -184,9 +184,9 @@ def outcome(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "control_steps": int(table["steps"].sum()),
         "endings": dict(Counter(table["termination"])),
         "not_finite": int(table["not_finite"].sum()),
-        "fallbacks": int(failed["fallbacks"].sum()),
-        "waits": int(table["fallbacks"].sum() - failed["fallbacks"].sum()),
-        "worst_violation": worst(constrained),
+        "fallback_steps": int(failed["fallback_steps"].sum()),
+        "waits": int(table["fallback_steps"].sum() - failed["fallback_steps"].sum()),
+        "max_commanded_violation": worst(constrained),
         "worst_violation_unconstrained": worst(~constrained),
         "disagreement": float(np.abs(said - recomputed)[constrained & bounded].max(initial=0.0)),
         "collisions": int(table["collisions"].sum()),
@@ -202,9 +202,9 @@ def complaints(found: Mapping[str, Any], limits: Mapping[str, float]) -> list[st
         wrong.append("the simulation failed")
     if found["not_finite"]:
         wrong.append("something was not finite")
-    if found["fallbacks"]:
+    if found["fallback_steps"]:
         wrong.append("a prediction failed")
-    if found["worst_violation"] is not None and not found["worst_violation"] <= TOLERANCE:
+    if found["max_commanded_violation"] is not None and not found["max_commanded_violation"] <= TOLERANCE:
         wrong.append("a command violated the constraints")
     if not found["disagreement"] <= TOLERANCE:
         wrong.append("what was said of a command is not what it was")
@@ -267,7 +267,7 @@ def _stress_all(steps: int, *, seed: int, out: Path | None, say: Callable[[str],
     return {
         "tasks": found,
         "control_steps": sum(one["all"]["control_steps"] for one in found.values()),
-        "worst_violation": max(one["all"]["worst_violation"] for one in found.values()),
+        "max_commanded_violation": max(one["all"]["max_commanded_violation"] for one in found.values()),
         "disagreement": max(one["all"]["disagreement"] for one in found.values()),
         "wrong": [f"{task}: {words}" for task, one in found.items() for words in one["wrong"]],
     }

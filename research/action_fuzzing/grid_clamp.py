@@ -10,13 +10,13 @@ def campaign() -> Campaign:
     """The template, six velocities and a residual, each in the cuboid; what pushes too hard is a collision."""
     cases = [
         Case(
-            f"{guidance}, {uncertainty}",
-            {"guidance": guidance, "uncertainty": uncertainty, "hold": 1},
+            f"{guidance}, {fixture_offset}",
+            {"guidance": guidance, "fixture_offset": fixture_offset, "action_repeat": 1},
             constrained=True,
             options={"new_run": True},
             waits=True,
         )
         for guidance in ("sct", "none", "residual")
-        for uncertainty in ("calibration", "disc")
+        for fixture_offset in ("per_run", "per_episode")
     ]
     return Campaign("GridClamp", cases, {"collisions": 0})

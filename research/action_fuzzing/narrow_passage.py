@@ -12,12 +12,16 @@ def campaign() -> Campaign:
     learning and the demonstrations from anything.
     """
     cases = [
-        Case(f"{guidance}, hold {hold}", {"guidance": guidance, "hold": hold}, constrained=True)
-        for guidance, hold in itertools.product(("kgrl", "skgrl"), (1, 5))
+        Case(
+            f"{guidance}, hold {action_repeat}",
+            {"guidance": guidance, "action_repeat": action_repeat},
+            constrained=True,
+        )
+        for guidance, action_repeat in itertools.product(("kgrl", "skgrl"), (1, 5))
     ]
     cases += [
-        Case("safe_residual", {"guidance": "safe_residual", "hold": 5}, constrained=True, waits=True),
-        Case("residual", {"guidance": "residual", "hold": 5}, constrained=False, limits={}),
-        Case("kmp", {"guidance": "kmp", "hold": 5}, constrained=False, limits={}),
+        Case("safe_residual", {"guidance": "safe_residual", "action_repeat": 5}, constrained=True, waits=True),
+        Case("residual", {"guidance": "residual", "action_repeat": 5}, constrained=False, limits={}),
+        Case("kmp", {"guidance": "kmp", "action_repeat": 5}, constrained=False, limits={}),
     ]
     return Campaign("NarrowPassage", cases, {"collisions": 0})

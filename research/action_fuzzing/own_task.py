@@ -19,6 +19,6 @@ def campaign_of(task: str) -> Campaign:
     """
     cases = [
         Case(name, {"guidance": name}, constrained=name in CONSTRAINED, waits=name not in ("kgrl", "skgrl"))
-        for name in possible_guidance(TASKS.get(task).knows())
+        for name in possible_guidance(TASKS.get(task).provides())
     ]
     return Campaign(task, cases, {}, frames=None)

@@ -15,14 +15,14 @@ from guiderail.diagrams.tasks.pouring.scripted import ADVERSARIES, Inputs
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.tools.evaluation.baselines import Choose, corners
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import EnvObserver
+from guiderail.tools.evaluation.rollout import EnvCallback
 from research.action_fuzzing.campaign import Campaign, Case
 
 
-class EarlyTilt(EnvObserver):
+class EarlyTilt(EnvCallback):
     """The greatest tilt [rad] that is commanded while the template is in its first state, where it is upright."""
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """`early_tilt` [rad], of all control steps; 0 where the template was never in its first state."""
         trace = self.base.trace
         upright = trace.commanded[trace.signals["state"][:, 0] == 0]

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.poses import pose_to_transform
-from guiderail.tools.evaluation.rollout import EnvObserver
+from guiderail.tools.evaluation.rollout import EnvCallback
 
 # From what a reset drew to where a template's objects are then.
 Frames = Callable[[Mapping[str, Any]], Mapping[str, RigidTransform]]
@@ -22,7 +22,7 @@ def nothing_moves(drawn: Mapping[str, Any]) -> Mapping[str, RigidTransform]:
     return {}
 
 
-class RecomputedViolation(EnvObserver):
+class RecomputedViolation(EnvCallback):
     """Adds `recomputed_violation`: how far the worst command of an episode was outside, −inf where nothing bounds it.
 
     It is computed from the trace's `desired_pose` and from the task's constraints, or the active constraints of the
@@ -38,7 +38,7 @@ class RecomputedViolation(EnvObserver):
         super().__init__(env)
         self._frames = frames
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """`recomputed_violation`."""
         task: Task | None = getattr(self.base.task, "declaration", None)
         if task is None or not len(self.base.trace):
@@ -53,7 +53,7 @@ class RecomputedViolation(EnvObserver):
             # The command at the end of control step n is the one of step n, as counted from zero.
             G, c = constraints.window(np.arange(len(poses)))
             return (c - np.einsum("nfo,no->nf", G, poses)).max(axis=1, initial=-np.inf)
-        if self._frames is None or "template" not in task.knows():
+        if self._frames is None or "template" not in task.provides():
             return np.full(len(poses), -np.inf)
         template = task.template()
         frames = {**template.frames, **self._frames(self.base.drawn)}

@@ -25,7 +25,7 @@ from guiderail.tools.learning.run_folder import RunFolder
 from research.benchmarks import told
 
 TASK = "BncConnector"
-ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "uncertainty": "calibration"}
+ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "fixture_offset": "per_run"}
 EPISODES = 20  # seeds 30 to 34 have converged after at most 10
 SEEDS = range(400, 405)
 HELD_OUT = 100

@@ -15,7 +15,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.options import HARD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.units import MM
-from guiderail.models.control.wrench import contact_lever
+from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.motion import poses
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
@@ -24,26 +24,26 @@ from guiderail.tools.visualization.style import legend, new_figure, save_figure
 from research.benchmarks import told
 from research.benchmarks.simulation import scripted_motion
 
-ENGINES = {"Drake": "rails", "MuJoCo": "mujoco"}
+ENGINES = {"Drake": "gantry", "MuJoCo": "mujoco"}
 COLOURS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
 TASKS = ("BncConnector", "GridClamp")
 OFFSETS = (0.8, 1.25, 2.0, 3.0)  # [mm], of a plug on the rim
 MODULI = (0.01, 0.1, 1.0, 10.0)  # times the contact's own, in Drake
 PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
-LEAST_FORCE = 0.5  # [N] below which a lever says nothing
+MIN_CONTACT_FORCE = 0.5  # [N] below which a lever says nothing
 NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
 IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that has dropped in, and an offset from which none does
 HALVINGS = 6  # of that offset
 AROUND, SPEEDS = 3.0 * MM, (0.003, 0.02, 0.04)  # circle about the jack on which a plug slides over the rim [m, m/s]
 CAPTURES = {  # station, and whether Drake's polygons have their circles' areas
-    "Drake": ("rails", False),
-    "Drake, equal areas": ("rails", True),
+    "Drake": ("gantry", False),
+    "Drake, equal areas": ("gantry", True),
     "MuJoCo": ("mujoco", False),
 }
 CONTACTS = {  # station, step [s] and margin [m]
-    "Drake, 10 ms": ("rails", PLANT_PERIOD, MARGIN),
-    "Drake, 2.5 ms": ("rails", PLANT_PERIOD / 4, MARGIN),
-    "Drake, 2.5 ms, no margin": ("rails", PLANT_PERIOD / 4, 0.0),
+    "Drake, 10 ms": ("gantry", PLANT_PERIOD, MARGIN),
+    "Drake, 2.5 ms": ("gantry", PLANT_PERIOD / 4, MARGIN),
+    "Drake, 2.5 ms, no margin": ("gantry", PLANT_PERIOD / 4, 0.0),
     "MuJoCo": ("mujoco", PLANT_PERIOD, MARGIN),
 }
 
@@ -104,7 +104,7 @@ def _profile(task: str, station: str) -> dict[str, Any]:
 def _lever(name: str, offset: float, modulus: float) -> float:
     """From the plug's axis to where the rim pushes, at rest on it beside the barrel [m]."""
     recording = _pressed(name, BncWorkcell(), offset, modulus)
-    return float(np.linalg.norm(contact_lever(recording["wrench"][-10:].mean(axis=0), LEAST_FORCE)))
+    return float(np.linalg.norm(center_of_pressure(recording["wrench"][-10:].mean(axis=0), MIN_CONTACT_FORCE)))
 
 
 def _capture(name: str, equal_area: bool = False) -> float:
@@ -128,7 +128,7 @@ def drag(station: str, time_step: float, margin: float, speed: float) -> float:
     motion[:, :2] += AROUND * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     built = STATIONS.get(station).build(workcell, time_step=time_step)
     wrench = drive_along(built, times, motion)[1]["wrench"][45:]
-    wrench = wrench[wrench[:, 2] > LEAST_FORCE]
+    wrench = wrench[wrench[:, 2] > MIN_CONTACT_FORCE]
     return float(np.median(np.linalg.norm(wrench[:, :2], axis=1) / wrench[:, 2]))
 
 

@@ -23,17 +23,25 @@ from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.motion import insert_and_lock
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.scripted import untrained
+from guiderail.tools.evaluation.scripted import make_baseline
 from research.benchmarks import told
 
 CONTROLS = ("joint", "cartesian")
 TIME_STEPS = {"joint": (1, 2, 4, 16), "cartesian": (4, 8, 16)}  # parts of a control period; the last is the finest
 DIFFICULTIES = ("standard", "hard")
-POLICIES = {"demonstrations": "zero", "rule": "rule"}
+POLICIES = {"demonstrations": "zero", "scripted": "scripted"}
 EPISODES = 10  # of each
 RESPONSE = 15  # control periods
 STEP = np.array([4.0 * MM, -3.0 * MM, 5.0 * MM, 0.05, -0.04, 0.03])  # of the desired pose, in the air
-SHOWN = ("success_rate", "success_low", "success_high", "mean_force", "peak_force", "mean_steps", "worst_violation")
+SHOWN = (
+    "success_rate",
+    "success_low",
+    "success_high",
+    "mean_force",
+    "peak_force",
+    "mean_steps",
+    "max_commanded_violation",
+)
 
 
 def measure() -> dict[str, Any]:
@@ -99,7 +107,7 @@ def _apart(poses: np.ndarray, others: np.ndarray, name: str) -> dict[str, float]
 def _episodes(difficulty: str, name: str, control: str) -> dict[str, Any]:
     env = make_env("BncConnector", guidance="kgrl", difficulty=difficulty, impedance_control=control)
     env.reset(seed=0)
-    act = untrained("BncConnector", POLICIES[name])(env)
+    act = make_baseline("BncConnector", POLICIES[name])(env)
     begin = time.process_time()
     rows = evaluate_policy(env, act, episodes=EPISODES, options={"new_run": True})
     spent = time.process_time() - begin

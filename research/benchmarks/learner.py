@@ -23,7 +23,7 @@ from gymnasium import spaces
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
 
-from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import register_learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
@@ -44,7 +44,7 @@ class PlainTqc(OffPolicyLearner):
     algorithm = TQC
 
 
-PRESETS = ("robust", "clamp", "quick", "table_4_1_simulation")
+PRESETS = ("tqc_contact", "sac_gridclamp", "tqc_fast", "table_4_1_simulation")
 REQUIRED_RATIO = 2.5  # of TQC at the connector's preset
 REQUIRED_OF = "tqc robust"
 TURNS = 8
@@ -92,12 +92,12 @@ def _seconds(learner: OffPolicyLearner) -> float:
 def _experienced(kind: type[OffPolicyLearner], preset: str) -> OffPolicyLearner:
     """A learner with something to remember."""
     settings = resolve_preset(preset, "tqc", {"symmetry": False})
-    learner = kind(settings, _Spaces(), hold=10, seed=0, decisions=_DECISIONS)
+    learner = kind(settings, _Spaces(), action_repeat=10, seed=0, decisions=_DECISIONS)
     random = np.random.default_rng(0)
     for index in range(_DECISIONS):
         seen, then = random.standard_normal((2, 13)).astype(np.float32)
         action = random.uniform(-1, 1, 2).astype(np.float32)
-        learner.remember(Decision(seen, action, float(random.standard_normal()), then, index % 50 == 49, False, {}))
+        learner.remember(Transition(seen, action, float(random.standard_normal()), then, index % 50 == 49, False, {}))
     return learner
 
 

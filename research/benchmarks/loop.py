@@ -21,7 +21,7 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import known
-from guiderail.diagrams.hardware.clock import hurry
+from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
@@ -182,7 +182,7 @@ def _speak(pipe: Connection, url: str) -> None:
 @contextmanager
 def _in_a_hurry() -> Iterator[None]:
     """As a process that a robot waits for, where the system allows it."""
-    is_served_first = hurry()
+    is_served_first = set_realtime_priority()
     try:
         yield
     finally:

@@ -18,7 +18,7 @@ import gymnasium
 from research.benchmarks import told
 
 ENVIRONMENT = "guiderail.diagrams:guiderail/BncConnector-v0"
-OPTIONS: dict[str, Any] = {"guidance": "kgrl", "uncertainty": "disc", "hold": 5}
+OPTIONS: dict[str, Any] = {"guidance": "kgrl", "fixture_offset": "per_episode", "action_repeat": 5}
 ASKED = 16  # cores
 STEPS = 300  # of the vector environment, in each measurement
 
@@ -36,13 +36,13 @@ def measure(*, steps: int = STEPS, counts: tuple[int, ...] | None = None) -> dic
     measured = {count: _measured(count, steps) for count in told(counts, "environments")}
     alone = measured[min(measured)]
     serial = measured[max(measured)]["own_seconds"] / max(measured)
-    hold = OPTIONS["hold"]
+    action_repeat = OPTIONS["action_repeat"]
     return {
         "cores": cores,
-        "control_steps_per_second": {count: hold * count / row["seconds"] for count, row in measured.items()},
+        "control_steps_per_second": {count: action_repeat * count / row["seconds"] for count, row in measured.items()},
         "serial_ms_an_environment": 1e3 * serial,
         "reckoned_cores": ASKED,
-        "reckoned_control_steps_per_second": hold * ASKED / (alone["seconds"] + (ASKED - 1) * serial),
+        "reckoned_control_steps_per_second": action_repeat * ASKED / (alone["seconds"] + (ASKED - 1) * serial),
     }
 
 

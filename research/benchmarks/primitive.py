@@ -160,7 +160,7 @@ def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> tuple[
         "dense_ms": dense_ms,
         "times_dense": 1e3 * dense_ms / row["median_us"],
         "difference_to_dense": difference,
-        "worst_violation": violation,
+        "max_commanded_violation": violation,
     }
     return row, seconds
 
@@ -173,7 +173,7 @@ def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict]:
         seconds.append(spent)
     together = _microseconds(np.concatenate(seconds))
     mean = {key: float(np.mean([row[key] for row in rows.values()])) for key in ("constrained", "dense_ms")}
-    worst = {key: max(row[key] for row in rows.values()) for key in ("difference_to_dense", "worst_violation")}
+    worst = {key: max(row[key] for row in rows.values()) for key in ("difference_to_dense", "max_commanded_violation")}
     rows["together"] = {**mean, **together, "times_dense": 1e3 * mean["dense_ms"] / together["median_us"], **worst}
     return rows
 
@@ -212,7 +212,7 @@ def _leaf_system(size: tuple[int, int, int, int], steps: int) -> dict[str, float
     context = system.CreateDefaultContext()
     action = system.get_null_space_action_input_port().FixValue(context, np.zeros(p.num_outputs))
     system.get_history_input_port().FixValue(context, np.tile(p.reference.means[0], (p.history, 1)).ravel())
-    port = system.get_output_output_port()
+    port = system.get_command_output_port()
     actions = np.random.default_rng(1).uniform(-1, 1, (steps, p.num_outputs))
     seconds = np.empty(steps)
     for k in range(steps):

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from guiderail.tools.evaluation.step_log import Ledger
+from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.learning import trainer as train
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
@@ -45,7 +45,7 @@ def timed(owner: Any, name: str) -> Iterator[list[float]]:
 def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     """Trains a run of so many episodes in a temporary folder: what saving it took, as parts of the whole."""
     config = configure(task, {}, **with_defaults(task, {"episodes": episodes, "seed": seed}))
-    with tempfile.TemporaryDirectory() as folder, timed(Ledger, "end") as ledger, timed(train, "_save") as checkpoints:
+    with tempfile.TemporaryDirectory() as folder, timed(StepLog, "end") as ledger, timed(train, "_save") as checkpoints:
         rows = train.train(RunFolder(Path(folder) / "run"), config)
     seconds = sum(row["wall_time"] for row in rows) + sum(checkpoints)
     return {

@@ -27,7 +27,7 @@ from guiderail.models.objects.bnc_connector.motion import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.cartesian_position_controller import CartesianPositionController
 from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.contact_detector import ContactWatch
+from guiderail.systems.contact_detector import ContactDetector
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.pose_wrench import PoseWrench
@@ -43,7 +43,7 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (CartesianImpedanceController, "_calc_law"),
     (CartesianPositionController, "_step"),
     (MeasuredPose, "_calc_pose"),
-    (ContactWatch, "_update"),
+    (ContactDetector, "_update"),
     (CommandWatch, "_update"),
     (CommandWatchdog, "_calc_safe_pose"),
     (ImpedanceMonitor, "_calc_contact_force"),
@@ -68,7 +68,7 @@ POUR_POSES = (
 POUR_CONTACT = (2.0, 7.6)  # the balls roll, and fall
 # What is driven along what, and how many times real time it is to be.
 REQUIRED_FACTOR = {
-    "rails": ("BncConnector", 10.0),
+    "gantry": ("BncConnector", 10.0),
     "arm": ("BncConnector", 6.0),
     "grid_clamp": ("GridClamp", 10.0),
     "pouring": ("Pouring", 10.0),
@@ -115,7 +115,7 @@ def _one_run(name: str) -> dict[str, float]:
     """Simulated seconds per second of CPU time while there is contact."""
     world, times, poses, contact = scripted_motion(REQUIRED_FACTOR[name][0])
     with timed_callbacks() as spent:
-        station = STATIONS.get(name if name in STATIONS.names() else "rails").build(world)
+        station = STATIONS.get(name if name in STATIONS.names() else "gantry").build(world)
         driven = DrivenStation(station, along(times, poses), num_samples=NUM_STEPS)
         driven.start(poses[0])
         first, last = (round(t / CONTROL_PERIOD) for t in contact)
@@ -141,7 +141,7 @@ def scripted_motion(task: str) -> tuple[Any, np.ndarray, np.ndarray, tuple[float
 
 def env_seconds(guidance: str = "kgrl") -> float:
     """CPU seconds of 400 control steps of the environment on rails with random actions; the best of some episodes."""
-    env = make_env("BncConnector", guidance=guidance, uncertainty="disc", hold=5)
+    env = make_env("BncConnector", guidance=guidance, fixture_offset="per_episode", action_repeat=5)
     rng = np.random.default_rng(0)
     best = np.inf
     for episode in range(1 + REPEATS):

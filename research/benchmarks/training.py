@@ -51,9 +51,9 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (off_policy.OffPolicyLearner, "learn", "gradient step"),
     (off_policy.NStepReplayBuffer, "sample", "replay"),
     (ensemble.Ensemble, "train", "gradient step"),
-    (perceptrons.Perceptrons, "forward", "forward"),
-    (perceptrons.Perceptrons, "backward", "backward"),
-    (perceptrons.Perceptrons, "input_gradient", "backward"),
+    (perceptrons.BatchedMLP, "forward", "forward"),
+    (perceptrons.BatchedMLP, "backward", "backward"),
+    (perceptrons.BatchedMLP, "input_gradient", "backward"),
     (flat_adam.FlatAdam, "step", "optimizer"),
     (checkpoint, "save_checkpoint", "checkpoint"),
 )

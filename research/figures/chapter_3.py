@@ -97,7 +97,7 @@ def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
         axes[0, column].set_title(algorithm.upper())
         for axis, key, label in zip(
             axes[:, column],
-            ("training_converged_after", "spill_percent", "collision_percent"),
+            ("training_episodes_to_convergence", "spill_percent", "collision_percent"),
             ("episodes before ten in a row", "% of episodes that end in a spill", "% that end in a collision"),
             strict=True,
         ):
@@ -120,7 +120,7 @@ def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
 
 def table_3_2(out: Path) -> dict[str, Any]:
     """The learners' settings for templates: the thesis's, and those of the presets that are named after it."""
-    return settings_table(out / "table_3_2", TABLE_3_2, ("pouring", "clamp"))
+    return settings_table(out / "table_3_2", TABLE_3_2, ("pouring", "sac_gridclamp"))
 
 
 def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
@@ -210,7 +210,7 @@ def _poured(rows: pd.DataFrame) -> dict[str, str]:
     return said(
         rows,
         {
-            "training_converged_after": ("converged after episode", "{}"),
+            "training_episodes_to_convergence": ("converged after episode", "{}"),
             "training_ended_in_spill": ("episodes that ended in a spill", "{}"),
             "training_ended_in_collision": ("episodes that ended in a collision", "{}"),
         },
@@ -226,7 +226,7 @@ def figure_3_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[
         figure_study("grid_clamp_figures", seeds=seeds, episodes=episodes),
         {"success": "success", "mean_squared_force": "mean squared force [N²]", "steps": "control steps of 20 ms"},
         {
-            "training_converged_after": ("converged after episode", "{}"),
+            "training_episodes_to_convergence": ("converged after episode", "{}"),
             "success_rate": ("held-out success", "{:.0%}"),
             "training_mean_squared_force": ("mean squared force of each seed [N²]", "{:.1f}"),
         },

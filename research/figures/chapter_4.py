@@ -71,7 +71,7 @@ def figure_4_2(out: Path) -> dict[str, Any]:
         away = np.linalg.norm(path - unmodulated, axis=1)
         elsewhere = np.abs(reference.times - reference.times[step]) > NEARBY
         moved = {"moved_at_3.2_s": float(away[step]), MOVED_ELSEWHERE: float(away[elsewhere].max())}
-        return {"panel": panel, "case": case, "worst_violation": _violation(primitive, path), **moved}
+        return {"panel": panel, "case": case, "max_commanded_violation": _violation(primitive, path), **moved}
 
     figure, ((first, second, third),) = new_figure(1, 3, (15, 4.2))
     for outputs in demonstrations.outputs:
@@ -93,11 +93,11 @@ def figure_4_2(out: Path) -> dict[str, Any]:
         if axis is not first:
             axis.add_patch(Rectangle(tuple(LOWER), *(UPPER - LOWER), fill=False, color="firebrick", linestyle="--"))
         axis.set(title=title, xlabel="x", ylabel="y", aspect="equal", xlim=(-0.65, 0.65), ylim=(-0.35, 0.6))
-    explored = np.sqrt(((paths - paths.mean(0)) ** 2).mean((0, 2)))
-    agreement = float(np.corrcoef(explored, np.sqrt((reference.standard_deviations**2).mean(1)))[0, 1])
+    action_dims = np.sqrt(((paths - paths.mean(0)) ** 2).mean((0, 2)))
+    agreement = float(np.corrcoef(action_dims, np.sqrt((reference.standard_deviations**2).mean(1)))[0, 1])
     return {
         **leave(out, "figure_4_2", figure, rows),
-        "worst_violation": max(row["worst_violation"] for row in rows),
+        "max_commanded_violation": max(row["max_commanded_violation"] for row in rows),
         "exploration_follows_the_demonstrated_spread": agreement,
     }
 
@@ -136,7 +136,7 @@ def figure_4_3(out: Path, name: str = "figure_4_3") -> dict[str, Any]:
 
 def table_4_1(out: Path) -> dict[str, Any]:
     """TQC's settings: the thesis's, and those of the presets that are named after it."""
-    return settings_table(out / "table_4_1", TABLE_4_1, ("quick", "robust"))
+    return settings_table(out / "table_4_1", TABLE_4_1, ("tqc_fast", "tqc_contact"))
 
 
 def random_episodes(env: Any, seed: int, episodes: int) -> list[dict[str, Any]]:
@@ -163,26 +163,29 @@ def figure_4_4(out: Path, seeds: int = 3, episodes: int = 10) -> dict[str, Any]:
     for axis, kind in zip(axes, METHODS, strict=True):
         draw_world(axis)
         axis.set_title(label(kind))
-        for hold in (HOLD, 1):
-            env: Any = make_environment(TASK, {"guidance": kind, "hold": hold})
-            explored: list[dict[str, Any]] = []
+        for action_repeat in (HOLD, 1):
+            env: Any = make_environment(TASK, {"guidance": kind, "action_repeat": action_repeat})
+            action_dims: list[dict[str, Any]] = []
             for seed in range(seeds):
                 env.reset(seed=seed)
-                explored += random_episodes(env, seed, episodes)
+                action_dims += random_episodes(env, seed, episodes)
             env.close()
-            counted = summary(pd.DataFrame(explored), COUNTED)
-            rows.append({"method": label(kind), "hold": hold, **counted})
-            for row in explored if hold == HOLD else ():
+            counted = summary(pd.DataFrame(action_dims), COUNTED)
+            rows.append({"method": label(kind), "action_repeat": action_repeat, **counted})
+            for row in action_dims if action_repeat == HOLD else ():
                 axis.plot(*row["measured"].T, ".", markersize=1.5, color=colour(kind), alpha=0.35)
     return {
         **leave(out, "figure_4_4", figure, rows),
-        **{f"{row['method']}, an action lasts {row['hold']}": f"{row['success_rate']:.0%} succeed" for row in rows},
+        **{
+            f"{row['method']}, an action lasts {row['action_repeat']}": f"{row['success_rate']:.0%} succeed"
+            for row in rows
+        },
     }
 
 
 COUNTED = (
-    "episodes", "success_rate", "ended_blocked", "collisions", "measured_violating_episodes", "worst_violation",
-    "worst_measured_violation",
+    "episodes", "success_rate", "ended_blocked", "collisions", "measured_violating_episodes", "max_commanded_violation",
+    "max_measured_violation",
 )  # fmt: skip
 
 
@@ -207,7 +210,7 @@ def figure_4_5(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
 def figure_4_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
     """Collisions with the walls and violations of the constraint, per episode of learning."""
     rows = run_study(figure_study("narrow_passage", seeds=seeds, episodes=episodes), out)
-    columns = {"collisions": "wall collisions per episode", "worst_measured_violation": "worst violation [m]"}
+    columns = {"collisions": "wall collisions per episode", "max_measured_violation": "worst violation [m]"}
     figure, axes = learning_curves(rows, columns, (1, 2), (10, 4), window=1)
     axes[0, 1].axhline(0, color="firebrick", linewidth=0.8)
     counts = ["training_collisions", "training_measured_violating_episodes", "training_episodes"]
@@ -228,7 +231,7 @@ def figure_4_7(out: Path, seeds: int = 3, episodes: int = 30) -> dict[str, Any]:
         seeds=seeds,
         episodes=episodes,
         methods=["kgrl"],
-        env={"hold": HOLD, "observation": "image"},
+        env={"action_repeat": HOLD, "observation": "image"},
         folder="runs/NarrowPassage/{method}-hold-5-observation-image-quick-{episodes}-{seed}",
     )
     rows = run_study(study, out)
@@ -255,6 +258,6 @@ def figure_4_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
 
 FORCE = "mean contact force [N]"
 LEARNED = {
-    "training_converged_after": ("converged after episode", "{}"),
+    "training_episodes_to_convergence": ("converged after episode", "{}"),
     "success_rate": ("held-out success", "{:.0%}"),
 }

@@ -18,13 +18,13 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import LcNsKmp
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import NullPolicy, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, white
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.experiments.declaration import LearnerChoice
 from guiderail.tools.experiments.study import each, run_study
 from guiderail.tools.visualization.curves import draw_world
-from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.film import draw_frames, watch
 from guiderail.tools.visualization.style import colour, label, new_figure
 from research.figures.chapter_4 import CONNECTOR, FORCE, HOLD, LEARNED, TASK, figure_4_3, random_episodes
@@ -121,7 +121,9 @@ def figure_5_3(out: Path) -> dict[str, Any]:
 
 def figure_5_4(out: Path) -> dict[str, Any]:
     """Pushes where demonstrations differ and where they agree, some of them into the restricted zone."""
-    env: Any = make_environment(TASK, {"guidance": "skgrl", "hold": 1, "history": 1, "history_source": "measured"})
+    env: Any = make_environment(
+        TASK, {"guidance": "skgrl", "action_repeat": 1, "history": 1, "history_source": "measured"}
+    )
     nominal, _, _ = _run(env, None)
     figure, ((plane, time),) = new_figure(1, 2, (11, 5.6))
     draw_world(plane)
@@ -149,7 +151,7 @@ def figure_5_4(out: Path) -> dict[str, Any]:
     return {
         **leave(out, "figure_5_4", figure, rows),
         "all reach the goal": bool(all(row["success"] for row in rows)),
-        "worst commanded violation": max(row["worst_commanded_violation"] for row in rows),
+        "worst commanded violation": max(row["max_commanded_violation"] for row in rows),
         "steps until half recovered, where demonstrations differ": str(half[0.20]),
         "steps until half recovered, in the passage": str(half[0.54]),
         "condition": "the history is the measured pose (P = 1), the action zero",
@@ -191,10 +193,10 @@ def _recovery(
         "steps_to_half": steps_until(0.5),
         "steps_to_a_tenth": steps_until(0.1),
         "largest_command_step": float(np.abs(np.diff(commanded[step:length, 0])).max()),
-        "worst_commanded_violation": float((commanded[:, 0] - PassageGeometry().zone_x).max()),
+        "max_commanded_violation": float((commanded[:, 0] - PassageGeometry().zone_x).max()),
         "steps_measured_in_the_zone": int((path[step:, 0] > PassageGeometry().zone_x + 1e-6).sum()),
         "collisions": row["collisions"],
-        "fallbacks": row["fallbacks"],
+        "fallback_steps": row["fallback_steps"],
         "success": row["success"],
     }
 
@@ -209,11 +211,13 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
     """
     figure, (axes,) = new_figure(1, 3, (14, 5.4))
     rows: list[dict[str, Any]] = []
-    for hold in HOLDS:
-        rough = _smoothness("kgrl", SHOWN, hold, _wander("kgrl", SHOWN, hold, range(seeds), episodes))
+    for action_repeat in HOLDS:
+        rough = _smoothness("kgrl", SHOWN, action_repeat, _wander("kgrl", SHOWN, action_repeat, range(seeds), episodes))
         rows.append(rough | {"times_below_kgrl_commanded": 1.0, "times_below_kgrl_measured": 1.0})
         for variance in VARIANCES:
-            row = _smoothness("skgrl", variance, hold, _wander("skgrl", variance, hold, range(seeds), episodes))
+            row = _smoothness(
+                "skgrl", variance, action_repeat, _wander("skgrl", variance, action_repeat, range(seeds), episodes)
+            )
             for column in ("commanded", "measured"):
                 row[f"times_below_kgrl_{column}"] = rough[f"jerk_{column}"] / row[f"jerk_{column}"]
             rows.append(row)
@@ -222,14 +226,14 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
         for row in _wander(kind, SHOWN, HOLDS[0], range(1), count):
             axis.plot(*row["commanded"].T, linewidth=1, color=colour(kind) if count == 1 else None)
         axis.set_title(f"{label(kind)}, {words}")
-    for hold, shade in zip(HOLDS, ("tab:blue", "tab:orange"), strict=True):
+    for action_repeat, shade in zip(HOLDS, ("tab:blue", "tab:orange"), strict=True):
         for column, style in (("commanded", "o-"), ("measured", "x--")):
             times = [
                 row[f"times_below_kgrl_{column}"]
                 for row in rows
-                if row["hold"] == hold and row["method"] != label("kgrl")
+                if row["action_repeat"] == action_repeat and row["method"] != label("kgrl")
             ]
-            words = f"{column}, an action lasts {hold} control step{'s' if hold > 1 else ''}"
+            words = f"{column}, an action lasts {action_repeat} control step{'s' if action_repeat > 1 else ''}"
             axes[2].loglog(VARIANCES, times, style, color=shade, label=words)
     axes[2].axhline(1.0, color="0.6", linewidth=0.8)
     axes[2].set(xlabel="history variance ρ [m²]", ylabel="KGRL's mean jerk / sKGRL's, at the same exploration RMS")
@@ -237,7 +241,7 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
     return {
         **leave(out, "figure_5_5", figure, rows),
         **{
-            f"jerk below KGRL's at ρ = {row['history_variance']:.0e}, action held {row['hold']}": (
+            f"jerk below KGRL's at ρ = {row['history_variance']:.0e}, action held {row['action_repeat']}": (
                 f"{row['times_below_kgrl_commanded']:.0f} times commanded, "
                 f"{row['times_below_kgrl_measured']:.0f} times measured"
             )
@@ -248,29 +252,31 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
     }
 
 
-def _wander(kind: str, variance: float, hold: int, seeds: Sequence[int], episodes: int) -> list[dict[str, Any]]:
+def _wander(
+    kind: str, variance: float, action_repeat: int, seeds: Sequence[int], episodes: int
+) -> list[dict[str, Any]]:
     """Episodes of random actions in the simulated plane, gains calibrated to an RMS of one standard deviation."""
-    gains = tuple(rms_gains(primitive_of(kind, variance), hold=hold).tolist())
-    arguments = {"guidance": kind, "hold": hold, "history_variance": variance, "gains": gains}
+    gains = tuple(rms_gains(primitive_of(kind, variance), action_repeat=action_repeat).tolist())
+    arguments = {"guidance": kind, "action_repeat": action_repeat, "history_variance": variance, "gains": gains}
     env = make_environment(TASK, arguments)
-    explored = [row for seed in seeds for row in random_episodes(env, seed, episodes)]
+    action_dims = [row for seed in seeds for row in random_episodes(env, seed, episodes)]
     env.close()
-    return explored
+    return action_dims
 
 
-def _smoothness(kind: str, variance: float, hold: int, explored: list[dict[str, Any]]) -> dict[str, Any]:
-    primitive, rows = primitive_of(kind, variance), pd.DataFrame(explored)
+def _smoothness(kind: str, variance: float, action_repeat: int, action_dims: list[dict[str, Any]]) -> dict[str, Any]:
+    primitive, rows = primitive_of(kind, variance), pd.DataFrame(action_dims)
     quiet = _quiet(primitive)
     deviation = np.sqrt((primitive.reference.standard_deviations**2).mean(0))
     moved = [((path - quiet[: len(path)]) / deviation) ** 2 for path in rows["commanded"]]
     return {
         "method": label(kind),
-        "hold": hold,
+        "action_repeat": action_repeat,
         "history_variance": variance if kind == "skgrl" else None,
         "rms_in_deviations": float(np.sqrt(np.mean(np.concatenate(moved)))),
         "jerk_commanded": float(np.mean(rows["jerk_commanded_linear"])),
         "jerk_measured": float(np.mean(rows["jerk_measured_linear"])),
-        **summary(rows, ("episodes", "success_rate", "collisions", "worst_violation")),
+        **summary(rows, ("episodes", "success_rate", "collisions", "max_commanded_violation")),
     }
 
 
@@ -281,7 +287,10 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
     at every decision, as sKGRL then depends on the seed.
     """
     groups = {}
-    for words, preset in (("first ten episodes constant", "steady"), ("exploring anew at every decision", "quick")):
+    for words, preset in (
+        ("first ten episodes constant", "tqc_cheap_correlated"),
+        ("exploring anew at every decision", "tqc_fast"),
+    ):
         study = figure_study(
             "narrow_passage",
             seeds=seeds,
@@ -321,14 +330,14 @@ def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
     found = run_study(
         figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], judged=False), out
     )
-    learned = Shown.of_run(Path(found["folder"].iloc[0]))
-    unlearned = replace(learned, policy=partial(NullPolicy, white), acting="before learning")
+    learned = EpisodeSpec.of_run(Path(found["folder"].iloc[0]))
+    unlearned = replace(learned, policy=partial(BaselinePolicy, white), acting="before learning")
     figure, axes = new_figure(2, 4, (13, 6.2))
     rows = []
     for shown, panels, letter in ((unlearned, axes[0], "A"), (learned, axes[1], "B")):
         row, frames = watch(_first(shown, success=shown is learned), len(panels))
         draw_frames(panels, frames, letter)
-        kept = ("success", "termination", "steps", "peak_force", "worst_violation")
+        kept = ("success", "termination", "steps", "peak_force", "max_commanded_violation")
         rows.append({"episode": shown.acting} | {key: row[key] for key in kept})
     return {
         **leave(out, "figure_5_7", figure, rows),
@@ -337,7 +346,7 @@ def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
     }
 
 
-def _first(shown: Shown, *, success: bool) -> Shown:
+def _first(shown: EpisodeSpec, *, success: bool) -> EpisodeSpec:
     """The first held-out episode that ends as is meant: white actions find the hole now and then. Nothing is drawn."""
     env = make_environment(shown.task, shown.environment)
     env.reset(seed=shown.run_seed)
@@ -356,7 +365,7 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
     figure, axes = new_figure(2, 2, (11, 6.4))
     rows: list[dict[str, Any]] = []
     for index, kind in enumerate(METHODS):
-        environment = {"guidance": kind, "uncertainty": "calibration", "reward": "shaped"}
+        environment = {"guidance": kind, "fixture_offset": "per_run", "reward": "shaped"}
         env: Any = make_environment("BncConnector", environment)
         for seed in range(seeds):
             env.reset(seed=seed)

@@ -42,7 +42,7 @@ def figure_study(
     if episodes is not None:
         known = {m: one.model_copy(update={"learner": LearnerChoice()}) for m, one in known.items()}
         changed["learner"] = changed.get("learner", study.learner).model_copy(update={"episodes": episodes})
-    changed |= {} if judged else {"judged_on": ()}
+    changed |= {} if judged else {"eval_set": ()}
     return study.model_copy(update={"methods": known, "seeds": tuple(range(first, first + seeds)), **changed})
 
 

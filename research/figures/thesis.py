@@ -37,21 +37,21 @@ THESIS = {
 # Hyperparameters by the preset that holds them; `discount` is of a decision, which lasts one control step there.
 TABLE_3_2 = {
     "table_3_2_iiwa": {
-        "learning_rate": 8e-4, "buffer_size": 1_000_000, "discount": 0.95, "soft_update": 0.02, "train_every": 8,
+        "learning_rate": 8e-4, "buffer_size": 1_000_000, "gamma": 0.95, "tau": 0.02, "train_freq": 8,
         "gradient_steps": 8, "learning_starts": 1000, "batch_size": 256,
     },
     "table_3_2_sara": {
-        "learning_rate": 1e-3, "buffer_size": 1_000_000, "discount": 0.98, "soft_update": 0.02, "train_every": 8,
+        "learning_rate": 1e-3, "buffer_size": 1_000_000, "gamma": 0.98, "tau": 0.02, "train_freq": 8,
         "gradient_steps": 8, "learning_starts": 1000, "batch_size": 256,
     },
 }  # fmt: skip
 TABLE_4_1 = {
     "table_4_1_simulation": {
-        "learning_rate": 1e-3, "soft_update": 0.02, "discount": 0.99, "train_every": 8, "gradient_steps": 8,
-        "entropy": "auto", "units": (256, 256),
+        "learning_rate": 1e-3, "tau": 0.02, "gamma": 0.99, "train_freq": 8, "gradient_steps": 8,
+        "ent_coef": "auto", "net_arch": (256, 256),
     },
     "table_4_1_robot": {
-        "learning_rate": 1e-3, "soft_update": 0.01, "discount": 0.995, "train_every": 8, "gradient_steps": 8,
-        "entropy": "auto_0.1", "units": (256, 256),
+        "learning_rate": 1e-3, "tau": 0.01, "gamma": 0.995, "train_freq": 8, "gradient_steps": 8,
+        "ent_coef": "auto_0.1", "net_arch": (256, 256),
     },
 }  # fmt: skip

@@ -8,7 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, DependencyTicket, Le
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
-from guiderail.models.templates.template import Skill
+from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.caching import declare_cache
 
 
@@ -19,7 +19,7 @@ class SkillFrames:
     that all guidance has, and a reset moves an object by `set`.
     """
 
-    def __init__(self, system: LeafSystem, skill: Skill, frames: Mapping[str, RigidTransform]):
+    def __init__(self, system: LeafSystem, skill: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
         """
         Args:
             system: the system that has the parameters; its outputs depend on `ticket`.

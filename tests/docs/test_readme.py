@@ -37,8 +37,8 @@ def test_every_study_and_method_that_it_asks_for_is_shipped(maker):
     for row in (row for task in maker.TASKS.values() for row in task):
         study = load_study(row.study)
         assert row.method in study.methods, f"{row.study} has no {row.method}"
-        assert row.judged is None or row.judged in [one.name for one in study.judged_on]
-        assert row.judged is not None or len(study.judged_on) < 2, f"{row.study} judges on several kinds of episodes"
+        assert row.judged is None or row.judged in [one.name for one in study.eval_set]
+        assert row.judged is not None or len(study.eval_set) < 2, f"{row.study} judges on several kinds of episodes"
 
 
 def test_a_study_that_is_not_there_is_left_out(maker, tmp_path):
@@ -50,8 +50,8 @@ def test_a_study_that_is_not_there_is_left_out(maker, tmp_path):
 
 
 HEAD = (
-    "method,seed,mark,judged_on,episodes,success_rate,success_low,success_high,worst_violation,violating_episodes,"
-    "peak_force,training_episodes,training_success_rate,training_converged_after,training_worst_violation,"
+    "method,seed,mark,eval_set,episodes,success_rate,success_low,success_high,max_commanded_violation,violating_episodes,"
+    "peak_force,training_episodes,training_success_rate,training_episodes_to_convergence,training_max_commanded_violation,"
     "training_violating_episodes,training_peak_force\n"
 )
 
@@ -76,8 +76,8 @@ def test_each_seed_is_told_after_its_last_episode_with_the_worst_that_it_did(mak
 
 def test_what_was_never_judged_is_said_to_be_of_training(maker, tmp_path):
     (tmp_path / "narrow_passage.csv").write_text(
-        "method,seed,mark,judged_on,training_episodes,training_success_rate,training_converged_after,"
-        "training_worst_violation,training_violating_episodes,training_peak_force\n"
+        "method,seed,mark,eval_set,training_episodes,training_success_rate,training_episodes_to_convergence,"
+        "training_max_commanded_violation,training_violating_episodes,training_peak_force\n"
         "kgrl,0,60,,60,1.0,0,-0.01,0,0.0\nkgrl,1,60,,60,0.5,3,1e-12,0,0.0\nkgrl,2,60,,60,0.25,,0,0,3.0\n"
     )
     (row,) = rows(maker.table(tmp_path))

@@ -7,7 +7,7 @@ from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, p
 STEPS, SIZE = 400, 2
 MADE = {
     "white": (white, {}),
-    "repeat": (white, {"hold": 7}),
+    "repeat": (white, {"action_repeat": 7}),
     "pink": (pink, {}),
     "ou": (ornstein_uhlenbeck, {}),
     "low_pass": (low_pass, {"cutoff": 1.0}),

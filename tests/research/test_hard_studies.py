@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_ERROR
-from guiderail.diagrams.tasks.pouring.scripted import aiming_person, blind_person
+from guiderail.diagrams.tasks.pouring.scripted import scripted_pour_aimed, scripted_pour_blind
 from guiderail.diagrams.tasks.pouring.task import POSITION_SCALE
 from guiderail.tools.experiments.declaration import LEARNED, load_study
 from guiderail.tools.experiments.study import Job
@@ -25,7 +25,7 @@ def test_every_method_can_be_made(name, tmp_path):
     study = load_study(name)
     for method in study.methods:
         job = Job(study, method, study.seeds[0], tmp_path)
-        assert job.config(job.marks[-1]).environment["difficulty"] == "hard"
+        assert job.config(job.after_episodes[-1]).environment["difficulty"] == "hard"
 
 
 @pytest.mark.parametrize("name", LEARNED_BY)
@@ -38,7 +38,7 @@ def test_a_sweep_judges_what_another_study_learned(name, tmp_path):
             ours, theirs = (Job(study, method, seed, tmp_path) for study in (sweep, learned))
             assert seed in learned.seeds
             assert ours.folder.path == theirs.folder.path
-            assert ours.config(ours.marks[-1]) == theirs.config(theirs.marks[-1])
+            assert ours.config(ours.after_episodes[-1]) == theirs.config(theirs.after_episodes[-1])
 
 
 @pytest.mark.parametrize("name", SWEEPS)
@@ -54,13 +54,13 @@ def seen(tip, error=(0.0, 0.0), state=1.0, tilt=0.0):
 
 
 def test_who_looks_aims_before_it_pours():
-    np.testing.assert_array_equal(aiming_person(seen((0.05, -0.2, 0.06)))[[0, 2]], [-1.0, 0.0])
-    assert aiming_person(seen((0.0, -0.045, 0.06)))[2] == 1.0
-    assert aiming_person(seen((0.05, -0.2, 0.06), tilt=np.deg2rad(100)))[2] == 1.0  # no way back: the balls roll
+    np.testing.assert_array_equal(scripted_pour_aimed(seen((0.05, -0.2, 0.06)))[[0, 2]], [-1.0, 0.0])
+    assert scripted_pour_aimed(seen((0.0, -0.045, 0.06)))[2] == 1.0
+    assert scripted_pour_aimed(seen((0.05, -0.2, 0.06), tilt=np.deg2rad(100)))[2] == 1.0  # no way back: the balls roll
 
 
 def test_who_does_not_look_acts_as_if_the_mug_were_where_it_is_believed():
     """However far the two are apart, the same in the frame of where the mug is believed to be."""
     for state in (-1.0, 0.0, 1.0):
-        there = blind_person(seen((0.01 + 0.04, -0.1 - 0.02, 0.06), (0.04, -0.02), state))
-        np.testing.assert_allclose(there, aiming_person(seen((0.01, -0.1, 0.06), state=state)), atol=1e-9)
+        there = scripted_pour_blind(seen((0.01 + 0.04, -0.1 - 0.02, 0.06), (0.04, -0.02), state))
+        np.testing.assert_allclose(there, scripted_pour_aimed(seen((0.01, -0.1, 0.06), state=state)), atol=1e-9)

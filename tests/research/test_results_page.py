@@ -13,13 +13,13 @@ from research.results_page import FIGURES, OF_SMOOTHNESS, write_results
 def finished(tmp_path):
     rows = [
         {
-            "method": "skgrl", "mark": 40, "judged_on": "rails", "seed": seed, "success_rate": rate,
-            "training_episodes": 40, "training_converged_after": after, "training_worst_violation": -1e-4,
+            "method": "skgrl", "after_episodes": 40, "eval_set": "gantry", "seed": seed, "success_rate": rate,
+            "training_episodes": 40, "training_episodes_to_convergence": after, "training_max_commanded_violation": -1e-4,
             "training_collisions": 1, "training_wall_time": 1800.0,
         }
         for seed, rate, after in ((30, 1.0, 12), (31, 0.97, None))
     ]  # fmt: skip
-    rows.append({"method": "nothing", "mark": 0, "judged_on": "rails", "seed": 0, "success_rate": 0.14})
+    rows.append({"method": "nothing", "after_episodes": 0, "eval_set": "gantry", "seed": 0, "success_rate": 0.14})
     write_table(tmp_path / "study" / "connector", pd.DataFrame(rows))
     return tmp_path / "study"
 
@@ -37,18 +37,18 @@ def test_every_seed_stands_beside_the_thesis_with_what_differs(finished, tmp_pat
 
 def test_a_study_that_judges_nothing_has_its_rows_too(finished, tmp_path):
     table = read_table(finished / "connector.csv").iloc[:2].drop(columns="success_rate")
-    write_table(tmp_path / "unjudged" / "connector", table.assign(judged_on=""))
+    write_table(tmp_path / "unjudged" / "connector", table.assign(eval_set=""))
     page = write_results([tmp_path / "unjudged"], tmp_path / "results").read_text()
     assert "| skgrl | 40 | – | – | 12, never | within | 2 | 1.00 |" in page
 
 
 def test_a_sweep_has_a_picture_and_says_where_each_method_breaks(tmp_path):
-    rates = {"rl_sct": (1.0, 1.0, 0.95, 0.85, 0.6, 0.0), "white": (0.05,) * 6}
+    rates = {"rl_sct": (1.0, 1.0, 0.95, 0.85, 0.6, 0.0), "uniform_random": (0.05,) * 6}
     rows = [
-        {"method": method, "mark": 100 * learned, "judged_on": one.name, "seed": 110, "episodes": 40,
-         "success_rate": rate, "training_episodes": 100 if learned else None, "training_converged_after": None,
-         "training_worst_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0}
-        for method, learned in (("rl_sct", True), ("white", False))
+        {"method": method, "after_episodes": 100 * learned, "eval_set": one.name, "seed": 110, "episodes": 40,
+         "success_rate": rate, "training_episodes": 100 if learned else None, "training_episodes_to_convergence": None,
+         "training_max_commanded_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0}
+        for method, learned in (("rl_sct", True), ("uniform_random", False))
         for one, rate in zip(load_study("pouring_sweep").judgements, rates[method], strict=True)
     ]  # fmt: skip
     write_table(tmp_path / "study" / "pouring_sweep", pd.DataFrame(rows))

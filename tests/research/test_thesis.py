@@ -30,30 +30,32 @@ def test_all_tasks_of_ours_are_in_the_thesis_and_others_are_said_not_to_be(bead_
 
 
 AS_PRINTED = {
-    "guidance": "skgrl", "reward": "sparse", "hold": 1, "explored": None, "history_variance": 1e-8,
-    "history_source": "measured", "uncertainty": "calibration", "station": "arm",
+    "guidance": "skgrl", "reward": "sparse", "action_repeat": 1, "action_dims": None, "history_variance": 1e-8,
+    "history_source": "measured", "fixture_offset": "per_run", "station": "arm",
 }  # fmt: skip
 
 
 def test_the_connector_as_the_thesis_has_it_differs_only_in_what_cannot_be_had():
     words = told("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
     assert all("thesis: " in one for one in words)
-    assert not any(one.startswith(("control steps", "ρ", "learning rate", "discount", "station")) for one in words)
+    assert not any(one.startswith(("control steps", "ρ", "learning rate", "gamma", "station")) for one in words)
     assert any(one.startswith("simulated") for one in words)
-    holding = [holds(configure("BncConnector", AS_PRINTED).environment) for _, holds in THESIS["BncConnector"].remarks]
-    assert len(words) == sum(holding)
+    command_timed_out = [
+        holds(configure("BncConnector", AS_PRINTED).environment) for _, holds in THESIS["BncConnector"].remarks
+    ]
+    assert len(words) == sum(command_timed_out)
 
 
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
         ({"reward": "shaped"}, "reward shaped (thesis: sparse)"),
-        ({"hold": 10}, "control steps of a decision 10 (thesis: 1)"),
-        ({"explored": (0, 1)}, "explored outputs 0, 1 (thesis: all)"),
+        ({"action_repeat": 10}, "control steps of a decision 10 (thesis: 1)"),
+        ({"action_dims": (0, 1)}, "explored outputs 0, 1 (thesis: all)"),
         ({"history_variance": 1e-11}, "ρ = 1e-11 (thesis: 1e-08)"),
         ({"history_source": "commanded"}, "history of poses that were commanded (thesis: measured)"),
-        ({"uncertainty": "disc"}, "uncertainty disc (thesis: calibration)"),
-        ({"station": "rails"}, "station rails (thesis: arm)"),
+        ({"fixture_offset": "per_episode"}, "uncertainty disc (thesis: calibration)"),
+        ({"station": "gantry"}, "station rails (thesis: arm)"),
     ],
 )
 def test_each_option_that_differs_is_named_with_both_values(changed, words):
@@ -63,7 +65,7 @@ def test_each_option_that_differs_is_named_with_both_values(changed, words):
 
 
 OTHER_VALUES = {
-    "offset_range": (0.0, 0.001), "start_height": (0.02, 0.03), "explored": (0,), "gains": (1.0, 1.0),
+    "offset_range": (0.0, 0.001), "start_height": (0.02, 0.03), "action_dims": (0,), "gains": (1.0, 1.0),
     "via_points": (10, 0.3, 0.3), "balls_in": 1, "balls": 3, "active_constraints": False, "input_speed": 1.5,
     "time_step": 0.005, "control_period": 0.004, "robot": "other.urdf", "end_effector": "other", "lcm_url": "udpm://",
     "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
@@ -80,7 +82,7 @@ def _another(task, name, field, default):
     usual = theirs if default in theirs else (default,)
     words = {"reward": TASKS.get(task).rewards, "observation": TASKS.get(task).observations, "difficulty": ("hard",)}
     words["history_source"], words["impedance_control"] = ("commanded", "measured"), ("joint", "cartesian")
-    words["uncertainty"], words["solver"] = ("calibration", "disc", "known"), ("daqp", "osqp")
+    words["fixture_offset"], words["solver"] = ("per_run", "per_episode", "none"), ("daqp", "osqp")
     if isinstance(default, bool):
         values = (True, False)
     elif name in words:
@@ -100,8 +102,8 @@ def _options():
     """Every option of every task, once for each guidance, at the station that it is used at first."""
     for task in THESIS:
         declared = TASKS.get(task)
-        for guidance in possible_guidance(declared.knows()):
-            for station in stations_for(declared.world_kind):
+        for guidance in possible_guidance(declared.provides()):
+            for station in stations_for(declared.workcell_kind):
                 for model in option_models(declared, guidance, station).values():
                     for name, field in model.model_fields.items():
                         yield task, guidance, station, name, field
@@ -155,11 +157,11 @@ def test_kgrl_has_no_history_to_differ_in():
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ({"greedy_share": 0.8}, "80% of the episodes are greedy"),
+        ({"greedy_episode_fraction": 0.8}, "80% of the episodes are greedy"),
         ({"symmetry": True}, "seen from other sides"),
         ({"selection_window": 8}, "checkpoint selection"),
         ({"learning_rate": 3e-4}, "learning rate 0.0003 (thesis: 0.001)"),
-        ({"discount": 0.99}, "discount of a control step 0.99 (thesis: 0.995)"),
+        ({"gamma": 0.99}, "discount of a control step 0.99 (thesis: 0.995)"),
         ({"n_steps": 3}, "returns are of 3 decisions"),
     ],
 )
@@ -174,13 +176,13 @@ def test_each_setting_of_the_learner_that_differs_is_named(setting, words):
     ("task", "guidance", "sides"), [("BncConnector", "kgrl", 1), ("NarrowPassage", "kgrl", 0), ("GridClamp", "sct", 0)]
 )
 def test_other_sides_are_named_where_there_are_any(task, guidance, sides):
-    words = told(task, {"guidance": guidance}, algorithm="tqc", preset="robust")
+    words = told(task, {"guidance": guidance}, algorithm="tqc", preset="tqc_contact")
     assert sum("seen from other sides" in one for one in words) == sides
 
 
 def test_a_discount_means_the_same_whatever_an_action_lasts():
-    words = told("BncConnector", {**AS_PRINTED, "hold": 10}, algorithm="tqc", preset="table_4_1_robot")
-    assert not any("discount" in one for one in words)
+    words = told("BncConnector", {**AS_PRINTED, "action_repeat": 10}, algorithm="tqc", preset="table_4_1_robot")
+    assert not any("gamma" in one for one in words)
 
 
 def test_pouring_names_its_weights_and_its_speed():
@@ -198,7 +200,7 @@ def test_the_connectors_dimensions_are_the_runs_own():
 
 
 def test_who_does_not_learn_differs_in_no_setting_of_a_learner():
-    config = configure("Pouring", {"difficulty": "hard"}, algorithm="tqc", preset="robust")
+    config = configure("Pouring", {"difficulty": "hard"}, algorithm="tqc", preset="tqc_contact")
     without = differences(config, learns=False)
     assert set(without) < set(differences(config))
     assert not any("learning rate" in one or "hidden units" in one for one in without)

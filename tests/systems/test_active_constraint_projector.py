@@ -7,7 +7,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform
-from guiderail.models.templates import parse_skill
+from guiderail.models.templates import parse_template
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
 
 PERIOD = 2.0**-7
@@ -20,7 +20,7 @@ states:
   above:
     input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5}]
 """
-SKILL = parse_skill(
+SKILL = parse_template(
     "name: slab"
     + ABOVE
     + """    active_constraints:
@@ -147,7 +147,7 @@ def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
 
 
 # The second state's floor is a little above where the first one's transition happens, but within reach of a period.
-RAISED = parse_skill(
+RAISED = parse_template(
     "name: step"
     + ABOVE
     + """    active_constraints: [{kind: keep_above, frame: slab, height_m: 0.1}]

@@ -212,13 +212,13 @@ def test_a_mass_dropped_on_it_is_caught_within_limits():
 def test_when_commands_stop_the_last_sound_pose_is_held():
     arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
-    holding = arm.controller.get_holding_output_port()
+    command_timed_out = arm.controller.get_holding_output_port()
     safe = start + [0.01, 0, 0, 0, 0, 0]
     arm.command(safe, time=0.0)
     arm.advance(0.05)
-    assert holding.Eval(arm.controller_context)[0] == 0.0
+    assert command_timed_out.Eval(arm.controller_context)[0] == 0.0
     arm.advance(0.2)
-    assert holding.Eval(arm.controller_context)[0] == 1.0
+    assert command_timed_out.Eval(arm.controller_context)[0] == 1.0
     arm.command(start + [0.5, 0.5, 0, 0, 0, 0], time=0.0)  # an old message with a far target
     arm.advance(2.0)
     np.testing.assert_allclose(arm.pose(), safe, atol=5e-4)
@@ -262,8 +262,10 @@ def test_damping_gives_every_mode_its_ratio():
     A, B = rng.standard_normal((2, 6, 6))
     K, Lambda = A @ A.T + np.eye(6), B @ B.T + np.eye(6)
     D = damping_matrix(K, np.linalg.inv(Lambda), 0.7)
-    companion = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.linalg.solve(Lambda, K), -np.linalg.solve(Lambda, D)]])
-    poles = np.linalg.eigvals(companion)
+    subprocess_tied_to_parent = np.block(
+        [[np.zeros((6, 6)), np.eye(6)], [-np.linalg.solve(Lambda, K), -np.linalg.solve(Lambda, D)]]
+    )
+    poles = np.linalg.eigvals(subprocess_tied_to_parent)
     np.testing.assert_allclose(-poles.real / np.abs(poles), 0.7, atol=1e-6)
 
 
@@ -306,7 +308,7 @@ def test_ports_and_feedthrough():
         "pose",
         "impedance_wrench",
         "saturation",
-        "holding",
+        "command_timed_out",
     ]
     desired, pose = system.get_desired_pose_input_port(), system.get_pose_output_port()
     assert not system.HasDirectFeedthrough(desired.get_index(), pose.get_index())

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.stations.arm import KnownArm, controller_model
+from guiderail.diagrams.stations.arm import ArmControllerPlant, controller_model
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
@@ -61,7 +61,7 @@ class Commanded:
         return self.system.get_stuck_output_port().Eval(self.context)[0]
 
     @property
-    def holding(self):
+    def command_timed_out(self):
         return self.system.get_holding_output_port().Eval(self.context)[0]
 
 
@@ -178,20 +178,20 @@ def test_holds_its_joint_command_while_the_desired_pose_is_not_finite(arm):
     commanded.command(np.full(6, np.nan))
     commanded.advance(0.1)
     np.testing.assert_array_equal(commanded.joints, commanded.q_start)
-    assert commanded.holding == 1.0
+    assert commanded.command_timed_out == 1.0
     commanded.command(GOAL)
     commanded.advance(0.1)
     assert (commanded.joints != commanded.q_start).any()
-    assert commanded.holding == 0.0
+    assert commanded.command_timed_out == 0.0
 
 
 def test_holds_its_joint_command_when_commands_stop(arm):
     commanded = Commanded(arm, timeout=0.1)
     commanded.command(GOAL, time=0.0)
     commanded.advance(0.095)
-    assert commanded.holding == 0.0
+    assert commanded.command_timed_out == 0.0
     commanded.advance(0.02)
-    assert commanded.holding == 1.0
+    assert commanded.command_timed_out == 1.0
     stopped = commanded.joints
     commanded.advance(0.5)
     np.testing.assert_array_equal(commanded.joints, stopped)
@@ -199,10 +199,10 @@ def test_holds_its_joint_command_when_commands_stop(arm):
     # A fresh command counts at the next period, and an old one doesn't count again.
     commanded.command(GOAL, time=commanded.context.get_time())
     commanded.advance(0.01)
-    assert commanded.holding == 0.0
+    assert commanded.command_timed_out == 0.0
     commanded.command(START, time=0.0)
     commanded.advance(0.01)
-    assert commanded.holding == 1.0
+    assert commanded.command_timed_out == 1.0
 
 
 @pytest.mark.parametrize("time", [0.02, 1e6, np.inf, np.nan])
@@ -211,7 +211,7 @@ def test_a_command_from_the_future_or_from_no_time_is_not_followed(arm, time):
     commanded.command(GOAL, time=time)
     commanded.advance(0.005)
     np.testing.assert_array_equal(commanded.joints, commanded.q_start)
-    assert commanded.holding == 1.0
+    assert commanded.command_timed_out == 1.0
 
 
 def test_command_times_change_nothing_while_commands_come(arm):
@@ -256,7 +256,7 @@ class SixJoints(Commanded):
     """The same of a UR5e, started in a singular posture."""
 
     def __init__(self, shift):
-        known = KnownArm(BncWorkcell(), "ur5e")
+        known = ArmControllerPlant(BncWorkcell(), "ur5e")
         self.plant, self.q_start = known.plant, SINGULAR
         self.system = CartesianPositionController(
             known.plant, known.arm.target, known.arm.tool_centre, posture=known.posture

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.center_of_pressure import ContactLever
+from guiderail.systems.center_of_pressure import CenterOfPressure
 
 
 def lever(wrench, least_force=0.5):
-    system = ContactLever(least_force)
+    system = CenterOfPressure(least_force)
     context = system.CreateDefaultContext()
     system.get_wrench_input_port().FixValue(context, wrench)
-    return system.get_lever_output_port().Eval(context)
+    return system.get_center_of_pressure_output_port().Eval(context)
 
 
 @pytest.mark.parametrize("force", [0.5, 2.0, 30.0])
@@ -27,4 +27,4 @@ def test_is_zero_where_next_to_nothing_pushes(force):
 @pytest.mark.parametrize("least_force", [0.0, -1.0, np.nan])
 def test_refuses_what_is_no_least_force(least_force):
     with pytest.raises(InputError):
-        ContactLever(least_force)
+        CenterOfPressure(least_force)

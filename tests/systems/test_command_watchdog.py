@@ -11,7 +11,7 @@ PERIOD, TIMEOUT = 2.0**-6, 2.0**-3
 START, FIRST, SECOND = np.zeros(6), np.full(6, 1.0), np.full(6, 2.0)
 
 
-class Watched:
+class SupervisedTraining:
     """A watchdog whose robot is at `START`, with its inputs at hand."""
 
     def __init__(self, command, time=None, start=START):
@@ -31,118 +31,118 @@ class Watched:
     def advance(self, seconds):
         self.simulator.AdvanceTo(self.context.get_time() + seconds)
 
-    def check(self, pose, holding):
+    def check(self, pose, command_timed_out):
         np.testing.assert_array_equal(self.system.get_safe_pose_output_port().Eval(self.context), pose)
-        assert self.system.get_holding_output_port().Eval(self.context) == [holding]
+        assert self.system.get_holding_output_port().Eval(self.context) == [command_timed_out]
 
 
 def test_a_valid_command_passes_at_once():
-    watched = Watched(FIRST)
-    watched.check(FIRST, holding=0)
+    watched = SupervisedTraining(FIRST)
+    watched.check(FIRST, command_timed_out=0)
     watched.command(SECOND)
-    watched.check(SECOND, holding=0)
+    watched.check(SECOND, command_timed_out=0)
 
 
 def test_without_a_time_commands_never_get_stale():
-    watched = Watched(FIRST)
+    watched = SupervisedTraining(FIRST)
     watched.advance(100 * TIMEOUT)
-    watched.check(FIRST, holding=0)
+    watched.check(FIRST, command_timed_out=0)
 
 
 def test_a_stale_command_gives_way_to_the_last_one_that_was_followed():
-    watched = Watched(FIRST, time=0.0)
+    watched = SupervisedTraining(FIRST, time=0.0)
     watched.advance(TIMEOUT)
-    watched.check(FIRST, holding=0)
+    watched.check(FIRST, command_timed_out=0)
     # Found at the first check at which it is stale: a period after the timeout at the latest.
     watched.advance(2.5 * PERIOD)
-    watched.check(FIRST, holding=1)
+    watched.check(FIRST, command_timed_out=1)
     watched.command(SECOND, time=0.0)  # an old message that arrives late
-    watched.check(FIRST, holding=1)
+    watched.check(FIRST, command_timed_out=1)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
 def test_a_fresh_command_after_a_stale_one_counts_at_once(phase):
-    watched = Watched(FIRST, time=0.0)
+    watched = SupervisedTraining(FIRST, time=0.0)
     watched.advance(3 * TIMEOUT + phase * PERIOD)
-    watched.check(FIRST, holding=1)
+    watched.check(FIRST, command_timed_out=1)
     watched.command(SECOND, time=watched.context.get_time())
-    watched.check(SECOND, holding=0)
+    watched.check(SECOND, command_timed_out=0)
 
 
 def test_a_command_that_arrives_late_and_gets_stale_at_once_is_what_is_held():
-    watched = Watched(FIRST, time=0.0)
+    watched = SupervisedTraining(FIRST, time=0.0)
     watched.advance(4.5 * PERIOD)
     # Still followed, and stale at the very next check.
     watched.command(SECOND, time=watched.context.get_time() - TIMEOUT - 0.25 * PERIOD)
-    watched.check(SECOND, holding=0)
+    watched.check(SECOND, command_timed_out=0)
     watched.advance(PERIOD)
-    watched.check(SECOND, holding=1)
+    watched.check(SECOND, command_timed_out=1)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
 def test_a_command_from_the_future_is_never_followed(phase):
     """It would never get stale."""
-    watched = Watched(FIRST, time=0.0)
+    watched = SupervisedTraining(FIRST, time=0.0)
     watched.advance(3 * PERIOD + phase * PERIOD)
     for ahead in (1.5 * PERIOD, 1000.0, np.inf):
         watched.command(SECOND, time=watched.context.get_time() + ahead)
-        watched.check(FIRST, holding=1)
+        watched.check(FIRST, command_timed_out=1)
     watched.advance(3 * PERIOD)
-    watched.check(FIRST, holding=1)
+    watched.check(FIRST, command_timed_out=1)
 
 
 def test_a_clock_that_is_ahead_by_less_than_a_period_is_no_reason_to_stop():
-    watched = Watched(FIRST, time=0.5 * PERIOD)
-    watched.check(FIRST, holding=0)
+    watched = SupervisedTraining(FIRST, time=0.5 * PERIOD)
+    watched.check(FIRST, command_timed_out=0)
 
 
 def test_a_time_that_is_no_number_is_no_command():
-    watched = Watched(FIRST, time=np.nan)
-    watched.check(START, holding=1)
+    watched = SupervisedTraining(FIRST, time=np.nan)
+    watched.check(START, command_timed_out=1)
 
 
 @pytest.mark.parametrize("nonsense", [np.nan, np.inf])
 def test_before_any_command_it_holds_where_the_robot_is(nonsense):
-    watched = Watched(np.full(6, nonsense))
-    watched.check(START, holding=1)
+    watched = SupervisedTraining(np.full(6, nonsense))
+    watched.check(START, command_timed_out=1)
     watched.advance(3 * PERIOD)
-    watched.check(START, holding=1)
+    watched.check(START, command_timed_out=1)
 
 
 def test_a_command_that_is_not_finite_gives_way_and_comes_back():
-    watched = Watched(FIRST)
+    watched = SupervisedTraining(FIRST)
     watched.advance(3 * PERIOD)
     watched.command(np.array([2.0, 2.0, np.nan, 2.0, 2.0, 2.0]))
-    watched.check(FIRST, holding=1)
+    watched.check(FIRST, command_timed_out=1)
     watched.command(SECOND)
-    watched.check(SECOND, holding=0)
+    watched.check(SECOND, command_timed_out=0)
 
 
 @pytest.mark.parametrize("size", [1, 2, 7])
 def test_poses_of_any_size(size):
-    watched = Watched(np.full(size, np.nan), start=np.arange(float(size)))
-    watched.check(np.arange(float(size)), holding=1)
+    watched = SupervisedTraining(np.full(size, np.nan), start=np.arange(float(size)))
+    watched.check(np.arange(float(size)), command_timed_out=1)
     watched.command(np.ones(size))
-    watched.check(np.ones(size), holding=0)
+    watched.check(np.ones(size), command_timed_out=0)
 
 
 def test_a_reset_forgets():
-    watched = Watched(FIRST, time=0.0)
+    watched = SupervisedTraining(FIRST, time=0.0)
     watched.advance(3 * TIMEOUT)
     watched.context.SetTimeStateAndParametersFrom(watched.pristine)
     watched.simulator.Initialize()
-    watched.check(FIRST, holding=0)
+    watched.check(FIRST, command_timed_out=0)
     watched.command(np.full(6, np.nan))
-    watched.check(START, holding=1)
+    watched.check(START, command_timed_out=1)
 
 
-@pytest.mark.parametrize(("age", "holding"), [(0.5 * TIMEOUT, 0), (2.0 * TIMEOUT, 1), (-2.0 * PERIOD, 1)])
-def test_started_between_two_checks_it_judges_by_the_time_of_the_start(age, holding):
-    watched, start = Watched(FIRST), 5.0 + 0.5 * PERIOD
+@pytest.mark.parametrize(("age", "command_timed_out"), [(0.5 * TIMEOUT, 0), (2.0 * TIMEOUT, 1), (-2.0 * PERIOD, 1)])
+def test_started_between_two_checks_it_judges_by_the_time_of_the_start(age, command_timed_out):
+    watched, start = SupervisedTraining(FIRST), 5.0 + 0.5 * PERIOD
     watched.context.SetTime(start)
     watched.command(FIRST, time=start - age)
     watched.simulator.Initialize()
-    watched.check(START if holding else FIRST, holding)
+    watched.check(START if command_timed_out else FIRST, command_timed_out)
 
 
 def test_between_two_checks_nothing_is_computed_anew():
@@ -155,13 +155,13 @@ def test_between_two_checks_nothing_is_computed_anew():
             super()._calc_safe_pose(context, output)
 
     builder = DiagramBuilder()
-    hold = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
+    action_repeat = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
     time_hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
     system = builder.AddSystem(Counted(PERIOD, TIMEOUT))
-    builder.Connect(hold.get_output_port(), system.get_desired_pose_input_port())
+    builder.Connect(action_repeat.get_output_port(), system.get_desired_pose_input_port())
     builder.Connect(time_hold.get_output_port(), system.get_command_time_input_port())
     for name, port in (
-        ("command", hold.get_input_port()),
+        ("command", action_repeat.get_input_port()),
         ("time", time_hold.get_input_port()),
         ("pose", system.get_pose_input_port()),
     ):

@@ -17,7 +17,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.contact_detector import ContactWatch
+from guiderail.systems.contact_detector import ContactDetector
 
 STEP = 2.0**-9
 RADIUS = 0.02
@@ -54,7 +54,7 @@ def drop(x, height=0.05, sampled=False, hydroelastic=False, duration=0.3):
     floor = RigidTransform([0, 0, -0.1])
     plant.RegisterCollisionGeometry(plant.world_body(), floor, Box(2, 2, 0.02), "floor", properties())
     plant.Finalize()
-    watch = builder.AddSystem(ContactWatch(plant, [ball], [plate], STEP))
+    watch = builder.AddSystem(ContactDetector(plant, [ball], [plate], STEP))
     builder.Connect(plant.get_contact_results_output_port(), watch.get_contact_results_input_port())
     simulator = Simulator(builder.Build())
     context = simulator.get_mutable_context()
@@ -112,6 +112,6 @@ def test_refuses_what_makes_no_sense():
     body = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(0.1, RADIUS))
     plant.Finalize()
     with pytest.raises(InputError, match="overlap"):
-        ContactWatch(plant, [body], [body], STEP)
+        ContactDetector(plant, [body], [body], STEP)
     with pytest.raises(InputError, match="period"):
-        ContactWatch(plant, [body], [plant.world_body()], 0.0)
+        ContactDetector(plant, [body], [plant.world_body()], 0.0)

@@ -2,7 +2,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, Condition, EpisodeMonitor
+from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, EpisodeMonitor, TerminationTerm
 
 PERIOD = 0.1
 BLOCKED = TERMINATIONS.index("blocked")
@@ -36,11 +36,11 @@ class Episode:
 
 
 def above(limit, **parameters):
-    return Condition("blocked", {"u": 1}, lambda u: u[0] > limit, **parameters)
+    return TerminationTerm("blocked", {"u": 1}, lambda u: u[0] > limit, **parameters)
 
 
 def test_ports():
-    system = EpisodeMonitor([above(1), Condition("success", {"v": 3}, lambda v: False)], PERIOD)
+    system = EpisodeMonitor([above(1), TerminationTerm("success", {"v": 3}, lambda v: False)], PERIOD)
     assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == ["u", "v"]
     assert system.get_signal_input_port("v").size() == 3
     assert system.GetOutputPort("termination").size() == 1
@@ -65,7 +65,7 @@ def test_counts_consecutive_steps_once_each():
 
 def test_counts_steps_since_the_last_progress():
     # Stuck where the second signal says so; progress is the first one.
-    stuck = Condition("blocked", {"u": 2}, lambda u: u[1] > 0, steps=3, progress=lambda u: u[0], min_progress=0.1)
+    stuck = TerminationTerm("blocked", {"u": 2}, lambda u: u[1] > 0, steps=3, progress=lambda u: u[0], min_progress=0.1)
     episode = Episode(stuck, size=2)
     # Neither a free step nor one that gains less than 0.1 starts the count anew; one that gains more does.
     moves = [(0, 1), (0, 1), (0.05, 0), (0.5, 1), (0.5, 1), (0.4, 0), (0.55, 1), (0.5, 1)]
@@ -73,7 +73,7 @@ def test_counts_steps_since_the_last_progress():
 
 
 def test_the_first_of_two_conditions_counts():
-    success = Condition("success", {"u": 1}, lambda u: u[0] > 1)
+    success = TerminationTerm("success", {"u": 1}, lambda u: u[0] > 1)
     assert Episode(success, above(1)).step(2) == SUCCESS
     assert Episode(above(1), success).step(2) == BLOCKED
 
@@ -83,9 +83,9 @@ def test_the_first_of_two_conditions_counts():
     [
         lambda: EpisodeMonitor([], PERIOD),
         lambda: EpisodeMonitor([above(1)], 0.0),
-        lambda: EpisodeMonitor([above(1), Condition("success", {"u": 2}, lambda u: True)], PERIOD),
-        lambda: Condition("lost", {"u": 1}, lambda u: True),
-        lambda: Condition("", {"u": 1}, lambda u: True),
+        lambda: EpisodeMonitor([above(1), TerminationTerm("success", {"u": 2}, lambda u: True)], PERIOD),
+        lambda: TerminationTerm("lost", {"u": 1}, lambda u: True),
+        lambda: TerminationTerm("", {"u": 1}, lambda u: True),
         lambda: above(1, steps=0),
     ],
 )
@@ -95,7 +95,7 @@ def test_refuses_what_makes_no_sense(make):
 
 
 def test_each_condition_counts_for_itself():
-    episode = Episode(above(5, steps=2), Condition("success", {"u": 1}, lambda u: u[0] > 1, steps=3))
+    episode = Episode(above(5, steps=2), TerminationTerm("success", {"u": 1}, lambda u: u[0] > 1, steps=3))
     assert [episode.step(u) for u in (6, 2, 6, 0)] == [0, 0, SUCCESS, SUCCESS]
 
 

@@ -23,7 +23,7 @@ from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
-from guiderail.models.templates import load_skill
+from guiderail.models.templates import load_template
 
 FOLDER = Path(guiderail.systems.__file__).parent
 TESTS = Path(__file__).parent
@@ -53,11 +53,11 @@ def primitive(history):
 def built():
     """One instance of each system, with every port that it can have."""
     plant, arm = controller_model(BncWorkcell())
-    skill, frames = load_skill("pouring"), {"mug_tip": RigidTransform()}
+    skill, frames = load_template("pouring"), {"mug_tip": RigidTransform()}
     body, other = arm.tool[0], plant.world_body()
     gains = systems.ImpedanceGains(np.eye(6), np.ones(6), np.zeros(7))
     safety = systems.SafetyLimits((1.0,) * 7, (1.0,) * 7, (1.0,) * 7, decay_time=1.0)
-    condition = systems.Condition("success", {"u": 2}, lambda u: False)
+    condition = systems.TerminationTerm("success", {"u": 2}, lambda u: False)
     term = systems.RewardTerm("cost", {"u": 2}, lambda u: 0.0)
     browser = SimpleNamespace(AddSlider=lambda *arguments: None)
     instances = [
@@ -67,13 +67,13 @@ def built():
         systems.CommandDisturbance(2, PERIOD, lost=0.5, late=1),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
-        systems.ContactLever(0.5),
-        systems.ContactWatch(plant, [body], [other], PERIOD),
-        systems.DeputyWatch(period=PERIOD, patience=1.0),
-        systems.DesiredPoseRamp(period=PERIOD),
+        systems.CenterOfPressure(0.5),
+        systems.ContactDetector(plant, [body], [other], PERIOD),
+        systems.HeartbeatMonitor(period=PERIOD, command_timeout=1.0),
+        systems.PoseRateLimiter(period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
-        systems.GuidanceLaw(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
+        systems.FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ImpedanceMonitor(np.ones(6)),
@@ -95,7 +95,7 @@ def built():
         systems.SctStateMachine(skill, frames, PERIOD),
         systems.SensorDisturbance(PERIOD, np.ones(2), delay=1),
         systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
-        systems.TorqueGuard(plant, safety, period=PERIOD),
+        systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),
         systems.TorquePublisher(DrakeLcm("memq://"), "torques", lambda time, torque: b"", 7, period=PERIOD),
         systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_centre, RotationMatrix(), PERIOD, 0.0),
     ]

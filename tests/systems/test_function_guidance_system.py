@@ -5,7 +5,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.function_guidance_system import GuidanceLaw
+from guiderail.systems.function_guidance_system import FunctionGuidanceSystem
 
 PERIOD = 0.25
 
@@ -13,7 +13,7 @@ PERIOD = 0.25
 def running(law, action=(0.5,), pose=(1.0, 2.0), wrench=(3.0,)):
     """The system in a simulation, its constants, and a function that sets one of them."""
     builder = DiagramBuilder()
-    system = builder.AddSystem(GuidanceLaw(law, len(action), len(pose), len(wrench), PERIOD))
+    system = builder.AddSystem(FunctionGuidanceSystem(law, len(action), len(pose), len(wrench), PERIOD))
     sources = {}
     for name, value in (("action", action), ("pose", pose), ("wrench", wrench)):
         sources[name] = builder.AddSystem(ConstantVectorSource(value))
@@ -74,12 +74,12 @@ def test_the_law_cannot_change_what_others_read():
 
 
 def test_nothing_feeds_through():
-    assert not GuidanceLaw(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD).HasAnyDirectFeedthrough()
+    assert not FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD).HasAnyDirectFeedthrough()
 
 
 @pytest.mark.parametrize("sizes", [(0, 1, 1), (1, 0, 1), (1, 1, 0)])
 def test_refuses_what_makes_no_sense(sizes):
     with pytest.raises(InputError, match="sizes of at least 1"):
-        GuidanceLaw(lambda action, pose, wrench: pose, *sizes, PERIOD)
+        FunctionGuidanceSystem(lambda action, pose, wrench: pose, *sizes, PERIOD)
     with pytest.raises(InputError, match="period"):
-        GuidanceLaw(lambda action, pose, wrench: pose, 1, 1, 1, 0.0)
+        FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 1, 1, 0.0)

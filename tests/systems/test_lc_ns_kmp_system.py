@@ -29,7 +29,7 @@ def test_ports():
     assert names(system, "input") == ["null_space_action", "history"]
     assert names(system, "output") == ["output", "constraint_violation", "fallback"]
     assert system.get_history_input_port().size() == 6
-    assert system.get_output_output_port().size() == 2
+    assert system.get_command_output_port().size() == 2
     without = LcNsKmpSystem(primitive(history=0), None, PERIOD)
     assert names(without, "input") == ["null_space_action"]
     with pytest.raises(InputError, match="history"):
@@ -49,7 +49,7 @@ def test_output_is_the_law_at_the_step_the_clock_says():
     for step in (0, 7, 30):
         simulator.AdvanceTo(PERIOD * (step + 0.5))
         expected = p.predict(step, gain * [0.5, -1.0], past).output
-        np.testing.assert_array_equal(system.get_output_output_port().Eval(context), expected)
+        np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
         violation = system.get_constraint_violation_output_port().Eval(context)[0]
         assert violation == pytest.approx(expected[0] - 0.5, abs=1e-12)
 
@@ -65,7 +65,7 @@ def test_the_same_within_a_control_step_and_not_recomputed():
     simulator.Initialize()
     for k in range(1, 41):
         simulator.AdvanceTo(k * PERIOD / 4 + 1e-6)
-        system.get_output_output_port().Eval(context)
+        system.get_command_output_port().Eval(context)
         system.get_fallback_output_port().Eval(context)
     assert calls == list(range(11))
 
@@ -75,16 +75,16 @@ def loop(history):
     builder = DiagramBuilder()
     p = primitive(history)
     system = builder.AddSystem(LcNsKmpSystem(p, np.array([20.0, 20.0]), PERIOD))
-    hold = builder.AddSystem(ZeroOrderHold(PERIOD, 2))
-    builder.Connect(hold.get_output_port(), system.get_null_space_action_input_port())
-    builder.ExportInput(hold.get_input_port(), "action")
+    action_repeat = builder.AddSystem(ZeroOrderHold(PERIOD, 2))
+    builder.Connect(action_repeat.get_output_port(), system.get_null_space_action_input_port())
+    builder.ExportInput(action_repeat.get_input_port(), "action")
     if history:
         buffer = builder.AddSystem(HistoryBuffer(2, history, PERIOD))
         start = builder.AddSystem(ConstantVectorSource(p.reference.means[0]))
-        builder.Connect(system.get_output_output_port(), buffer.get_output_input_port())
+        builder.Connect(system.get_command_output_port(), buffer.get_output_input_port())
         builder.Connect(start.get_output_port(), buffer.get_initial_output_input_port())
         builder.Connect(buffer.get_history_output_port(), system.get_history_input_port())
-    builder.ExportOutput(system.get_output_output_port(), "desired_pose")
+    builder.ExportOutput(system.get_command_output_port(), "desired_pose")
     return builder.Build(), p
 
 
@@ -123,7 +123,7 @@ def test_repeats_the_last_safe_command_where_there_is_no_solution_and_says_so():
     zero = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
     builder.Connect(zero.get_output_port(), system.get_null_space_action_input_port())
     sinks = [builder.AddSystem(VectorLogSink(size, PERIOD)) for size in (2, 1)]
-    builder.Connect(system.get_output_output_port(), sinks[0].get_input_port())
+    builder.Connect(system.get_command_output_port(), sinks[0].get_input_port())
     builder.Connect(system.get_fallback_output_port(), sinks[1].get_input_port())
     diagram = builder.Build()
     simulator = Simulator(diagram)
@@ -152,7 +152,7 @@ def test_where_constraints_change_on_the_way_a_fallback_is_within_those_of_its_o
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
     for step in range(50):
         simulator.AdvanceTo(step * PERIOD + 1e-6)
-        assert system.get_output_output_port().Eval(context)[0] <= upper[step] + 1e-9
+        assert system.get_command_output_port().Eval(context)[0] <= upper[step] + 1e-9
         assert system.get_constraint_violation_output_port().Eval(context)[0] <= 1e-9
         assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
@@ -171,7 +171,7 @@ def test_where_even_the_nearest_is_not_found_the_last_command_goes_on(monkeypatc
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
     started = context.get_discrete_state(1).value().copy()
     simulator.AdvanceTo(5 * PERIOD)
-    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), started)
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), started)
     assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
 
@@ -185,7 +185,7 @@ def test_first_fallback_is_within_the_constraints():
     system = LcNsKmpSystem(p, None, PERIOD)
     context = system.CreateDefaultContext()
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
-    assert system.get_output_output_port().Eval(context)[0] <= -0.5 + 1e-9
+    assert system.get_command_output_port().Eval(context)[0] <= -0.5 + 1e-9
 
 
 def test_an_initialization_begins_at_the_first_step_with_the_first_safe_command():
@@ -204,13 +204,13 @@ def test_an_initialization_begins_at_the_first_step_with_the_first_safe_command(
     context.SetTime(0.0)
     action.GetMutableData()  # what was evaluated is not known to be the same any more
     simulator.Initialize()
-    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), p.reference.means[0])
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), p.reference.means[0])
     p.predict = predict
     action.GetMutableData()
-    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), predict(0, np.zeros(2)).output)
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(0, np.zeros(2)).output)
     context.SetTime(7 * PERIOD)
     simulator.Initialize()
-    np.testing.assert_array_equal(system.get_output_output_port().Eval(context), predict(7, np.zeros(2)).output)
+    np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(7, np.zeros(2)).output)
 
 
 @pytest.mark.parametrize("length", [2.0, 4.0, 0.0, 1.5, np.nan])
@@ -221,7 +221,7 @@ def test_refuses_the_length_of_a_history_that_no_primitive_has(length):
     system.get_history_input_port().FixValue(context, np.zeros(6))
     system.get_history_length_input_port().FixValue(context, [length])
     with pytest.raises(InputError, match="only with 1, 3"):
-        system.get_output_output_port().Eval(context)
+        system.get_command_output_port().Eval(context)
 
 
 def test_the_history_length_selects_the_primitive_which_gets_the_newest_part():
@@ -237,7 +237,7 @@ def test_the_history_length_selects_the_primitive_which_gets_the_newest_part():
     for p in (longest, short, longest):
         system.get_history_length_input_port().FixValue(context, [float(p.history)])
         expected = p.predict(0, gains[p.history] * action, past[-p.history :]).output
-        np.testing.assert_array_equal(system.get_output_output_port().Eval(context), expected)
+        np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
     with pytest.raises(InputError, match="one primitive"):
         LcNsKmpSystem(longest, None, PERIOD).get_history_length_input_port()
 

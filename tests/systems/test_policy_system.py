@@ -32,13 +32,13 @@ class Counter(LeafSystem):
 class Loop:
     """A counter that a policy observes, and the hold of the control period behind that policy."""
 
-    def __init__(self, policy, hold=1):
+    def __init__(self, policy, action_repeat=1):
         builder = DiagramBuilder()
         counter = builder.AddSystem(Counter())
-        self.system = builder.AddSystem(PolicySystem(policy, 1, 1, hold * PERIOD))
-        self.hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
+        self.system = builder.AddSystem(PolicySystem(policy, 1, 1, action_repeat * PERIOD))
+        self.action_repeat = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
         builder.Connect(counter.get_output_port(), self.system.get_observation_input_port())
-        builder.Connect(self.system.get_action_output_port(), self.hold.get_input_port())
+        builder.Connect(self.system.get_action_output_port(), self.action_repeat.get_input_port())
         self.simulator = Simulator(builder.Build())
         self.context = self.simulator.get_mutable_context()
         self.pristine = self.context.Clone()
@@ -58,7 +58,7 @@ class Loop:
             # To the middle of a step: then all events of its first instant are over.
             n = int(self.context.get_time() / PERIOD + 0.5)
             self.simulator.AdvanceTo((n + 0.5) * PERIOD)
-            held.append(self.read(self.hold))
+            held.append(self.read(self.action_repeat))
         return held
 
 
@@ -85,17 +85,17 @@ def test_one_period_later_is_what_a_discrete_update_would_give():
             discrete_state.set_value(tenth(self.observation.Eval(context)))
 
     builder = DiagramBuilder()
-    counter, late, hold = (builder.AddSystem(s) for s in (Counter(), Late(), ZeroOrderHold(PERIOD, 1)))
+    counter, late, action_repeat = (builder.AddSystem(s) for s in (Counter(), Late(), ZeroOrderHold(PERIOD, 1)))
     builder.Connect(counter.get_output_port(), late.get_input_port())
-    builder.Connect(late.get_output_port(), hold.get_input_port())
+    builder.Connect(late.get_output_port(), action_repeat.get_input_port())
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(3.5 * PERIOD)
-    assert hold.get_output_port().Eval(hold.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
+    assert action_repeat.get_output_port().Eval(action_repeat.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
 
 
 def test_an_action_lasts_until_the_next_decision():
     calls = []
-    loop = Loop(lambda observation: calls.append(observation) or tenth(observation), hold=4)
+    loop = Loop(lambda observation: calls.append(observation) or tenth(observation), action_repeat=4)
     assert loop.held(10) == [0.0] * 4 + [4 / 16] * 4 + [8 / 16] * 2
     assert [c.tolist() for c in calls] == [[0.0], [4.0], [8.0]]
 
@@ -165,24 +165,24 @@ def test_refuses_what_makes_no_sense(arguments):
         PolicySystem(tenth, *arguments)
 
 
-@pytest.mark.parametrize("hold", [1, 5])
-def test_a_simulator_does_bit_for_bit_what_the_environment_does(hold):
+@pytest.mark.parametrize("action_repeat", [1, 5])
+def test_a_simulator_does_bit_for_bit_what_the_environment_does(action_repeat):
     """The narrow passage under sKGRL, with a policy that depends on everything it observes."""
     steps = 30
 
     def policy(observation):
         return np.sin(np.array([[3.0], [-5.0]]) * observation.sum() + [[0.3], [1.1]])[:, 0]
 
-    env = make_env("NarrowPassage", guidance="skgrl", hold=hold)
+    env = make_env("NarrowPassage", guidance="skgrl", action_repeat=action_repeat)
     observation, info = env.reset(seed=7)
     while info["control_steps"] < steps:
         observation, *_, info = env.step(policy(observation))
     commanded, measured = (np.array(rows)[:steps] for rows in (env.trace.commanded, env.trace.measured))
 
-    task = make_env("NarrowPassage", guidance="skgrl", hold=hold).task
+    task = make_env("NarrowPassage", guidance="skgrl", action_repeat=action_repeat).task
     builder = DiagramBuilder()
     diagram = builder.AddSystem(task.diagram)
-    system = PolicySystem(policy, task.observation_space.shape[0], 2, hold * task.control_period)
+    system = PolicySystem(policy, task.observation_space.shape[0], 2, action_repeat * task.control_period)
     builder.AddSystem(system)
     builder.Connect(diagram.GetOutputPort("observation"), system.get_observation_input_port())
     builder.Connect(system.get_action_output_port(), diagram.GetInputPort("action"))

@@ -58,15 +58,15 @@ def test_records_every_step_once():
     assert row["steps"] == 50
     assert row["peak_force"] == forces.max()
     assert row["mean_force"] == pytest.approx(forces.mean(), rel=1e-12)
-    assert row["worst_commanded_violation"] == violations.max()
-    assert row["worst_measured_violation"] == 2 * violations.max()
+    assert row["max_commanded_violation"] == violations.max()
+    assert row["max_measured_violation"] == 2 * violations.max()
 
 
 def test_the_worst_step_counts_even_if_it_is_the_last():
     episode = Episode()
     episode.step()
     episode.step(commanded_violation=0.3)
-    assert episode.row()["worst_commanded_violation"] == 0.3
+    assert episode.row()["max_commanded_violation"] == 0.3
 
 
 def test_a_collision_lasts_as_long_as_the_contact():
@@ -81,15 +81,15 @@ def test_counts_saturation_of_any_actuator_in_any_direction_and_fallbacks():
     episode = Episode(num_actuators=2)
     for saturation, fallback in (([0, 0], 1), ([0, -3], 0), ([1, 0], 1)):
         episode.step(saturation=np.array(saturation, float), fallback=fallback)
-    assert episode.row()["saturations"] == 2
-    assert episode.row()["fallbacks"] == 2
+    assert episode.row()["saturated_steps"] == 2
+    assert episode.row()["fallback_steps"] == 2
 
 
 def test_not_a_number_does_not_hide_behind_a_maximum():
     episode = Episode()
     episode.step(measured_violation=5.0)
     episode.step(measured_violation=np.nan)
-    assert np.isnan(episode.row()["worst_measured_violation"])
+    assert np.isnan(episode.row()["max_measured_violation"])
 
 
 def test_a_reset_empties_it():
@@ -99,14 +99,14 @@ def test_a_reset_empties_it():
     episode.reset()
     episode.step()
     assert episode.row() == {
-        "worst_commanded_violation": -1.0,
-        "worst_measured_violation": -1.0,
+        "max_commanded_violation": -1.0,
+        "max_measured_violation": -1.0,
         "peak_force": 0.0,
         "mean_force": 0.0,
         "collisions": 0.0,
         "collision_steps": 0.0,
-        "saturations": 0.0,
-        "fallbacks": 0.0,
+        "saturated_steps": 0.0,
+        "fallback_steps": 0.0,
         "steps": 1.0,
     }
 

@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
-from guiderail.models.templates import load_skill
+from guiderail.models.templates import load_template
 from guiderail.systems.sct_input_mapping import SctInputMapping
 
 PERIOD = 0.01
@@ -14,7 +14,7 @@ POSE = np.array([0.1, -0.06, 0.06, 0.0, 0.0, -1.2])
 
 @pytest.fixture(scope="module")
 def skill():
-    return load_skill("pouring")
+    return load_template("pouring")
 
 
 @pytest.fixture

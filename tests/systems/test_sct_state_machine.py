@@ -5,7 +5,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import transform_to_pose
-from guiderail.models.templates import load_skill
+from guiderail.models.templates import load_template
 from guiderail.systems.sct_state_machine import SctStateMachine
 
 PERIOD = 2.0**-7
@@ -19,7 +19,7 @@ def at(distance):
 
 @pytest.fixture(scope="module")
 def skill():
-    return load_skill("pouring")
+    return load_template("pouring")
 
 
 class Rig:

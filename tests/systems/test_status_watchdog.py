@@ -14,7 +14,7 @@ LIMITS = StatusLimits(velocity=(1.0, 1.0))
 CLOCK = 1000.0  # of the robot, when this one starts
 
 
-class Watched:
+class SupervisedTraining:
     """A watchdog whose robot's joints move at 0.1 rad/s; a status comes just before each check."""
 
     def __init__(self, limits=LIMITS):
@@ -57,7 +57,7 @@ class Watched:
 
 
 def test_passes_on_what_is_sound_at_once():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     status = watched.sound()
     watched.check(status)
     np.testing.assert_array_equal(watched.state, status.values()[:4])
@@ -66,7 +66,7 @@ def test_passes_on_what_is_sound_at_once():
 
 
 def test_believes_nobody_before_the_settling_time():
-    watched = Watched()
+    watched = SupervisedTraining()
     assert watched.check(None) == Fault.NO_STATUS
     faults = [watched.check(watched.sound()) for _ in range(round(LIMITS.settling / PERIOD))]
     assert set(faults) == {Fault.NO_STATUS}
@@ -86,7 +86,7 @@ WRONG = {
 
 @pytest.mark.parametrize("fault", WRONG, ids=lambda fault: fault.name)
 def test_names_the_fault_believes_nothing_of_it_and_recovers(fault):
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     before = watched.state
     wrong = WRONG[fault](watched.sound())
     assert watched.check(wrong) == fault
@@ -111,7 +111,7 @@ def replace_time(watched):
 
 
 def test_silence_is_stale_and_a_repeated_status_is_silence():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     last = watched.sound()
     found = [watched.check(last) for _ in range(20)]
     first = found.index(Fault.STALE)
@@ -124,7 +124,7 @@ def test_silence_is_stale_and_a_repeated_status_is_silence():
 
 
 def test_statuses_that_come_late_are_stale():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     queue = []
     found = []
     for step in range(40):
@@ -134,7 +134,7 @@ def test_statuses_that_come_late_are_stale():
 
 
 def test_two_clocks_may_drift_apart():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     for _ in range(3000):
         status = watched.sound()
         assert watched.check(replace(status, time=CLOCK + 1.0003 * (status.time - CLOCK))) == Fault.NONE
@@ -142,7 +142,7 @@ def test_two_clocks_may_drift_apart():
 
 def test_the_robots_clock_may_start_anew():
     """Its driver was started again: it is a fault once, and then another clock."""
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     assert watched.check(replace(watched.sound(), time=1.0)) == Fault.OUT_OF_ORDER
     start = watched.step
     for _ in range(round(LIMITS.settling / PERIOD) + 3):
@@ -151,7 +151,7 @@ def test_the_robots_clock_may_start_anew():
 
 
 def test_an_initialization_forgets():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     watched.simulator.Initialize()
     assert watched.fault == Fault.NO_STATUS
 
@@ -179,7 +179,7 @@ def test_refuses_a_period_that_is_none():
         StatusWatchdog(LIMITS, period=0.0)
 
 
-class WithClock(Watched):
+class WithClock(SupervisedTraining):
     """The same by the clock on the wall, which goes by itself."""
 
     def __init__(self):
@@ -206,9 +206,9 @@ def test_by_the_clock_on_the_wall_a_delay_of_ones_own_is_no_fault_of_the_status(
 def test_a_program_that_was_held_up_for_too_long_says_so_and_believes_the_newest_status():
     watched = WithClock().settle()
     status = watched.sound(0.2)
-    assert watched.check(status, 0.2) == Fault.LATE
+    assert watched.check(status, 0.2) == Fault.DEADLINE_MISSED
     np.testing.assert_array_equal(watched.state, status.values()[:4])
-    assert watched.check(watched.sound()) == Fault.LATE  # until it has settled again
+    assert watched.check(watched.sound()) == Fault.DEADLINE_MISSED  # until it has settled again
     watched.settle()
 
 
@@ -231,7 +231,7 @@ def test_what_came_after_a_check_is_not_judged_by_what_the_clock_showed_then():
 
 def test_what_comes_soonest_tells_how_late_all_others_are():
     """Statuses that were late when the clocks were synchronized don't make later ones pass for punctual."""
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
 
     def delayed(by):
         return replace(watched.sound(), time=watched.sound().time - by * LIMITS.max_age)
@@ -251,7 +251,7 @@ def test_what_comes_soonest_tells_how_late_all_others_are():
 
 
 def test_a_single_status_that_is_a_little_early_makes_no_other_late():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     sound, lead = watched.sound(), 0.9 * LIMITS.max_lead
     watched.check(replace(sound, time=sound.time + lead, positions=sound.positions + 0.1 * lead))
     for _ in range(50):
@@ -267,7 +267,7 @@ def test_the_limits_follow_from_the_rate():
 
 def test_a_speed_with_which_nothing_moves_is_never_believed():
     """The first such status is a jump; the ones after it agree with each other, and with no motion."""
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     before = watched.state
     for _ in range(5):
         sound = watched.sound()
@@ -276,7 +276,7 @@ def test_a_speed_with_which_nothing_moves_is_never_believed():
 
 
 def test_a_status_that_was_overtaken_counts_as_none():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     late = watched.sound()
     watched.check(watched.sound())
     newest = watched.sound()
@@ -290,7 +290,7 @@ def test_a_status_that_was_overtaken_counts_as_none():
 
 def test_after_a_silence_nothing_is_believed_before_it_has_settled():
     """How late the statuses are that come then nobody knows."""
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     before = watched.sound()
     watched.check(before)
     for _ in range(20):
@@ -306,7 +306,7 @@ def test_after_a_silence_nothing_is_believed_before_it_has_settled():
 @pytest.mark.parametrize("seconds", [-1.0, 1.0])
 def test_after_a_stray_status_what_keeps_to_the_known_clock_is_believed_at_once(seconds):
     """Whoever damps needs the arm's speed now; the fault is reported all the same."""
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     watched.check(replace(watched.sound(), time=watched.sound().time + seconds))
     fault = watched.fault
     for _ in range(3):
@@ -324,7 +324,7 @@ def test_after_a_stray_status_what_keeps_to_the_known_clock_is_believed_at_once(
 
 @pytest.mark.parametrize("between", [Fault.MALFORMED, Fault.POSITION_JUMP], ids=lambda fault: fault.name)
 def test_another_clock_is_not_believed_before_it_has_settled_whatever_else_goes_wrong(between):
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
 
     def set_back():
         status = watched.sound()
@@ -342,7 +342,7 @@ def test_another_clock_is_not_believed_before_it_has_settled_whatever_else_goes_
 
 def test_a_position_that_has_jumped_and_stays_is_not_believed_before_it_has_settled():
     """Its inertia is that of another posture, and damping by it may drive the arm."""
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
 
     def slipped():
         return replace(watched.sound(), positions=watched.sound().positions + [2.5, 0.0])
@@ -367,7 +367,7 @@ def test_the_ports_have_the_sizes_that_they_say():
 
 
 def test_new_is_what_is_believed_and_was_not_there_before():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     is_new = watched.system.get_is_new_output_port()
     sound = watched.sound()
     jumped = WRONG[Fault.POSITION_JUMP](sound)
@@ -379,7 +379,7 @@ def test_new_is_what_is_believed_and_was_not_there_before():
 
 
 def test_before_any_status_the_age_is_the_time_since_the_start():
-    watched = Watched()
+    watched = SupervisedTraining()
     assert watched.age == 0.0
     for _ in range(5):
         watched.check(None)
@@ -388,7 +388,7 @@ def test_before_any_status_the_age_is_the_time_since_the_start():
 
 def test_statuses_that_fall_behind_one_after_another_stay_stale():
     """Each is new, and none of them says that the clocks differ by as much."""
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     queue = [watched.sound()]
     while watched.step * PERIOD + CLOCK - queue[0].time < 1.5 * LIMITS.max_age:
         for _ in range(2):  # two come for each that is read
@@ -401,7 +401,7 @@ def test_statuses_that_fall_behind_one_after_another_stay_stale():
 
 
 def test_after_a_silence_the_clocks_are_synchronized_anew():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     last = watched.sound()
     for _ in range(round(3.0 * LIMITS.max_age / PERIOD)):
         watched.check(last)
@@ -412,7 +412,7 @@ def test_after_a_silence_the_clocks_are_synchronized_anew():
 
 
 def test_what_was_known_is_no_news_after_a_stray_status():
-    watched = Watched().settle()
+    watched = SupervisedTraining().settle()
     known = watched.sound()
     watched.check(known)
     watched.check(replace(watched.sound(), time=watched.sound().time + 1.0))

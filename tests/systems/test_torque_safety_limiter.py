@@ -9,7 +9,7 @@ from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.robots.robot import DEFAULT_ROBOT, find_robot
-from guiderail.systems.torque_safety_limiter import OLDEST_SPEED, Phase, SafetyLimits, TorqueGuard
+from guiderail.systems.torque_safety_limiter import OLDEST_SPEED, ArmState, SafetyLimits, TorqueSafetyLimiter
 
 PERIOD = 1.0 / 256.0
 n = 7
@@ -31,7 +31,7 @@ class Guarded:
 
     def __init__(self, plant, running=True):
         self.plant = plant
-        self.system = TorqueGuard(plant, LIMITS, period=PERIOD)
+        self.system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         ok = {
@@ -44,14 +44,14 @@ class Guarded:
             "status_fault": [0.0],
             "status_age": [0.0],
             "status_is_new": [1.0],
-            "holding": [0.0],
+            "command_timed_out": [0.0],
         }
         self.ports = {name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in ok.items()}
         self.ok = ok
         if running:
             self.simulator.Initialize()
             self.go(LIMITS.ramp_time + 4 * PERIOD)
-            assert self.phase == Phase.RUNNING
+            assert self.phase == ArmState.RUNNING
 
     def set(self, **values):
         for name, value in values.items():
@@ -66,7 +66,7 @@ class Guarded:
 
     @property
     def phase(self):
-        return Phase(int(self["phase"][0]))
+        return ArmState(int(self["phase"][0]))
 
     @property
     def fault(self):
@@ -91,15 +91,15 @@ def test_sends_nothing_before_the_status_is_sound_and_then_takes_over_gradually(
     guarded.set(status_fault=[Fault.NO_STATUS])
     guarded.simulator.Initialize()
     guarded.go(0.5)
-    assert guarded.phase == Phase.WAITING
+    assert guarded.phase == ArmState.WAITING
     assert guarded["sending"][0] == 0.0
     np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
     guarded.set(status_fault=[0.0])
     shares = []
-    while guarded.phase != Phase.RUNNING:
+    while guarded.phase != ArmState.RUNNING:
         guarded.go(PERIOD)
         share = guarded["authority"][0]
-        if guarded.phase == Phase.RAMPING:
+        if guarded.phase == ArmState.RAMPING:
             shares.append(share)
             assert guarded["not_following"][0] == 1.0
             expected = np.clip(share * WANTED + (1.0 - share) * guarded.damping(), -20.0, 20.0)
@@ -127,19 +127,19 @@ def test_stops_at_once_says_why_and_goes_on_only_when_told(plant, fault):
     assert not np.isclose(guarded["safe_torque"], WANTED).any()
     guarded.go(2 * PERIOD)
     guarded.set(**{name: guarded.ok[name] for name in WRONG[fault]})
-    assert (guarded.phase, guarded.fault) == (Phase.DAMPING, fault)
+    assert (guarded.phase, guarded.fault) == (ArmState.DAMPING, fault)
     np.testing.assert_allclose(guarded["safe_torque"], np.clip(guarded.damping(), -20.0, 20.0), atol=1e-12)
     with pytest.raises(InputError, match="is damping"):
         guarded.system.resume(guarded.context)
     guarded.go(LIMITS.damping_time)
-    assert (guarded.phase, guarded.fault) == (Phase.OFF, fault)
+    assert (guarded.phase, guarded.fault) == (ArmState.OFF, fault)
     np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
     guarded.go(1.0)
-    assert guarded.phase == Phase.OFF
+    assert guarded.phase == ArmState.OFF
     guarded.system.resume(guarded.context)
-    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (Phase.RAMPING, Fault.NONE, 0.0)
+    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (ArmState.RAMPING, Fault.NONE, 0.0)
     guarded.go(LIMITS.ramp_time + 2 * PERIOD)
-    assert guarded.phase == Phase.RUNNING
+    assert guarded.phase == ArmState.RUNNING
 
 
 def test_is_not_told_to_leave_the_workspace(plant):
@@ -164,23 +164,23 @@ NO_NUMBER = {
 
 @pytest.mark.parametrize("authority", ["none", "some", "all"])
 @pytest.mark.parametrize("what", NO_NUMBER)
-def test_what_is_no_number_is_within_no_limit_and_what_is_sent_is_one(plant, what, authority):
+def test_what_is_no_number_is_within_no_limit_and_what_is_sent_is_one(plant, what, blend_factor):
     """Whether the arm waits, takes over or runs, when it stops and until it is off."""
     wrong, fault = NO_NUMBER[what]
-    guarded = Guarded(plant, running=authority == "all")
-    if authority != "all":
+    guarded = Guarded(plant, running=blend_factor == "all")
+    if blend_factor != "all":
         guarded.simulator.Initialize()
-        guarded.go(0.5 * LIMITS.ramp_time if authority == "some" else 0.0)
+        guarded.go(0.5 * LIMITS.ramp_time if blend_factor == "some" else 0.0)
     guarded.set(**wrong)
     assert np.isfinite(guarded["safe_torque"]).all()
-    if authority == "none" and what == "desired_pose":
+    if blend_factor == "none" and what == "desired_pose":
         return  # nobody is told to go anywhere yet
     assert guarded.fault == fault
     for _ in range(round(LIMITS.damping_time / PERIOD) + 4):
         guarded.go(PERIOD)
         assert np.isfinite(guarded["safe_torque"]).all()
         assert guarded.fault == fault
-    assert guarded.phase == (Phase.WAITING if authority == "none" else Phase.OFF)
+    assert guarded.phase == (ArmState.WAITING if blend_factor == "none" else ArmState.OFF)
 
 
 @pytest.mark.parametrize("wrong", [{"state": POSITION}, {"state": VELOCITY}, {"status_age": [np.nan]}])
@@ -190,7 +190,7 @@ def test_a_speed_that_nobody_knows_is_not_damped(plant, wrong):
     for _ in range(3):
         np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
         guarded.go(PERIOD)
-    assert guarded.phase == Phase.DAMPING
+    assert guarded.phase == ArmState.DAMPING
 
 
 def test_torques_that_come_out_as_no_numbers_are_none(plant):
@@ -208,7 +208,7 @@ def test_does_not_go_on_while_something_is_wrong(plant):
     guarded.go(1.0)
     with pytest.raises(InputError, match="numbers that are none"):
         guarded.system.resume(guarded.context)
-    assert guarded.phase == Phase.OFF
+    assert guarded.phase == ArmState.OFF
 
 
 def test_never_sends_more_than_the_limits(plant):
@@ -248,7 +248,7 @@ def test_a_robot_that_was_started_anew_is_not_driven_by_the_speed_that_it_had(pl
         guarded.set(status_fault=[float(status_fault)])
         guarded.go(PERIOD)
     assert guarded["safe_torque"].any() == has_torque
-    assert guarded.phase == (Phase.DAMPING if has_torque else Phase.OFF)
+    assert guarded.phase == (ArmState.DAMPING if has_torque else ArmState.OFF)
 
 
 @pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (OLDEST_SPEED, True), (0.2, False)])
@@ -290,13 +290,13 @@ def test_a_silent_robot_is_sent_no_torque_and_then_nothing(plant):
 def test_stops_when_asked(plant):
     guarded = Guarded(plant)
     guarded.system.stop(guarded.context)
-    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (Phase.DAMPING, Fault.ASKED, 0.0)
+    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (ArmState.DAMPING, Fault.USER_STOP, 0.0)
     with pytest.raises(InputError):
         guarded.system.resume(guarded.context)
     guarded.go(LIMITS.damping_time + 2 * PERIOD)
-    assert guarded.phase == Phase.OFF
+    assert guarded.phase == ArmState.OFF
     guarded.system.stop(guarded.context)
-    assert (guarded.phase, guarded.fault) == (Phase.OFF, Fault.ASKED)
+    assert (guarded.phase, guarded.fault) == (ArmState.OFF, Fault.USER_STOP)
 
 
 def test_an_arm_that_was_never_taken_over_is_stopped_without_a_word(plant):
@@ -305,9 +305,9 @@ def test_an_arm_that_was_never_taken_over_is_stopped_without_a_word(plant):
     guarded.set(status_fault=[Fault.NO_STATUS])
     guarded.simulator.Initialize()
     guarded.go(10 * PERIOD)
-    assert guarded.phase == Phase.WAITING
+    assert guarded.phase == ArmState.WAITING
     guarded.system.stop(guarded.context)
-    assert (guarded.phase, guarded.fault) == (Phase.OFF, Fault.ASKED)
+    assert (guarded.phase, guarded.fault) == (ArmState.OFF, Fault.USER_STOP)
     for _ in range(100):
         guarded.go(PERIOD)
         assert guarded["sending"][0] == 0.0
@@ -349,12 +349,12 @@ def test_refuses_limits_that_make_no_sense(wrong):
 
 def test_refuses_an_arm_that_the_limits_do_not_fit(plant):
     with pytest.raises(InputError, match="7 joints"):
-        TorqueGuard(plant, SafetyLimits((1.0,) * 6, (1.0,) * 6, (1.0,) * 6), period=PERIOD)
-    TorqueGuard(plant, LIMITS, period=0.5 * LIMITS.decay_time)
+        TorqueSafetyLimiter(plant, SafetyLimits((1.0,) * 6, (1.0,) * 6, (1.0,) * 6), period=PERIOD)
+    TorqueSafetyLimiter(plant, LIMITS, period=0.5 * LIMITS.decay_time)
     with pytest.raises(InputError, match="rest"):
-        TorqueGuard(plant, LIMITS, period=0.51 * LIMITS.decay_time)
+        TorqueSafetyLimiter(plant, LIMITS, period=0.51 * LIMITS.decay_time)
     with pytest.raises(InputError):
-        TorqueGuard(plant, LIMITS, period=0.0)
+        TorqueSafetyLimiter(plant, LIMITS, period=0.0)
 
 
 def test_what_is_exactly_at_a_limit_is_within_it_and_of_the_wrench_the_force_counts(plant):
@@ -371,7 +371,7 @@ def test_what_is_exactly_at_a_limit_is_within_it_and_of_the_wrench_the_force_cou
 
 
 def test_outputs_have_the_sizes_that_they_say_and_depend_at_once_on_no_more(plant):
-    system = TorqueGuard(plant, LIMITS, period=PERIOD)
+    system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD)
     outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
     assert {port.get_name(): port.size() for port in outputs} == {
         **{"safe_torque": n, "fault": 1, "phase": 1, "authority": 1, "sending": 1, "not_following": 1}
@@ -391,13 +391,13 @@ def test_outputs_have_the_sizes_that_they_say_and_depend_at_once_on_no_more(plan
         "phase": set(),
         "authority": set(),
         "sending": {"status_fault"},
-        "not_following": {"holding"},
+        "not_following": {"command_timed_out"},
     }
 
 
 def test_before_it_is_initialized_it_waits_and_sends_nothing(plant):
     guarded = Guarded(plant, running=False)
-    assert (guarded.phase, guarded["sending"][0], guarded["not_following"][0]) == (Phase.WAITING, 0.0, 1.0)
+    assert (guarded.phase, guarded["sending"][0], guarded["not_following"][0]) == (ArmState.WAITING, 0.0, 1.0)
     np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
 
 
@@ -405,7 +405,7 @@ def test_while_it_takes_over_it_damps_the_speed_that_is_seen_and_nothing_that_it
     guarded = Guarded(plant, running=False)
     guarded.simulator.Initialize()
     guarded.go(LIMITS.ramp_time / 2)
-    assert guarded.phase == Phase.RAMPING
+    assert guarded.phase == ArmState.RAMPING
     guarded.set(status_age=[PERIOD], status_is_new=[0.0])
     guarded.go(PERIOD)
     share = guarded["authority"][0]
@@ -415,5 +415,5 @@ def test_while_it_takes_over_it_damps_the_speed_that_is_seen_and_nothing_that_it
 
 def test_while_a_watchdog_holds_the_arm_is_not_following(plant):
     guarded = Guarded(plant)
-    guarded.set(holding=[1.0])
-    assert (guarded.phase, guarded["not_following"][0]) == (Phase.RUNNING, 1.0)
+    guarded.set(command_timed_out=[1.0])
+    assert (guarded.phase, guarded["not_following"][0]) == (ArmState.RUNNING, 1.0)

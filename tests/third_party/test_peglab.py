@@ -101,7 +101,7 @@ def test_it_is_trained_resumed_and_evaluated(lab, trained):
     guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run")
     found = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
     assert found["episodes"] == 2
-    assert found["worst_violation"] <= 1e-9
+    assert found["max_commanded_violation"] <= 1e-9
 
 
 def test_it_is_replayed(lab, trained):
@@ -119,7 +119,7 @@ methods:
   kgrl: {env: {guidance: kgrl}}
   zero: {env: {guidance: kgrl}, policy: zero}
 seeds: [1]
-judged_on:
+eval_set:
   - {name: held_out, episodes: 3}
 """
     )

@@ -6,21 +6,23 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from guiderail.diagrams.envs.trace import Trace
+from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
 
 
 class Bead(gymnasium.Env):
     metadata = {"render_modes": ["human"]}  # noqa: RUF012
 
-    def __init__(self, guidance="skgrl", reward="shaped", observation="state", hold=1, wall=1.0, render_mode=None):
+    def __init__(
+        self, guidance="skgrl", reward="shaped", observation="state", action_repeat=1, wall=1.0, render_mode=None
+    ):
         if guidance not in ("kmp", "skgrl"):
             raise InputError(f"Bead has no guidance {guidance!r}: choose kmp or skgrl")
         self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float32)
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
-        self.hold, self.wall, self.render_mode = hold, wall, render_mode
+        self.action_repeat, self.wall, self.render_mode = action_repeat, wall, render_mode
         self.task = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1, symmetry=None)
-        self.trace, self.length = Trace(250, 2, 0.1), 12
+        self.trace, self.length = EpisodeTrace(250, 2, 0.1), 12
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -42,7 +44,7 @@ class Bead(gymnasium.Env):
 
     def step(self, action):
         total = 0.0
-        for _ in range(self.hold):
+        for _ in range(self.action_repeat):
             self.x = np.minimum(self.x + 0.1 * np.asarray(action, float), self.wall)
             reward = -float(np.linalg.norm(self.x - [0.5, 0.5]))
             self.trace.append(self.x, self.x, 1.0, reward)
@@ -52,7 +54,7 @@ class Bead(gymnasium.Env):
         termination = ("success" if reward > -0.2 else "time_limit") if done else ""
         info = self._info(termination, total)
         if done:
-            info["ledger"] = {"collisions": 0.0, "fallbacks": 0.0}
+            info["ledger"] = {"collisions": 0.0, "fallback_steps": 0.0}
         return self._observation(), total, termination == "success", termination == "time_limit", info
 
 

@@ -25,7 +25,7 @@ def bead_config():
     """A run of a second: tiny networks that learn from the second episode on."""
     from guiderail.tools.learning.train import configure
 
-    settings = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
+    settings = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
     return configure("Bead", {}, settings=settings, episodes=8, seed=5)
 
 

@@ -92,14 +92,14 @@ def declared_start(task, **environment):
 
 def test_a_start_is_within_what_the_task_declares_and_the_error_of_its_measurement():
     assert not declared_start("BncConnector").any()
-    np.testing.assert_allclose(declared_start("BncConnector", start_beside=0.002), np.full(6, 0.002))
+    np.testing.assert_allclose(declared_start("BncConnector", start_offset_max=0.002), np.full(6, 0.002))
     np.testing.assert_allclose(declared_start("BncConnector", pose_bias=0.001), [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0])
-    both = declared_start("BncConnector", pose_bias=0.001, start_beside=0.002)
+    both = declared_start("BncConnector", pose_bias=0.001, start_offset_max=0.002)
     np.testing.assert_allclose(both, [3e-3, 3e-3, 3e-3, 2e-3, 2e-3, 2e-3])
 
 
 @pytest.mark.parametrize(
-    "far", [{"pose_bias": 1e-3}, {"start_beside": 1e-3}, {"pose_bias": 5e-4, "start_beside": 1e-3}]
+    "far", [{"pose_bias": 1e-3}, {"start_offset_max": 1e-3}, {"pose_bias": 5e-4, "start_offset_max": 1e-3}]
 )
 def test_a_history_begins_within_what_is_declared(far):
     env = make_env("BncConnector", guidance="skgrl", **far)

@@ -14,7 +14,7 @@ from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.study import Job, run_job
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.report_data import command
 
 HARD = {"difficulty": "hard"}
@@ -28,13 +28,13 @@ def policy(seen, moved):
 
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"])
 def test_another_difficulty_is_what_it_stands_for_and_keeps_what_was_chosen(task):
-    chosen = {"hold": 3, "reward": "sparse"}
+    chosen = {"action_repeat": 3, "reward": "sparse"}
     standard, hard = (check_environment(task, chosen | more) for more in ({}, HARD))
     assert standard != hard | {"difficulty": "standard"}
     assert changed_environment(task, standard, HARD) == hard
     assert changed_environment(task, hard, {"difficulty": "standard"}) == standard
-    assert changed_environment(task, hard, {**HARD, "hold": 4}) == hard | {"hold": 4}
-    assert changed_environment(task, standard, {"hold": 4}) == standard | {"hold": 4}
+    assert changed_environment(task, hard, {**HARD, "action_repeat": 4}) == hard | {"action_repeat": 4}
+    assert changed_environment(task, standard, {"action_repeat": 4}) == standard | {"action_repeat": 4}
 
 
 class _AskedFor(Exception):
@@ -72,7 +72,7 @@ def test_a_policy_is_shown_and_certified_at_another_difficulty(tmp_path):
     RunFolder(tmp_path).create(configure("NarrowPassage", {}, episodes=1))
     policy(3, 2).save(tmp_path)
     hard = check_environment("NarrowPassage", HARD)
-    assert Shown.of_run(tmp_path, HARD).environment == hard
+    assert EpisodeSpec.of_run(tmp_path, HARD).environment == hard
     assert _what(str(tmp_path), HARD)[1] == hard
 
 
@@ -84,7 +84,7 @@ def test_a_policy_that_sees_or_moves_other_things_is_refused_in_a_sentence():
             as_learned(other, env)
 
 
-@pytest.mark.parametrize("chosen", [{"difficulty": "hard"}, {"station": "arm", "hold": 7}])
+@pytest.mark.parametrize("chosen", [{"difficulty": "hard"}, {"station": "arm", "action_repeat": 7}])
 def test_the_command_of_a_run_says_what_is_not_the_tasks_own(chosen):
     words = command(configure("BncConnector", {"guidance": "kgrl", **chosen}), "out").split()
     given = [word for word in words if "=" in word]

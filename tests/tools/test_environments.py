@@ -5,18 +5,18 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import changed_environment, check_environment, import_modules
 
 
-@pytest.mark.parametrize(("learned_on", "judged_on"), [("rails", "mujoco"), ("rails", "arm"), ("arm", "rails")])
-def test_what_was_learned_on_one_station_is_judged_on_another(learned_on, judged_on):
-    learned = check_environment("BncConnector", {"station": learned_on, "hold": 3})
-    there = check_environment("BncConnector", changed_environment("BncConnector", learned, {"station": judged_on}))
-    assert (there["station"], there["hold"]) == (judged_on, 3)
-    assert there == check_environment("BncConnector", {"station": judged_on, "hold": 3})
+@pytest.mark.parametrize(("learned_on", "eval_set"), [("gantry", "mujoco"), ("gantry", "arm"), ("arm", "gantry")])
+def test_what_was_learned_on_one_station_is_judged_on_another(learned_on, eval_set):
+    learned = check_environment("BncConnector", {"station": learned_on, "action_repeat": 3})
+    there = check_environment("BncConnector", changed_environment("BncConnector", learned, {"station": eval_set}))
+    assert (there["station"], there["action_repeat"]) == (eval_set, 3)
+    assert there == check_environment("BncConnector", {"station": eval_set, "action_repeat": 3})
 
 
 def test_what_is_asked_for_and_the_other_station_does_not_have_is_refused():
     learned = check_environment("BncConnector", {"impedance_control": "cartesian"})
     assert changed_environment("BncConnector", learned, {}) == learned
-    assert changed_environment("BncConnector", learned, {"station": "rails"})["impedance_control"] == "cartesian"
+    assert changed_environment("BncConnector", learned, {"station": "gantry"})["impedance_control"] == "cartesian"
     asked = changed_environment("BncConnector", learned, {"station": "arm", "impedance_control": "joint"})
     with pytest.raises(InputError, match="it is one of station='rails'"):
         check_environment("BncConnector", asked)
@@ -24,7 +24,7 @@ def test_what_is_asked_for_and_the_other_station_does_not_have_is_refused():
 
 def test_an_environment_of_no_station_takes_others():
     assert changed_environment("Bead", {"wall": 1.0}, {"wall": 2.0}) == {"wall": 2.0}
-    assert changed_environment("Bead", {"wall": 1.0}, {"station": "rails"}) == {"wall": 1.0, "station": "rails"}
+    assert changed_environment("Bead", {"wall": 1.0}, {"station": "gantry"}) == {"wall": 1.0, "station": "gantry"}
 
 
 def test_a_file_is_run_once_as_long_as_it_stays_what_it_is(tmp_path, monkeypatch):

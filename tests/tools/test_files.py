@@ -12,7 +12,7 @@ from guiderail.tools.datasets.record import record
 from guiderail.tools.evaluation.rollout import check_seed
 from guiderail.tools.files import LOCK, check_page, check_picture, check_writable, remove_parts
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.episode_spec import EpisodeSpec
 
 
 def test_a_file_below_a_file_cannot_be_written(tmp_path):
@@ -46,7 +46,7 @@ def test_a_page_is_not_written_over_what_is_none(name, tmp_path):
 def test_a_seed_that_no_environment_takes_is_refused(seed, bead_run, tmp_path):
     for refused in (
         lambda: check_seed(seed),
-        lambda: Shown.of_run(bead_run, seed=seed),
+        lambda: EpisodeSpec.of_run(bead_run, seed=seed),
         lambda: record(bead_run, tmp_path / "x.npz", seed=seed),
     ):
         with pytest.raises(InputError, match=f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}"):

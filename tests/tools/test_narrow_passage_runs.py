@@ -19,15 +19,15 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import train
 from guiderail.tools.visualization import film
-from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.replay import default_page, tube, write_page
 
-SETTINGS = {"units": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}
+SETTINGS = {"net_arch": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}
 
 
 @pytest.fixture(scope="module")
 def config():
-    return configure("NarrowPassage", {"guidance": "skgrl"}, preset="quick", settings=SETTINGS, episodes=3, seed=1)
+    return configure("NarrowPassage", {"guidance": "skgrl"}, preset="tqc_fast", settings=SETTINGS, episodes=3, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_training_is_safe_from_the_first_episode_on(trained):
     rows = trained.episodes()
     assert (rows["success"] == 1).all()
     assert (rows["collisions"] == 0).all()
-    assert rows[["worst_violation", "worst_measured_violation"]].to_numpy().max() <= 1e-9
+    assert rows[["max_commanded_violation", "max_measured_violation"]].to_numpy().max() <= 1e-9
 
 
 def test_a_rows_terms_add_up_to_its_return(trained):
@@ -62,7 +62,7 @@ def test_a_resumed_simulation_goes_on_bit_for_bit(trained, config, tmp_path):
 def test_evaluation_states_what_the_demonstration_alone_achieves(trained):
     result = evaluate(trained.path, episodes=2)
     assert result["demonstration_success_rate"] == 1.0
-    assert result["worst_violation"] <= 1e-9
+    assert result["max_commanded_violation"] <= 1e-9
 
 
 def test_held_out_starts_differ_from_those_of_training_and_from_each_other():
@@ -79,7 +79,7 @@ def test_held_out_starts_differ_from_those_of_training_and_from_each_other():
 
 
 def test_the_replay_is_one_page_that_needs_nothing_else(trained):
-    write_page(default_page(trained.path, {}), Shown.of_run(trained.path), episodes=1)
+    write_page(default_page(trained.path, {}), EpisodeSpec.of_run(trained.path), episodes=1)
     page = (trained.path / "replay.html").read_text()
     assert "the constraint" in page
     assert "demonstrations" in page
@@ -89,11 +89,11 @@ def test_the_replay_is_one_page_that_needs_nothing_else(trained):
 
 
 def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, monkeypatch):
-    watched = film.watch(Shown.of_run(trained.path), film.ROWS * film.COLUMNS)
+    watched = film.watch(EpisodeSpec.of_run(trained.path), film.ROWS * film.COLUMNS)
     monkeypatch.setattr(film, "watch", lambda *_: watched)  # once for both
     for ending, magic in ((".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")):
         picture = tmp_path / f"film{ending}"
-        row = film.write_film(picture, Shown.of_run(trained.path))
+        row = film.write_film(picture, EpisodeSpec.of_run(trained.path))
         assert row["success"]
         assert picture.read_bytes().startswith(magic)
         image = imread(picture)
@@ -103,9 +103,9 @@ def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, 
 
 def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
     with pytest.raises(InputError, match="no station 'arm': choose one of plane"):
-        write_page(tmp_path / "replay.html", Shown.of_run(trained.path, {"station": "arm"}))
+        write_page(tmp_path / "replay.html", EpisodeSpec.of_run(trained.path, {"station": "arm"}))
     with pytest.raises(InputError, match="a picture is"):
-        film.write_film(tmp_path / "film.gif", Shown.of_run(trained.path))
+        film.write_film(tmp_path / "film.gif", EpisodeSpec.of_run(trained.path))
     assert list(tmp_path.iterdir()) == []
 
 

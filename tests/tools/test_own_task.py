@@ -9,18 +9,18 @@ import pytest
 
 from guiderail.diagrams.envs.env import RECORDED, SAID
 from guiderail.diagrams.envs.make import make_env, resolve
-from guiderail.diagrams.envs.observation import Observed, affine
+from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
-from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 from guiderail.tools.cli.catalog import options_in_words
 from guiderail.tools.datasets.validate import check
 from guiderail.tools.environments import import_modules
-from guiderail.tools.evaluation.evaluate import _counts_collisions, claim
+from guiderail.tools.evaluation.evaluate import _counts_collisions, evaluation_scope
 from research.action_fuzzing.campaign import stress
 
 NUM_STEPS = 10
@@ -29,25 +29,25 @@ NUM_STEPS = 10
 class Own(Task):
     """Straight up through a wide gap."""
 
-    world_kind = "plane"
+    workcell_kind = "plane"
     num_steps = NUM_STEPS
     reward = staticmethod(lambda pose: -float(pose[1]))
 
-    def world(self):
+    def workcell(self):
         return PassageGeometry(start=(0.35, 0.1), goal=(0.35, 0.9), goal_radius=0.05, gap_x=(0.2, 0.5))
 
     def reference(self):
         means = np.column_stack([np.full(NUM_STEPS, 0.35), np.linspace(0.1, 0.2, NUM_STEPS)])
         return ReferenceTrajectory(0.02 * np.arange(NUM_STEPS), means, np.tile(1e-4 * np.eye(2), (NUM_STEPS, 1, 1)))
 
-    def observed(self):
-        return (Observed("phase"),)
+    def observation_terms(self):
+        return (ObservationTerm("phase"),)
 
     def reward_terms(self, num_actions):
         return [RewardTerm("a", {"pose": 2}, self.reward)]
 
-    def conditions(self):
-        return [Condition("success", {"pose": 2}, self.world().at_goal)]
+    def termination_terms(self):
+        return [TerminationTerm("success", {"pose": 2}, self.workcell().at_goal)]
 
     def reset(self, station, guidance, context, rng, options):
         return {}
@@ -98,8 +98,11 @@ def test_a_declaration_of_the_wrong_kind_is_refused_where_it_is_made(attributes,
 @pytest.mark.parametrize(
     ("attributes", "says"),
     [
-        ({"world_kind": "planes"}, "a world of the kind 'planes', which lab/Own has: did you mean plane"),
-        ({"of": Ignorant, "world_kind": "plane"}, "nothing guides lab/Own, as it knows nothing: write its reference"),
+        ({"workcell_kind": "planes"}, "a world of the kind 'planes', which lab/Own has: did you mean plane"),
+        (
+            {"of": Ignorant, "workcell_kind": "plane"},
+            "nothing guides lab/Own, as it knows nothing: write its reference",
+        ),
         ({"difficulties": {"standard": {}, "hard": {"gapp": 1}}}, "hard of lab/Own sets no option 'gapp'"),
         ({"defaults": {"hodl": 5}}, "defaults of lab/Own sets no option 'hodl': did you mean hold"),
     ],
@@ -123,7 +126,7 @@ def test_settings_of_another_guidance_are_no_mistake():
         ({"reward": lambda self, pose: None}, "reward term 'a' of lab/Own must be one number, and it is None"),
         ({"reward": lambda self, place: 0.0}, "reward term 'a' of lab/Own is called with .*, pose, and takes place"),
         (
-            {"conditions": lambda self: [Condition("success", {"pose": 2}, lambda position: False)]},
+            {"conditions": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
             "the condition 'success' of lab/Own is called with .*, pose, and takes position",
         ),
         ({"reset": lambda self, *given: None}, "reset of lab/Own returns what it drew by name, {} .*, not None"),
@@ -139,17 +142,26 @@ def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, 
     ("observed", "says"),
     [
         ((), "the observation of lab/Own is of nothing: let observed"),
-        ((Observed("pose", entries=()),), "the observation of lab/Own is of nothing"),
-        ((Observed("pose", scale=0.0),), "the scale of the observed signal 'pose' of lab/Own divides it, .* be 0.0"),
-        ((Observed("phase"), Observed("pose", scale=[0.5, 0.0])), "the scale .* 'pose' .* cannot be"),
-        ((Observed("pose", scale=1e-320),), "the scale of the observed signal 'pose' of lab/Own divides it"),
-        ((Observed("pose", scale=np.nan),), "the scale .* 'pose' of lab/Own is a finite number, or 2 of them, not nan"),
-        ((Observed("pose", scale=[1.0, 2.0, 3.0]),), "the scale .* is a finite number, or 2 of them, not"),
-        ((Observed("pose", scale="a"),), "the scale .* is a finite number, or 2 of them, not 'a'"),
-        ((Observed("pose", centre=np.inf),), "the centre .* is a finite number, or 2 of them, not inf"),
-        ((Observed("pose", entries=(0, 5)),), "the entries .* 'pose' of lab/Own are whole numbers from 0 to 1, not"),
-        ((Observed("pose", entries=1),), "the entries .* are whole numbers from 0 to 1, not 1"),
-        ((Observed("pose", entries=((0, 1),)),), "the entries .* are whole numbers from 0 to 1, not"),
+        ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is of nothing"),
+        (
+            (ObservationTerm("pose", scale=0.0),),
+            "the scale of the observed signal 'pose' of lab/Own divides it, .* be 0.0",
+        ),
+        ((ObservationTerm("phase"), ObservationTerm("pose", scale=[0.5, 0.0])), "the scale .* 'pose' .* cannot be"),
+        ((ObservationTerm("pose", scale=1e-320),), "the scale of the observed signal 'pose' of lab/Own divides it"),
+        (
+            (ObservationTerm("pose", scale=np.nan),),
+            "the scale .* 'pose' of lab/Own is a finite number, or 2 of them, not nan",
+        ),
+        ((ObservationTerm("pose", scale=[1.0, 2.0, 3.0]),), "the scale .* is a finite number, or 2 of them, not"),
+        ((ObservationTerm("pose", scale="a"),), "the scale .* is a finite number, or 2 of them, not 'a'"),
+        ((ObservationTerm("pose", centre=np.inf),), "the centre .* is a finite number, or 2 of them, not inf"),
+        (
+            (ObservationTerm("pose", entries=(0, 5)),),
+            "the entries .* 'pose' of lab/Own are whole numbers from 0 to 1, not",
+        ),
+        ((ObservationTerm("pose", entries=1),), "the entries .* are whole numbers from 0 to 1, not 1"),
+        ((ObservationTerm("pose", entries=((0, 1),)),), "the entries .* are whole numbers from 0 to 1, not"),
     ],
 )
 def test_what_cannot_be_observed_is_refused_when_the_task_is_assembled(observed, says):
@@ -159,7 +171,7 @@ def test_what_cannot_be_observed_is_refused_when_the_task_is_assembled(observed,
 
 
 def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
-    declare(observed=lambda self: (Observed("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
+    declare(observed=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
     env = make_env("lab/Own", guidance="kmp")
     seen, _ = env.reset(seed=0)
     x, y = env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
@@ -196,7 +208,7 @@ def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number)
         builder.Connect(station.get_pose_output_port(), broken.get_input_port())
         return {"broken": broken.get_output_port()}
 
-    declare(signals=signals, observed=lambda self: (Observed("phase"), Observed("broken", entries=(1,))))
+    declare(signals=signals, observed=lambda self: (ObservationTerm("phase"), ObservationTerm("broken", entries=(1,))))
     with pytest.raises(InputError, match=r"the observation of lab/Own is not finite, but"):
         first_step()
 
@@ -221,12 +233,12 @@ def test_a_world_that_is_none_is_a_sentence():
 
 def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
     declare()
-    assert "conditions as in training" in claim("lab/Own", {}, fresh=False)
+    assert "conditions as in training" in evaluation_scope("lab/Own", {}, fresh=False)
     words = options_in_words("lab/Own")
     assert words["reset: held_out"].startswith("nothing here")
     assert words["reward"] == "what is rewarded: the task's own, which has no name"
-    declare(draws_held_out=True)
-    assert claim("lab/Own", {}, fresh=False) == "a policy for starts that training never drew"
+    declare(has_held_out_distribution=True)
+    assert evaluation_scope("lab/Own", {}, fresh=False) == "a policy for starts that training never drew"
     assert options_in_words("lab/Own")["reset: held_out"].startswith("draw from conditions that training never")
 
 

@@ -51,8 +51,8 @@ def task(name: str) -> dict[str, Any]:
     return {
         "is": _first_line(declared),
         "environment": environment_id(name),
-        "guidance": possible_guidance(declared.knows()),
-        "stations": stations_for(declared.world_kind),
+        "guidance": possible_guidance(declared.provides()),
+        "stations": stations_for(declared.workcell_kind),
         "rewards": list(declared.rewards),
         "observations": list(declared.observations),
         "difficulties": {level: dict(settings) for level, settings in declared.difficulties.items()},
@@ -73,8 +73,8 @@ def options_in_words(name: str) -> dict[str, str]:
     resolved = resolve(name, {})
     declared = TASKS.get(name)
     choices = {
-        "guidance": possible_guidance(declared.knows()),
-        "station": stations_for(declared.world_kind),
+        "guidance": possible_guidance(declared.provides()),
+        "station": stations_for(declared.workcell_kind),
         "reward": declared.rewards,
         "observation": declared.observations,
         "difficulty": tuple(declared.difficulties),
@@ -97,7 +97,7 @@ def options_in_words(name: str) -> dict[str, str]:
     if declared.rewards is Task.rewards:
         words["reward"] = "what is rewarded: the task's own, which has no name"
     reset = {f"reset: {row['name']}": row["description"] for row in described(declared.Reset)}
-    if not declared.draws_held_out:
+    if not declared.has_held_out_distribution:
         reset["reset: held_out"] = "nothing here: the task declares no conditions that training never draws"
     return words | reset
 

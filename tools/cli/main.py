@@ -42,7 +42,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "studies": _known("tools.experiments.declaration", "shipped_studies"),
     "engines": _known("tools.experiments.engines.engine", "ENGINES"),
     "pictures": _known("tools.files", "PICTURES"),
-    "nulls": _known("tools.evaluation.baselines", "NULL_POLICIES"),
+    "nulls": _known("tools.evaluation.baselines", "BASELINES"),
     "axes": lambda: [axis.name for axis in import_module("guiderail.tools.evaluation.robustness").AXES],
     "listed": lambda: [*LISTED, *CHOICES["tasks"]()],
 }
@@ -89,9 +89,9 @@ def _arg(words: str, metavar: str, of: str | None = None) -> Any:
 Json = Annotated[bool, _opt("Print one JSON object, for a program to read.", "--json")]
 LcmUrl = Annotated[str, _opt("Of a robot: the URL of LCM.  [default: LCM's own]")]
 WhichRobot = Annotated[str, _opt("Of a robot: which arm.", of="robots")]
-Rehearse = Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--rehearse")]
+Rehearse = Annotated[bool, _opt("A simulated robot stands in, in a process of its own.", "--sim")]
 Lockstep = Annotated[
-    bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--lockstep")
+    bool, _opt("Of a rehearsal: each side waits for the other, whatever the wall's clock says.", "--synchronous")
 ]
 Rate = Annotated[float, _opt("Of a rehearsal: the simulated robot's clock to the wall's.")]
 Scenario = Annotated[
@@ -99,7 +99,7 @@ Scenario = Annotated[
 ]
 Yes = Annotated[bool, _opt("What is read out before the arm moves is so.", "--yes")]
 Run = Annotated[Path, _arg("The folder of a run that guiderail train made.", "RUN")]
-Shown = Annotated[str, _arg("The folder of a run; or a task, for --policy: {tasks}.", "RUN or TASK")]
+EpisodeSpec = Annotated[str, _arg("The folder of a run; or a task, for --policy: {tasks}.", "RUN or TASK")]
 Seed = Annotated[int, _opt("The seed of the held-out initial conditions.")]
 ENV_HELP = (
     "An option of the environment, such as station=arm or explored=[0,1,2]; give it as often as you like. "
@@ -147,10 +147,10 @@ def train(
         list[str] | None, _opt("One setting of the learner, such as batch_size=128.", "--set", metavar="name=value")
     ] = None,
     env: Env = None,
-    hold: Annotated[int | None, _opt("How many control steps an action lasts.")] = None,
+    action_repeat: Annotated[int | None, _opt("How many control steps an action lasts.")] = None,
     reward: Annotated[str | None, _opt("sparse or shaped; Pouring: hand_shaped too, GridClamp: no_force.")] = None,
     observation: Annotated[str | None, _opt("state or image.")] = None,
-    uncertainty: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
+    fixture_offset: Annotated[str | None, _opt("calibration, disc or known, where parts are offset.")] = None,
     station: Annotated[str | None, _opt("rails or arm, where a task has both; mujoco; hardware for a robot.")] = None,
     ledger: Annotated[
         bool | None, _opt("Write every control step into the run's ledger/.  [default: yes]", "--ledger/--no-ledger")
@@ -160,8 +160,8 @@ def train(
     ] = False,
     lcm_url: Annotated[str | None, _opt("Of a robot: the URL of LCM.  [default: LCM's own]")] = None,
     robot: Annotated[str | None, _opt("Which arm.  [default: the station's]", of="robots")] = None,
-    rehearse: Rehearse = False,
-    lockstep: Lockstep = False,
+    sim: Rehearse = False,
+    synchronous: Lockstep = False,
     rate: Annotated[float | None, _opt("Of a rehearsal: the robot's clock to the wall's.  [default: 0.2]")] = None,
     scenario: Scenario = None,
     yes: Yes = False,
@@ -181,8 +181,8 @@ def train(
         from guiderail.tools.environments import import_modules
 
         modules = import_modules(modules)  # first, as the station may be in one of them
-    words = {"guidance": guidance, "hold": hold, "reward": reward, "observation": observation}
-    words |= {"uncertainty": uncertainty, "station": station, "robot": robot, "lcm_url": lcm_url}
+    words = {"guidance": guidance, "action_repeat": action_repeat, "reward": reward, "observation": observation}
+    words |= {"fixture_offset": fixture_offset, "station": station, "robot": robot, "lcm_url": lcm_url}
     environment = {k: v for k, v in words.items() if v is not None} | _environment(env)
     if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.datasets.validate import leaves_demonstrations
@@ -191,7 +191,7 @@ def train(
             _say(sentence)
     if _is_robot(environment.get("station")):
         there = {name: environment[name] for name in ("lcm_url", "robot") if name in environment}
-        there |= {"rehearse": rehearse, "lockstep": lockstep} | ({} if rate is None else {"rate": rate})
+        there |= {"rehearse": sim, "lockstep": synchronous} | ({} if rate is None else {"rate": rate})
         given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
         given |= {"ledger": ledger, "imports": modules}
         if task is None or out is None or resume or with_person:
@@ -199,13 +199,13 @@ def train(
                 "on a robot a run begins anew and nobody pushes through a page: name a task and a folder, without "
                 "--resume and --with-person"
             )
-        from guiderail.tools.hardware.connection import Other
+        from guiderail.tools.hardware.connection import RobotConnection
         from guiderail.tools.hardware.train import train_on_robot
 
         found = train_on_robot(
             task,
             out,
-            Other.in_scenario(scenario, **there),
+            RobotConnection.in_scenario(scenario, **there),
             environment=environment,
             given={name: value for name, value in given.items() if value is not None},
             settings=_pairs(setting, "--set", "batch_size=128"),
@@ -214,7 +214,7 @@ def train(
         )
         _print(found, as_json)
         return
-    if rehearse or lockstep or yes or rate is not None or scenario is not None:
+    if sim or synchronous or yes or rate is not None or scenario is not None:
         raise InputError(
             "--rehearse, --lockstep, --rate, --scenario and --yes are for a robot: give --station hardware too"
         )
@@ -244,7 +244,7 @@ def evaluate(
     episodes: Annotated[int, _opt("How many, each with held-out initial conditions.")] = 100,
     seed: Seed = 1_000_000,
     env: Env = None,
-    beside: Annotated[
+    baselines: Annotated[
         str | None,
         _opt(
             "Who else meets the same episodes, comma-separated: rule, {nulls}; or none. The demonstration alone always "
@@ -252,22 +252,26 @@ def evaluate(
             "[default: white, constant and rule; zero too where nothing is demonstrated]"
         ),
     ] = None,
-    fresh: Annotated[bool, _opt("Draw anew in every episode what is hidden in the run.", "--fresh")] = False,
+    resample_offsets: Annotated[
+        bool, _opt("Draw anew in every episode what is hidden in the run.", "--resample-offsets")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Evaluate a run's policy on what training never met, beside policies that learned nothing.
 
     It acts deterministically. The demonstration alone, random actions and a rule written by hand meet the same
     episodes: what they come to is what a success is worth. Their episodes are kept, and not run again. To be a policy
-    for the offset that a run hides, or with --fresh for any, are two claims: the row "claim" of the table says which.
+    for the offset that a run hides, or with --resample-offsets for any, are two claims: the row "evaluation_scope" of the table says which.
     """
     from guiderail.tools.evaluation.evaluate import evaluate as evaluate_run
 
     environment = _environment(env)
-    others = _beside(run, environment, beside)
-    found = evaluate_run(run, episodes=episodes, seed=seed, environment=environment, beside=others, fresh=fresh)
+    others = _beside(run, environment, baselines)
+    found = evaluate_run(
+        run, episodes=episodes, seed=seed, environment=environment, baselines=others, resample_offsets=resample_offsets
+    )
     for name in others:
-        if name not in found["beside"]:
+        if name not in found["baselines"]:
             _say(f"{name} is left out: it was written for other inputs, or to see other things, than there are here")
     # The numbers last: they are what a person looks for.
     _print_differences([] if as_json else found.pop("differs_from_thesis"))
@@ -281,7 +285,7 @@ def robustness(
     seed: Seed = 1_000_000,
     axes: Annotated[str | None, _opt("What is changed, comma-separated: {axes}.  [default: all]")] = None,
     env: Env = None,
-    beside: Annotated[
+    baselines: Annotated[
         str | None,
         _opt("Who else meets the same episodes, comma-separated: rule, {nulls}; or none.  [default: white, rule]"),
     ] = None,
@@ -299,11 +303,11 @@ def robustness(
     from guiderail.tools.evaluation.robustness import robustness as judge
 
     environment = _environment(env)
-    others = _beside(runs[0], environment, beside)
-    if beside is None:
+    others = _beside(runs[0], environment, baselines)
+    if baselines is None:
         others = {name: acts for name, acts in others.items() if name != "constant"}
     found = judge(
-        runs, episodes=episodes, seed=seed, environment=environment, axes=axes, beside=others, out=out, tell=_say
+        runs, episodes=episodes, seed=seed, environment=environment, axes=axes, baselines=others, out=out, tell=_say
     )
     if as_json:
         typer.echo(json.dumps({"table": str(found["table"]), "picture": str(found["picture"]), "rows": found["rows"]}))
@@ -356,13 +360,13 @@ def certify(
 
 @command("replay runs/passage --html replay.html")
 def replay(
-    shown: Shown,
+    shown: EpisodeSpec,
     html: Annotated[Path | None, _opt("The page to write, .html.  [default: replay.html in the run]")] = None,
     seed: Seed = 1_000_000,
     env: Env = None,
     station: Annotated[str | None, _opt("Where the policy acts: rails or arm.")] = None,
     picture: Annotated[Path | None, _opt("Also write what a camera sees of the episode: a file {pictures}.")] = None,
-    policy: PolicyName = "rule",
+    policy: PolicyName = "scripted",
     episodes: Annotated[int | None, _opt("How many held-out episodes there are to pick from.  [default: 4]")] = None,
     imports: OwnTask = None,
 ) -> None:
@@ -388,11 +392,11 @@ def replay(
 
 @command("film runs/passage --out episode.jpg")
 def film(
-    shown: Shown,
+    shown: EpisodeSpec,
     out: Annotated[Path, _opt("The picture to write: a file {pictures}.")],
     seed: Seed = 1_000_000,
     env: Env = None,
-    policy: PolicyName = "rule",
+    policy: PolicyName = "scripted",
     imports: OwnTask = None,
 ) -> None:
     """Draw six moments of an episode, as a camera sees them."""
@@ -667,8 +671,8 @@ def run(
     robot: Annotated[
         str | None, _opt("Of a robot: which arm.  [default: the scenario's, or else iiwa14]", of="robots")
     ] = None,
-    rehearse: Rehearse = False,
-    lockstep: Lockstep = False,
+    sim: Rehearse = False,
+    synchronous: Lockstep = False,
     rate: Rate = 0.2,
     scenario: Scenario = None,
     yes: Yes = False,
@@ -687,19 +691,19 @@ def run(
     the start at a crawl and executes the skill; every control step is recorded. It ends with 0 if the skill was
     executed to its end, and with 1 if a limit, a fault of the status or a key stopped it.
     """
-    from guiderail.tools.hardware.connection import Other
+    from guiderail.tools.hardware.connection import RobotConnection
     from guiderail.tools.hardware.executor import run_policy
 
-    there: dict[str, Any] = {"lcm_url": lcm_url, "rehearse": rehearse, "lockstep": lockstep, "rate": rate}
+    there: dict[str, Any] = {"lcm_url": lcm_url, "rehearse": sim, "lockstep": synchronous, "rate": rate}
     there |= {} if robot is None else {"robot": robot}
-    other = Other.in_scenario(scenario, **there)
+    other = RobotConnection.in_scenario(scenario, **there)
     if episodes is not None:
-        from guiderail.tools.evaluation.scripted import untrained
+        from guiderail.tools.evaluation.scripted import make_baseline
         from guiderail.tools.hardware.evaluate import evaluate_on_robot
         from guiderail.tools.learning.run_folder import RunFolder
 
         config = RunFolder(run).config()
-        acting = None if policy is None else untrained(config.task, policy, config.seed)
+        acting = None if policy is None else make_baseline(config.task, policy, config.seed)
         found = evaluate_on_robot(
             run, other, episodes, station=station, policy=policy or "", acting=acting, yes=yes, out=out, say=_say
         )
@@ -714,7 +718,7 @@ def run(
 def serve_iiwa(
     url: Annotated[str, _opt("The URL of LCM.  [default: LCM's own]")] = "",
     seconds: Annotated[float, _opt("How long, in simulated time.")] = 3600.0,
-    patience: Annotated[float, _opt("How many seconds to wait for a command.")] = 5.0,
+    command_timeout: Annotated[float, _opt("How many seconds to wait for a command.")] = 5.0,
     task: Annotated[str, _opt("What stands in front of it: {tasks}.", of="tasks")] = "BncConnector",
     rate: Annotated[
         float | None, _opt("Go by the wall's clock, or so much slower, and wait for nobody; 1 is real time.")
@@ -732,7 +736,9 @@ def serve_iiwa(
     from guiderail.tools.hardware.sim_driver import serve_iiwa as serve
 
     task = _named(task, imports)[0]
-    is_done = serve(url, seconds, patience, task, rate=rate, offset=_numbers(offset), scenario=scenario, say=_tell)
+    is_done = serve(
+        url, seconds, command_timeout, task, rate=rate, offset=_numbers(offset), scenario=scenario, say=_tell
+    )
     raise typer.Exit(0 if is_done else 1)
 
 
@@ -947,7 +953,7 @@ def _is_robot(station: Any) -> bool:
 def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
     """Null policies and rules by name, for an evaluation; unless named those that the run's task has."""
     from guiderail.tools.environments import changed_environment
-    from guiderail.tools.evaluation.scripted import RULES, untrained
+    from guiderail.tools.evaluation.scripted import SCRIPTED_POLICIES, make_baseline
     from guiderail.tools.learning.run_folder import RunFolder
     from guiderail.tools.visualization.style import is_demonstrated
 
@@ -955,27 +961,27 @@ def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dic
     where = changed_environment(config.task, config.environment, environment)
     if names is None:
         zero = [] if is_demonstrated(where.get("guidance")) else ["zero"]
-        rule = ["rule"] if config.task in RULES and where.get("observation") != "image" else []
-        chosen = [*zero, "white", "constant", *rule]
+        rule = ["scripted"] if config.task in SCRIPTED_POLICIES and where.get("observation") != "image" else []
+        chosen = [*zero, "uniform_random", "constant", *rule]
     else:
         chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
-    return {name: untrained(config.task, name, config.seed) for name in chosen}
+    return {name: make_baseline(config.task, name, config.seed) for name in chosen}
 
 
 def _person() -> Any:
     """Whoever opens the page; nothing goes on before."""
-    from guiderail.tools.teleop.supervisor import PagePerson
+    from guiderail.tools.teleop.supervisor import MeshcatSupervisor
 
-    person = PagePerson(_tell)
+    person = MeshcatSupervisor(_tell)
     person.wait()
     return person
 
 
 def _rule(task: str) -> Any:
     """The rule written by hand for a task, which demonstrates it to a learner."""
-    from guiderail.tools.evaluation.scripted import untrained
+    from guiderail.tools.evaluation.scripted import make_baseline
 
-    return untrained(task, "rule")
+    return make_baseline(task, "scripted")
 
 
 def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int, imports: Sequence[str] | None) -> Any:
@@ -984,12 +990,12 @@ def _episode(shown: str, policy: str, environment: Mapping[str, Any], seed: int,
 
     shown = _named(shown, imports)[0]
     if Path(shown).is_dir() or shown not in CHOICES["tasks"]():
-        return showing.Shown.of_run(Path(shown), environment, seed)
+        return showing.EpisodeSpec.of_run(Path(shown), environment, seed)
     from guiderail.tools.environments import check_environment
-    from guiderail.tools.evaluation.scripted import untrained
+    from guiderail.tools.evaluation.scripted import make_baseline
 
     arguments = check_environment(shown, environment)
-    return showing.Shown(shown, arguments, untrained(shown, policy), policy, policy, seed=seed)
+    return showing.EpisodeSpec(shown, arguments, make_baseline(shown, policy), policy, policy, seed=seed)
 
 
 def _print_differences(differs: Sequence[str], of: str = "") -> None:
@@ -1022,7 +1028,7 @@ def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
     from guiderail.tools.evaluation.metrics import STATISTICS, SYMBOLS
     from guiderail.tools.tables import cell
 
-    columns = [*result.get("beside", ())]
+    columns = [*result.get("baselines", ())]
     said = {key: key if " " in key else key.replace("_", space) for key in result}
     units = {key: STATISTICS[key].unit for key in {*result} & {*STATISTICS}}
     said |= {key: f"{said[key]} [{unit}]" for key, unit in units.items() if unit in SYMBOLS}
@@ -1031,7 +1037,7 @@ def _print(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
     if columns:
         typer.echo("  ".join([" " * width, *(f"{title:<{COLUMN}}" for title in titles)]).rstrip())
     for key, value in result.items():
-        if key == "beside" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
+        if key == "baselines" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
             continue
         cells = [cell(value), *(cell(result[f"{name}_{key}"]) for name in columns if f"{name}_{key}" in result)]
         typer.echo("  ".join([f"{said[key]:<{width}}", *(f"{one:<{COLUMN}}" for one in cells)]).rstrip())

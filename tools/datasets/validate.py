@@ -28,7 +28,7 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
     from guiderail.diagrams.envs.make import resolve  # Drake takes a second
 
     resolved = resolve(task, environment)
-    if "demonstrations" not in resolved.task.knows():
+    if "demonstrations" not in resolved.task.provides():
         return None
     values = resolved.values
     chosen = {name: values[name] for name in ("inverse_length", "lambda_", "beta", "horizon")}
@@ -57,14 +57,14 @@ def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[st
         InputError: if it is neither, or what it holds makes no sense.
     """
     if not is_there(file):
-        from guiderail.models.templates.schema import shipped_skills
+        from guiderail.models.templates.schema import shipped_templates
 
-        if str(file) in shipped_skills():
+        if str(file) in shipped_templates():
             _refuse_fit(fit)
             return check_skill(file, draw)
         raise InputError(
             f"there is no file {file}: name demonstrations (.npz, .csv, a folder), a skill (.yaml) or one of "
-            f"{', '.join(shipped_skills())}"
+            f"{', '.join(shipped_templates())}"
         )
     if file.suffix in ENDINGS or file.is_dir():
         return check_demonstrations(file, draw) | (fitted(file) if fit else {})
@@ -168,11 +168,11 @@ def check_skill(file: Path, draw: Path | None = None) -> dict[str, Any]:
     Raises:
         InputError: if the skill cannot be used.
     """
-    from guiderail.models.templates import load_skill  # it needs Drake, which demonstrations don't
+    from guiderail.models.templates import load_template  # it needs Drake, which demonstrations don't
     from guiderail.models.templates.drawing import draw as draw_skill
     from guiderail.models.templates.validate import validate
 
-    skill = load_skill(file)
+    skill = load_template(file)
     findings = validate(skill)
     errors = [finding.message for finding in findings if finding.is_error]
     if errors:

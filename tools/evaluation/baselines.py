@@ -6,46 +6,46 @@ from functools import partial
 import gymnasium
 import numpy as np
 
-from guiderail.tools.evaluation.rollout import Act, Observer
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn
 
 REPEATS = 10  # decisions that a held action lasts
 TURNS = 0.1  # how likely corner actions turn into another corner at a decision
 
 # Makes the actions of an episode from its random generator and the size of an action.
-Choose = Callable[[np.random.Generator, int], Act]
+Choose = Callable[[np.random.Generator, int], PolicyFn]
 
 
-def zero(rng: np.random.Generator, size: int) -> Act:
+def zero(rng: np.random.Generator, size: int) -> PolicyFn:
     """The action of zero, which leaves guidance to itself: where it has demonstrations, those."""
     return lambda observation: np.zeros(size, np.float32)
 
 
-def white(rng: np.random.Generator, size: int) -> Act:
-    """Uniform in [−1, 1], anew at every decision: an untrained policy."""
+def uniform_random(rng: np.random.Generator, size: int) -> PolicyFn:
+    """Uniform in [−1, 1], anew at every decision: an make_baseline policy."""
     return lambda observation: rng.uniform(-1.0, 1.0, size)
 
 
-def constant(rng: np.random.Generator, size: int) -> Act:
+def constant(rng: np.random.Generator, size: int) -> PolicyFn:
     """One action for the whole episode, uniform in [−1, 1]."""
     return _repeated(lambda: rng.uniform(-1.0, 1.0, size), lambda count: False)
 
 
-def held(rng: np.random.Generator, size: int) -> Act:
+def random_hold(rng: np.random.Generator, size: int) -> PolicyFn:
     """Uniform, each for `REPEATS` decisions: they lead further than white ones."""
     return _repeated(lambda: rng.uniform(-1.0, 1.0, size), lambda count: count % REPEATS == 0)
 
 
-def corners(rng: np.random.Generator, size: int) -> Act:
+def bang_bang(rng: np.random.Generator, size: int) -> PolicyFn:
     """Full deflection, that turns into another corner now and then."""
     return _repeated(lambda: rng.choice([-1.0, 1.0], size), lambda count: rng.uniform() < TURNS)
 
 
-def stuck(rng: np.random.Generator, size: int) -> Act:
+def random_corner(rng: np.random.Generator, size: int) -> PolicyFn:
     """Full deflection into one corner for the whole episode."""
     return _repeated(lambda: rng.choice([-1.0, 1.0], size), lambda count: False)
 
 
-def _repeated(choose: Callable[[], np.ndarray], turns: Callable[[int], bool]) -> Act:
+def _repeated(choose: Callable[[], np.ndarray], turns: Callable[[int], bool]) -> PolicyFn:
     count, action = 0, choose()
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -58,10 +58,12 @@ def _repeated(choose: Callable[[], np.ndarray], turns: Callable[[int], bool]) ->
     return act
 
 
-NULL_POLICIES: dict[str, Choose] = {one.__name__: one for one in (zero, white, constant, held, corners, stuck)}
+BASELINES: dict[str, Choose] = {
+    one.__name__: one for one in (zero, uniform_random, constant, random_hold, bang_bang, random_corner)
+}
 
 
-class NullPolicy(Observer):
+class BaselinePolicy(Callback):
     """Actions that look at nothing, chosen anew for every episode from a random generator of its own."""
 
     def __init__(self, choose: Choose, env: gymnasium.Env, seed: int = 0):
@@ -73,9 +75,9 @@ class NullPolicy(Observer):
         """
         self._choose, self._seed, self._episode = choose, seed, -1
         self._size = int(np.prod(env.action_space.shape or ()))
-        self._act: Act = zero(np.random.default_rng(0), self._size)
+        self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """The next episode's actions."""
         self._episode += 1
         self._act = self._choose(np.random.default_rng([self._seed, self._episode]), self._size)
@@ -85,10 +87,10 @@ class NullPolicy(Observer):
         return self._act(observation)
 
 
-still = partial(NullPolicy, zero)
+still = partial(BaselinePolicy, zero)
 """What acts by zero, for an environment."""
 
 
-def always(env: gymnasium.Env, action: np.ndarray) -> NullPolicy:
+def always(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
     """The same action in every episode."""
-    return NullPolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)
+    return BaselinePolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)

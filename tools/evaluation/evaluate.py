@@ -18,9 +18,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment, make_environment, task_content
 from guiderail.tools.evaluation.baselines import still
-from guiderail.tools.evaluation.metrics import converged_after, summary
+from guiderail.tools.evaluation.metrics import episodes_to_convergence, summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import Act, as_learned, check_seed, rollout, suits
+from guiderail.tools.evaluation.rollout import PolicyFn, as_learned, check_seed, rollout, suits
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
@@ -28,15 +28,15 @@ from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.visualization.style import is_demonstrated
 from research.thesis import differences
 
-CALIBRATION = "calibration"  # the uncertainty under which a run hides an offset of its own
+CALIBRATION = "per_run"  # the uncertainty under which a run hides an offset of its own
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode
 COMPARED = (
-    "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "worst_violation",
-    "worst_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
+    "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "max_commanded_violation",
+    "max_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
 )  # fmt: skip
 SERIES = {
-    "policy": "the policy", "demonstration": "demonstration alone", "zero": "no action", "white": "white noise",
-    "constant": "one constant action", "rule": "the rule written by hand",
+    "policy": "the policy", "demonstration": "demonstration alone", "zero": "no action", "uniform_random": "white noise",
+    "constant": "one constant action", "scripted": "the rule written by hand",
 }  # fmt: skip
 """Who acts in a series of held-out episodes, in words."""
 
@@ -46,7 +46,7 @@ COLLISIONS = ("collisions", "collision_steps")  # of them, those that a task dec
 
 def evaluate_policy(
     env: gymnasium.Env,
-    act: Act,
+    act: PolicyFn,
     *,
     episodes: int,
     seed: int = HELD_OUT_SEED,
@@ -80,7 +80,7 @@ def evaluate_policy(
 
 def evaluate_run(
     config: RunConfig,
-    policy: Callable[[gymnasium.Env], Act],
+    policy: Callable[[gymnasium.Env], PolicyFn],
     environment: Mapping[str, Any] | None = None,
     **how: Any,
 ) -> pd.DataFrame:
@@ -113,8 +113,8 @@ def evaluate(
     episodes: int = 100,
     seed: int = HELD_OUT_SEED,
     environment: Mapping[str, Any] | None = None,
-    beside: Mapping[str, Callable[[gymnasium.Env], Act]] | None = None,
-    fresh: bool = False,
+    baselines: Mapping[str, Callable[[gymnasium.Env], PolicyFn]] | None = None,
+    resample_offsets: bool = False,
 ) -> dict[str, Any]:
     """Evaluates the policy that a run left, beside policies that learned nothing.
 
@@ -128,11 +128,11 @@ def evaluate(
         fresh: what is hidden and constant in the run is drawn anew in every episode.
 
     Returns:
-        `claim`, what the policy is then judged as; the statistics `COMPARED`, each also as `demonstration_<name>` (the
+        `evaluation_scope`, what the policy is then judged as; the statistics `COMPARED`, each also as `demonstration_<name>` (the
         same episodes before anything was learned; None where guidance has no demonstration, and those of collisions
         where the task declares no signal of them) and as `<policy>_<name>`
-        for those beside it; `beside`, the names of those that can act in this environment; `episodes` and `seed`;
-        `converged_after` and `trained_episodes` of the training; `differs_from_thesis`, in what task, learner and
+        for those beside it; `baselines`, the names of those that can act in this environment; `episodes` and `seed`;
+        `episodes_to_convergence` and `trained_episodes` of the training; `differs_from_thesis`, in what task, learner and
         environment do, in words.
 
     Raises:
@@ -143,8 +143,8 @@ def evaluate(
     config, policy, trained = folder.config(), Policy.load(folder.path), folder.episodes()
     where = changed_environment(config.task, config.environment, environment or {})
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
-    claimed = claim(config.task, where, fresh)
-    if fresh:
+    claimed = evaluation_scope(config.task, where, resample_offsets)
+    if resample_offsets:
         how["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # what a run hides is drawn from its own seed
             raise InputError(
@@ -152,15 +152,15 @@ def evaluate(
                 f"{config.seed + 1}"
             )
     alone = {"demonstration": still} if is_demonstrated(where.get("guidance")) else {}
-    them: dict[str, Callable[[gymnasium.Env], Act]] = {**alone, **(beside or {})}
+    them: dict[str, Callable[[gymnasium.Env], PolicyFn]] = {**alone, **(baselines or {})}
     series = {
         name: f"series {number} of {1 + len(them)}: {SERIES.get(name, name)}"
         for number, name in enumerate(("policy", *them), start=1)
     }
     rows = evaluate_run(config, partial(as_learned, policy), where, words=series["policy"], **how)
-    if where == config.environment and not fresh:
+    if where == config.environment and not resample_offsets:
         write_atomically(learned_file(folder.path, len(trained), seed, episodes), table_text(rows).encode())
-    kept, judged = folder.path / "beside", {}
+    kept, judged = folder.path / "baselines", {}
     for name, acts in them.items():
         if kept_file(kept, name, config, where, **how).exists():
             print(f"{series[name]}: kept from before, and not run again", file=sys.stderr, flush=True)
@@ -173,12 +173,12 @@ def evaluate(
     counts = _counts_collisions(config.task)
     statistics = {**summary(rows, COMPARED), **others}
     return {
-        "claim": claimed,
+        "evaluation_scope": claimed,
         **{key: value if counts or not key.endswith(COLLISIONS) else None for key, value in statistics.items()},
-        "beside": [*judged],
+        "baselines": [*judged],
         "episodes": episodes,
         "seed": seed,
-        "converged_after": converged_after(trained),
+        "episodes_to_convergence": episodes_to_convergence(trained),
         "trained_episodes": len(trained),
         "differs_from_thesis": differences(replace(config, environment=where)),
     }
@@ -189,7 +189,7 @@ def learned_file(run: Path, trained: int, seed: int, episodes: int) -> Path:
     return run / "held_out" / f"learned-{trained}-{seed}-{episodes}.csv"
 
 
-def claim(task: str, environment: Mapping[str, Any], fresh: bool) -> str:
+def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets: bool) -> str:
     """What a policy is judged as: one for what a run hides, or one for whatever may be hidden.
 
     Args:
@@ -200,20 +200,20 @@ def claim(task: str, environment: Mapping[str, Any], fresh: bool) -> str:
     Raises:
         InputError: if a run hides nothing that could be drawn anew.
     """
-    if fresh and not _can_hide(task):
-        raise InputError(f"a run of {task} hides nothing that could be drawn anew: leave --fresh out")
-    if not draws_held_out(task):
+    if resample_offsets and not _can_hide(task):
+        raise InputError(f"a run of {task} hides nothing that could be drawn anew: leave --resample-offsets out")
+    if not has_held_out_distribution(task):
         return f"a policy for conditions as in training: {task} declares none that training never draws"
     if not _can_hide(task):
         return "a policy for starts that training never drew"
-    if fresh or not hides(task, environment):
+    if resample_offsets or not hides(task, environment):
         return "a policy for any offset: a new one in every episode"
-    return "a policy for the one offset that is hidden in this run, and for no other (--fresh: for any)"
+    return "a policy for the one offset that is hidden in this run, and for no other (--resample-offsets: for any)"
 
 
 def hides(task: str, environment: Mapping[str, Any]) -> bool:
     """Whether something is hidden that is the same in all episodes of a run, unless `new_run` draws it anew."""
-    return _can_hide(task) and environment.get("uncertainty", CALIBRATION) == CALIBRATION
+    return _can_hide(task) and environment.get("fixture_offset", CALIBRATION) == CALIBRATION
 
 
 def _can_hide(task: str) -> bool:
@@ -221,20 +221,20 @@ def _can_hide(task: str) -> bool:
 
 
 def _counts_collisions(task: str) -> bool:
-    """Whether a task declares what a collision is; a `Condition` that ends an episode as one is none of the ledger."""
+    """Whether a task declares what a collision is; a `TerminationTerm` that ends an episode as one is none of the ledger."""
     return task not in TASKS.names() or TASKS.get(task).declares_collision()
 
 
-def draws_held_out(task: str) -> bool:
+def has_held_out_distribution(task: str) -> bool:
     """Whether a task declares conditions that training never draws; one that is registered as Gymnasium's can't."""
-    return task not in TASKS.names() or TASKS.get(task).draws_held_out
+    return task not in TASKS.names() or TASKS.get(task).has_held_out_distribution
 
 
 def judged_once(
     kept: Path,
     name: str,
     config: RunConfig,
-    acts: Callable[[gymnasium.Env], Act],
+    acts: Callable[[gymnasium.Env], PolicyFn],
     environment: Mapping[str, Any],
     *,
     about: Any = None,
@@ -280,7 +280,7 @@ class _NotSuitedError(Exception):
     """A policy whose observations or actions are not an environment's."""
 
 
-def _suited(policy: Callable[[gymnasium.Env], Act], env: gymnasium.Env) -> Act:
+def _suited(policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> PolicyFn:
     """What acts, if its observations and actions are the environment's."""
     if not suits(policy, env):
         raise _NotSuitedError

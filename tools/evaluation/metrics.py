@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from guiderail.diagrams.envs.trace import Trace, mean_jerk
+from guiderail.diagrams.envs.trace import EpisodeTrace, mean_jerk
 from guiderail.models.common.errors import InputError
 
 CONFIDENCE = 0.95
@@ -100,7 +100,7 @@ class Episode:
     """An episode that is over."""
 
     index: int
-    trace: Trace  # every control step
+    trace: EpisodeTrace  # every control step
     ledger: Mapping[str, float]  # the safety ledger's row
     total: float  # of the rewards
     terms: Mapping[str, float]  # the sum of each of the reward's terms
@@ -158,12 +158,12 @@ COLUMNS = (
         for which in ("commanded", "measured")
         for part, of, unit in (("linear", "position", "m/s³"), ("angular", "orientation (0 without one)", "rad/s³"))
     ),
-    Metric("worst_violation", SLACK, "how far any command was outside", _ledger("worst_commanded_violation")),
-    Metric("worst_measured_violation", SLACK, "the same of measured poses", _ledger("worst_measured_violation")),
+    Metric("max_commanded_violation", SLACK, "how far any command was outside", _ledger("max_commanded_violation")),
+    Metric("max_measured_violation", SLACK, "the same of measured poses", _ledger("max_measured_violation")),
     Metric("collisions", "", "collisions that began, by the safety ledger, however long", _count("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
-    Metric("saturations", STEPS, "control steps with an actuator at its limit", _count("saturations")),
-    Metric("fallbacks", STEPS, "control steps that repeated the last safe command", _count("fallbacks")),
+    Metric("saturated_steps", STEPS, "control steps with an actuator at its limit", _count("saturated_steps")),
+    Metric("fallback_steps", STEPS, "control steps that repeated the last safe command", _count("fallback_steps")),
 )
 
 
@@ -174,7 +174,7 @@ def episode_row(episode: Episode) -> dict[str, Any]:
 
 
 WORDS = ("termination", "fault")  # the latter at a robot
-COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturations", "fallbacks")
+COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturated_steps", "fallback_steps")
 
 
 def checked_rows(rows: pd.DataFrame, where: Path) -> pd.DataFrame:
@@ -205,15 +205,15 @@ def first_in_a_row(good: Iterable[bool], number: int) -> int | None:
 
 def own(rows: pd.DataFrame) -> pd.DataFrame:
     """Those of a run's episodes in which its learner acted, and nobody that it learned from."""
-    return rows[rows["demonstrated"] == 0] if "demonstrated" in rows else rows
+    return rows[rows["is_demonstration"] == 0] if "is_demonstration" in rows else rows
 
 
-def converged_after(rows: pd.DataFrame) -> int | None:
+def episodes_to_convergence(rows: pd.DataFrame) -> int | None:
     """Episodes before the first ten in a row that succeed, those ten not counted (the thesis's figure 3.8).
 
     What was demonstrated counts as an episode, and as no success.
     """
-    return first_in_a_row((rows["success"] == 1) & (rows.get("demonstrated", 0) == 0), 10)
+    return first_in_a_row((rows["success"] == 1) & (rows.get("is_demonstration", 0) == 0), 10)
 
 
 def avoids_obstacle_from(rows: pd.DataFrame, cost: float = 1.0, in_a_row: int = 5) -> int | None:
@@ -262,7 +262,7 @@ def _wilson(end: int) -> Callable[[pd.DataFrame], float | None]:
 
 
 def _force_since_converged(rows: pd.DataFrame) -> float | None:
-    converged = converged_after(rows)
+    converged = episodes_to_convergence(rows)
     return None if converged is None else _mean("mean_squared_force", slice(converged, None))(rows)
 
 
@@ -276,7 +276,12 @@ _STATISTICS = (
     Metric("success_low", "", "lower end of the success rate's 95 % interval (Wilson)", _wilson(0)),
     Metric("success_high", "", "upper end of the success rate's 95 % interval (Wilson)", _wilson(1)),
     Metric("success_rate_last_10", "", "success rate of the last ten of them", _succeeded(LAST)),
-    Metric("converged_after", "episodes", "before the first ten in a row that succeed, its own", converged_after),
+    Metric(
+        "episodes_to_convergence",
+        "episodes",
+        "before the first ten in a row that succeed, its own",
+        episodes_to_convergence,
+    ),
     Metric("mean_return", "reward", "return, mean over episodes", _mean("return")),
     Metric("mean_return_last_10", "reward", "return, mean over the last ten episodes", _mean("return", LAST)),
     Metric("mean_steps", STEPS, "length, mean over episodes", _mean("steps")),
@@ -284,14 +289,19 @@ _STATISTICS = (
     Metric("peak_force", "N", "largest force of any episode", _largest("peak_force")),
     Metric("mean_force", "N", "each episode's mean force, mean over episodes", _mean("mean_force")),
     Metric("mean_squared_force", "N²", "the same of the squared force", _mean("mean_squared_force")),
-    Metric(SINCE, "N²", "the same of the episodes after `converged_after`", _force_since_converged),
-    Metric("worst_violation", SLACK, "of a command, the largest of any episode", _largest("worst_violation")),
-    Metric("worst_measured_violation", SLACK, "of a measured pose", _largest("worst_measured_violation")),
-    Metric("violating_episodes", "", "episodes with a command outside", _violating("worst_violation")),
-    Metric("measured_violating_episodes", "", "those with a pose outside", _violating("worst_measured_violation")),
+    Metric(SINCE, "N²", "the same of the episodes after `episodes_to_convergence`", _force_since_converged),
+    Metric(
+        "max_commanded_violation",
+        SLACK,
+        "of a command, the largest of any episode",
+        _largest("max_commanded_violation"),
+    ),
+    Metric("max_measured_violation", SLACK, "of a measured pose", _largest("max_measured_violation")),
+    Metric("violating_episodes", "", "episodes with a command outside", _violating("max_commanded_violation")),
+    Metric("measured_violating_episodes", "", "those with a pose outside", _violating("max_measured_violation")),
     Metric("collisions", "", "collisions that began in all episodes, by the safety ledger", _total("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision, in all", _total("collision_steps")),
-    Metric("fallbacks", STEPS, "repeated safe commands, in all episodes", _total("fallbacks")),
+    Metric("fallback_steps", STEPS, "repeated safe commands, in all episodes", _total("fallback_steps")),
     Metric("ended_in_success", "", "episodes that ended in success", _ended("success")),
     Metric("ended_in_collision", "", "episodes that a collision ended", _ended("collision")),
     Metric("ended_in_spill", "", "episodes that a spill ended", _ended("spill")),

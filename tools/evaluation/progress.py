@@ -58,7 +58,7 @@ class EpisodeProgress:
         self._recent = [*self._recent, (float(row["success"]), float(row["return"]))]
         if self._window is not None:
             self._recent = self._recent[-self._window :]
-        self._worst = max(self._worst, float(row["worst_violation"]))
+        self._worst = max(self._worst, float(row["max_commanded_violation"]))
         self._bar.update(self._task, completed=self._done, said=self.says())
         now = time.monotonic()
         due = self._seen == 1 or self._done == self._episodes or now - self._said > 10

@@ -23,7 +23,7 @@ from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, hides, judged_once
 from guiderail.tools.evaluation.metrics import wilson
-from guiderail.tools.evaluation.rollout import Act, as_learned
+from guiderail.tools.evaluation.rollout import PolicyFn, as_learned
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import is_demonstrated, label, legend, new_figure, save_figure
@@ -77,7 +77,7 @@ def _offsets(environment: Environment, value: float) -> dict[str, Any]:
 
     if "offset_range" not in environment:
         raise InputError("nothing here has an offset whose range could be another")
-    trained = environment["offset_range"] or OFFSET_RANGES[environment["uncertainty"]]
+    trained = environment["offset_range"] or OFFSET_RANGES[environment["fixture_offset"]]
     return {"offset_range": tuple(value * distance for distance in trained)}
 
 
@@ -233,7 +233,7 @@ EPISODES = 30  # of each who at each place
 LONGEST = 120  # characters of a table's name
 POLICY, DEMONSTRATION = "policy", "demonstration"  # names in the table
 
-Acts = Callable[[gymnasium.Env], Act]
+Acts = Callable[[gymnasium.Env], PolicyFn]
 
 
 @dataclass(frozen=True)
@@ -262,7 +262,7 @@ def robustness(
     seed: int = HELD_OUT_SEED,
     environment: Mapping[str, Any] | None = None,
     axes: str | None = None,
-    beside: Mapping[str, Acts] | None = None,
+    baselines: Mapping[str, Acts] | None = None,
     out: Path | None = None,
     tell: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Any]:
@@ -296,7 +296,7 @@ def robustness(
     who = list(policies)
     if is_demonstrated(first.environment.get("guidance")):
         who.append(_Who(DEMONSTRATION, still, first.config, first.environment))
-    for name, acts in (beside or {}).items():
+    for name, acts in (baselines or {}).items():
         if name != "zero" or len(who) == len(policies):
             who.append(_Who(name, acts, first.config, first.environment))
     out = runs[0] / "robustness" / str(first.environment.get("station", "")) if out is None else out
@@ -316,7 +316,7 @@ def robustness(
     asked = dict(environment or {})
     asked |= {"episodes": episodes} if episodes != EPISODES else {}
     asked |= {"seed": seed} if seed != HELD_OUT_SEED else {}
-    others = [*([one.name for one in policies] if len(policies) > 1 else []), *sorted(beside or {})]
+    others = [*([one.name for one in policies] if len(policies) > 1 else []), *sorted(baselines or {})]
     table = write_table(out / f"{_called(axes, asked, others)}.csv", rows).with_suffix(".csv")
     picture = draw(table.with_suffix(".png"), rows)
     return {"table": table, "picture": picture, "rows": rows, "policies": [one.name for one in policies]}
@@ -396,7 +396,7 @@ def _row(place: Point, name: str, judged: pd.DataFrame) -> dict[str, Any]:
         "peak_force_mean": float(judged["peak_force"].mean()),
         "peak_force": float(judged["peak_force"].max()),
         "mean_steps": float(judged["steps"].mean()),
-        "worst_violation": float(judged["worst_violation"].max()),
+        "max_commanded_violation": float(judged["max_commanded_violation"].max()),
     }
 
 

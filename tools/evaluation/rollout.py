@@ -13,12 +13,12 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.metrics import Episode, episode_row
 
-Act = Callable[[np.ndarray], np.ndarray]
+PolicyFn = Callable[[np.ndarray], np.ndarray]
 COUNTED = {"collision", "saturation", "fallback"}
 
 
 @dataclass(frozen=True)
-class Decision:
+class Transition:
     """A decision of an episode and what followed; `info` is the environment's."""
 
     observation: np.ndarray
@@ -35,21 +35,21 @@ class Decision:
         return self.terminated or self.truncated
 
 
-class Observer:
+class Callback:
     """Watches an episode: a learner, a camera, a witness."""
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """Called after the environment was reset."""
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Called after every decision."""
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Called with the episode's row; what it returns are further columns."""
         return {}
 
 
-class EnvObserver(Observer):
+class EnvCallback(Callback):
     """One that also looks at what an environment's step doesn't return.
 
     Attributes:
@@ -78,8 +78,8 @@ def check_seed(seed: int) -> None:
 
 def rollout(
     env: gymnasium.Env,
-    act: Act,
-    *observers: Observer,
+    act: PolicyFn,
+    *observers: Callback,
     index: int = 0,
     seed: int | None = None,
     held_out: bool = False,
@@ -102,43 +102,43 @@ def rollout(
         else env.reset(seed=seed, options=None if options is None else dict(options))[0]
     )
     tally = _Tally(env)
-    watching = (tally, *([act] if isinstance(act, Observer) and act not in observers else []), *observers)
+    watching = (tally, *([act] if isinstance(act, Callback) and act not in observers else []), *observers)
     for observer in watching:
-        observer.begin()
+        observer.on_episode_start()
     over = False
     while not over:
         action = act(observation)
         following, reward, terminated, truncated, info = env.step(action)
-        decision = Decision(observation, action, float(reward), following, terminated, truncated, info)
+        decision = Transition(observation, action, float(reward), following, terminated, truncated, info)
         for observer in watching:
-            observer.see(decision)
+            observer.on_step(decision)
         observation, over = following, decision.is_last
     row = tally.row(index)
     for observer in watching:
-        row |= observer.end(row)
+        row |= observer.on_episode_end(row)
     return row
 
 
-class Paths(EnvObserver):
+class Paths(EnvCallback):
     """Adds the poses that were commanded and measured, (n, O) each, to an episode's row."""
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """`commanded` and `measured`."""
         trace = self.base.trace
         return {"commanded": trace.commanded.copy(), "measured": trace.measured.copy()}
 
 
-class _Tally(EnvObserver):
+class _Tally(EnvCallback):
     """Adds up what the trace and the ledger don't hold. (Where the simulation failed or a person ended the episode
     there is no ledger: then what was seen until there takes its place.)
     """
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         self._terms: dict[str, float] = dict.fromkeys(self.base.task.reward_terms, 0.0)
-        self._total, self._worst = 0.0, {"worst_commanded_violation": -np.inf, "worst_measured_violation": -np.inf}
+        self._total, self._worst = 0.0, {"max_commanded_violation": -np.inf, "max_measured_violation": -np.inf}
         self._last: Mapping[str, Any] = {}
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         self._total += decision.reward
         self._last = decision.info
         for name, key in zip(self._worst, ("constraint_violation", "measured_violation"), strict=True):
@@ -174,7 +174,7 @@ def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
     return env.reset(seed=seed, options={"held_out": True} | options)[0]
 
 
-def suits(acts: Callable[[gymnasium.Env], Act], env: gymnasium.Env) -> bool:
+def suits(acts: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
     """Whether what it says to a few observations are actions of the environment's shape.
 
     A few, because a rule may look at a number that isn't there only in the middle of an episode.
@@ -187,7 +187,7 @@ def suits(acts: Callable[[gymnasium.Env], Act], env: gymnasium.Env) -> bool:
     return found == {env.action_space.shape}
 
 
-def as_learned(policy: Policy, env: gymnasium.Env) -> Act:
+def as_learned(policy: Policy, env: gymnasium.Env) -> PolicyFn:
     """A learned policy, in an environment that may be another one than where it learned.
 
     Raises:

@@ -10,17 +10,17 @@ import numpy as np
 
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTRE, POSE_SCALE
-from guiderail.diagrams.tasks.bnc_connector.scripted import lever_rule
+from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure
 from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS
 from guiderail.diagrams.tasks.grid_clamp.task import CENTRE, SCALE, make_skill
-from guiderail.diagrams.tasks.narrow_passage.task import slalom
-from guiderail.diagrams.tasks.pouring.scripted import aiming_person, blind_person, person
+from guiderail.diagrams.tasks.narrow_passage.task import scripted_slalom
+from guiderail.diagrams.tasks.pouring.scripted import scripted_pour, scripted_pour_aimed, scripted_pour_blind
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.objects.bnc_connector.motion import MM, RIM
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
-from guiderail.tools.evaluation.baselines import NULL_POLICIES, NullPolicy
-from guiderail.tools.evaluation.rollout import Act
+from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
+from guiderail.tools.evaluation.rollout import PolicyFn
 
 # The connector: where the demonstrations search the rim, the rule moves against the contact torque.
 GAIN = 1.5  # of the action per scaled contact torque
@@ -32,7 +32,7 @@ PUSHING = 0.2  # scaled force along z from which the plug counts as standing on 
 TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y = 0, 3, 9, 10, 11
 
 
-def reactive_rule(observation: np.ndarray) -> np.ndarray:
+def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
     """Moves in x and y against the torque, which says on which side of its mouth the plug stands; (2,)."""
     step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
     if not (SEARCH[0] < step < SEARCH[1] and observation[Z] > ON_RIM and observation[FORCE_Z] > PUSHING):
@@ -57,7 +57,7 @@ LIFT = make_skill().parameters["lift"]  # part of it, upwards
 STIFFNESS = Impedance().stiffness[0]
 
 
-def searching_rule(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
+def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
     """Inputs (3,) in [−1, 1] for an observation (6,), without a memory.
 
     Above the table it goes to where the first lane begins. On it, it presses lightly and follows the lanes, each the
@@ -87,9 +87,9 @@ def _along_lanes(xy: np.ndarray) -> np.ndarray:
     return np.array([0.0, SEARCH_SPEED])
 
 
-def gentle_rule(observation: np.ndarray) -> np.ndarray:
+def scripted_gentle_search(observation: np.ndarray) -> np.ndarray:
     """The same, that never pushes harder than is allowed where the clamp is hard."""
-    return searching_rule(observation, GENTLE_SNAP_FORCE)
+    return scripted_search(observation, GENTLE_SNAP_FORCE)
 
 
 def straight_descent(observation: np.ndarray) -> np.ndarray:
@@ -97,52 +97,59 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
     return np.array([0.0, 0.0, -1.0])
 
 
-RULES: dict[str, dict[str, Act]] = {
-    "BncConnector": {"reactive_rule": reactive_rule, "lever_rule": lever_rule},
+SCRIPTED_POLICIES: dict[str, dict[str, PolicyFn]] = {
+    "BncConnector": {
+        "scripted_torque_search": scripted_torque_search,
+        "scripted_center_of_pressure": scripted_center_of_pressure,
+    },
     "GridClamp": {
-        "searching_rule": searching_rule,
-        "gentle_rule": gentle_rule,
+        "scripted_search": scripted_search,
+        "scripted_gentle_search": scripted_gentle_search,
         "straight_descent": straight_descent,
     },
-    "NarrowPassage": {"slalom": slalom},
-    "Pouring": {"person": person, "aiming_person": aiming_person, "blind_person": blind_person},
+    "NarrowPassage": {"scripted_slalom": scripted_slalom},
+    "Pouring": {
+        "scripted_pour": scripted_pour,
+        "scripted_pour_aimed": scripted_pour_aimed,
+        "scripted_pour_blind": scripted_pour_blind,
+    },
 }
 
 
-# What "rule" means at a difficulty; a task's first rule otherwise.
+# What "scripted" means at a difficulty; a task's first rule otherwise.
 AT_DIFFICULTY = {
-    ("BncConnector", "hard"): "lever_rule",
-    ("GridClamp", "hard"): "gentle_rule",
-    ("Pouring", "hard"): "aiming_person",
+    ("BncConnector", "hard"): "scripted_center_of_pressure",
+    ("GridClamp", "hard"): "scripted_gentle_search",
+    ("Pouring", "hard"): "scripted_pour_aimed",
 }
 
 
-def find_rule(task: str, name: str, difficulty: str = "standard") -> Act:
-    """A task's rule by its name; "rule" is the one that was written for that difficulty.
+def find_scripted_policy(task: str, name: str, difficulty: str = "standard") -> PolicyFn:
+    """A task's rule by its name; "scripted" is the one that was written for that difficulty.
 
     Raises:
         InputError: if there is no such rule.
     """
-    rules = RULES.get(task, {})
-    if name == "rule" and rules:
+    rules = SCRIPTED_POLICIES.get(task, {})
+    if name == "scripted" and rules:
         return rules[AT_DIFFICULTY.get((task, difficulty), next(iter(rules)))]
     if name not in rules:
-        raise InputError(f"{task} has no policy {name!r}: {did_you_mean(name, [*rules, *NULL_POLICIES])}")
+        raise InputError(f"{task} has no policy {name!r}: {did_you_mean(name, [*rules, *BASELINES])}")
     return rules[name]
 
 
-def untrained(task: str, name: str, seed: int = 0) -> Callable[[gymnasium.Env], Act]:
+def make_baseline(task: str, name: str, seed: int = 0) -> Callable[[gymnasium.Env], PolicyFn]:
     """A null policy or a task's rule by its name: what acts, for an environment.
 
     Raises:
         InputError: if there is neither.
     """
-    if name in NULL_POLICIES:
-        return lambda env: NullPolicy(NULL_POLICIES[name], env, seed)
-    find_rule(task, name)
+    if name in BASELINES:
+        return lambda env: BaselinePolicy(BASELINES[name], env, seed)
+    find_scripted_policy(task, name)
 
-    def acting(env: gymnasium.Env) -> Act:
+    def acting(env: gymnasium.Env) -> PolicyFn:
         choice = getattr(cast(Any, env.unwrapped).task.declaration, "choice", None)
-        return find_rule(task, name, getattr(choice, "difficulty", "standard"))
+        return find_scripted_policy(task, name, getattr(choice, "difficulty", "standard"))
 
     return acting

@@ -14,9 +14,9 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from guiderail.diagrams.envs.trace import Trace
+from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import EnvObserver
+from guiderail.tools.evaluation.rollout import EnvCallback
 from guiderail.tools.files import write_atomically
 
 SLACK = "how far outside of the constraint: negative is slack"
@@ -32,15 +32,15 @@ MEANINGS = {
     "wrench_i": ("N, Nm", "of the surroundings on the tool"),
     "saturation": ("", "the greatest demand on an actuator beyond its limit, 0 within"),
     "collision": ("", "whether the robot touched what it must not"),
-    "holding": ("", "whether the watchdog held the last safe pose"),
+    "command_timed_out": ("", "whether the watchdog held the last safe pose"),
     "fallback": ("", "whether guidance commanded something safe instead of what was asked for"),
     "state": ("", "number of the template's state, where there is one"),
     "reward": ("reward", "of the control step"),
 }
-_FLAGS = {"collision", "holding", "fallback"}
+_FLAGS = {"collision", "command_timed_out", "fallback"}
 
 
-class Ledger(EnvObserver):
+class StepLog(EnvCallback):
     """Writes what an episode's control steps were as the episode ends: before a checkpoint can know of it.
 
     Attributes:
@@ -57,7 +57,7 @@ class Ledger(EnvObserver):
         self._folder = folder
         self.seconds = 0.0
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Writes; adds no column."""
         started = time.perf_counter()
         write_ledger(ledger_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
@@ -70,7 +70,7 @@ def ledger_file(folder: Path, episode: int) -> Path:
     return folder / f"episode-{episode:06d}.parquet"
 
 
-def table(trace: Trace, episode: int) -> pa.Table:
+def table(trace: EpisodeTrace, episode: int) -> pa.Table:
     """An episode's control steps, a row each, with the columns of `MEANINGS` that its environment knows."""
     number = len(trace)
     columns: dict[str, np.ndarray] = {"episode": np.full(number, episode, np.int32), "step": np.arange(number)}

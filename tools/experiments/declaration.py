@@ -66,7 +66,7 @@ class Method(_Strict):
     seeds: tuple[Whole, ...] | None = None  # the study's unless given: what doesn't depend on them needs one
 
 
-class JudgedOn(_Strict):
+class EvalSet(_Strict):
     """Held-out episodes that a policy is judged on."""
 
     name: str = "held out"  # in the table
@@ -87,11 +87,11 @@ class Sweep(_Strict):
     options: dict[str, Any] = {}  # of each reset
     episodes: Whole = Field(default=40, ge=1)  # at each value
 
-    def judged_on(self, value: float) -> JudgedOn:
+    def eval_set(self, value: float) -> EvalSet:
         """What is judged at one of its values."""
         name = f"{self.quantity} {value:g}"
         file = re.sub(r"\W+", "_", self.quantity).strip("_") + f"-{value:g}-{{mark}}-{{digest}}.csv"
-        return JudgedOn(name=name, env=self.at[value], options=self.options, episodes=self.episodes, file=file)
+        return EvalSet(name=name, env=self.at[value], options=self.options, episodes=self.episodes, file=file)
 
 
 class Ratio(_Strict):
@@ -111,10 +111,10 @@ class Study(_Strict):
     learner: LearnerChoice = LearnerChoice()  # of every method that learns
     methods: dict[FolderName, Method] = Field(min_length=1)  # by name, of a folder and a legend
     seeds: tuple[Whole, ...] = Field(min_length=1)  # of training
-    marks: tuple[
+    after_episodes: tuple[
         Annotated[Whole, Field(ge=1)], ...
     ] = ()  # training episodes after which a policy is judged; all of them unless given
-    judged_on: tuple[JudgedOn, ...] = (JudgedOn(),)  # each of them, after every mark
+    eval_set: tuple[EvalSet, ...] = (EvalSet(),)  # each of them, after every mark
     sweeps: tuple[Sweep, ...] = ()  # of which each value is judged on, too
     statistics: tuple[str, ...] = ()  # of training, besides the usual ones
     ratios: tuple[Ratio, ...] = ()  # what is said beside the table
@@ -130,9 +130,9 @@ class Study(_Strict):
         return names
 
     @property
-    def judgements(self) -> tuple[JudgedOn, ...]:
+    def judgements(self) -> tuple[EvalSet, ...]:
         """All that is judged on, sweeps included."""
-        return (*self.judged_on, *(sweep.judged_on(value) for sweep in self.sweeps for value in sweep.at))
+        return (*self.eval_set, *(sweep.eval_set(value) for sweep in self.sweeps for value in sweep.at))
 
     @model_validator(mode="after")
     def _is_told_apart(self) -> Study:
@@ -148,8 +148,10 @@ class Study(_Strict):
     @model_validator(mode="after")
     def _reaches_its_marks(self) -> Study:
         learning = [method.learner for method in self.methods.values() if method.policy == LEARNED]
-        lasting = [learner.episodes or self.learner.episodes or max(self.marks, default=0) for learner in learning]
-        if beyond := [mark for mark in self.marks if lasting and mark > max(lasting)]:
+        lasting = [
+            learner.episodes or self.learner.episodes or max(self.after_episodes, default=0) for learner in learning
+        ]
+        if beyond := [mark for mark in self.after_episodes if lasting and mark > max(lasting)]:
             raise ValueError(
                 f"no method learns as long as the mark {beyond[0]}: leave it out, or give more than {max(lasting)} "
                 "learner episodes"
@@ -182,7 +184,7 @@ class Smoothness(_Strict):
     program: Literal["smoothness"]  # what makes it this kind of study
     name: FolderName  # of the tables
     episodes: Whole = Field(default=4, ge=1)  # of each way to explore
-    kappa: float = Field(default=1.0, gt=0.0)  # κ of all of them
+    action_scale: float = Field(default=1.0, gt=0.0)  # κ of all of them
     outputs: Literal["all", "xy"] = "all"  # which of them are explored
     seed: Whole = Field(default=0, ge=0)  # of the actions
 
@@ -244,7 +246,7 @@ def _sentence(error: ValidationError) -> str:
     where = ", ".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         kinds: tuple[type[BaseModel], ...] = (
-            Study, Method, LearnerChoice, JudgedOn, Sweep, Ratio, Certifiable, *PROGRAMS.values()
+            Study, Method, LearnerChoice, EvalSet, Sweep, Ratio, Certifiable, *PROGRAMS.values()
         )  # fmt: skip
         known = {str(field.alias) for kind in kinds for field in kind.model_fields.values()}
         return f"{where} is nothing that a study has: {did_you_mean(str(first['loc'][-1]), known)}"

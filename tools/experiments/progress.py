@@ -64,7 +64,7 @@ class Board:
         self._ended += 1
         self._failed += bool(outcome.failure)
         words = "".join(
-            f": {row['judged_on']} {row['success_rate']:.0%}" for row in outcome.rows[-1:] if row["judged_on"]
+            f": {row['eval_set']} {row['success_rate']:.0%}" for row in outcome.rows[-1:] if row["eval_set"]
         )
         words = f": failed: {outcome.failure}" if outcome.failure else words
         again = f" (by worker {workers}, those before it were lost)" if workers > 1 else ""
@@ -93,7 +93,7 @@ class Board:
 
     @staticmethod
     def _state(job: Any, table: Any) -> str:
-        episodes = job.marks[-1]
+        episodes = job.after_episodes[-1]
         try:
             done = table.read_bytes().count(b"\n") - 1
         except OSError:

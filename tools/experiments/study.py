@@ -33,9 +33,9 @@ from guiderail.tools.environments import (
 from guiderail.tools.evaluation.baselines import always
 from guiderail.tools.evaluation.evaluate import cached, evaluate_run
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import Act, as_learned, rollout
-from guiderail.tools.evaluation.scripted import untrained
-from guiderail.tools.experiments.declaration import LEARNED, JudgedOn, Ratio, Study
+from guiderail.tools.evaluation.rollout import PolicyFn, as_learned, rollout
+from guiderail.tools.evaluation.scripted import make_baseline
+from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Ratio, Study
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.experiments.progress import Board
 from guiderail.tools.experiments.sweep import broken, draw_sweeps
@@ -51,15 +51,15 @@ BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
 
 TRAINING = (
-    "episodes", "success_rate", "success_rate_last_10", "converged_after", "mean_return_last_10", "mean_force",
-    "mean_squared_force", "mean_squared_force_since_converged", "peak_force", "worst_violation",
-    "worst_measured_violation", "violating_episodes", "measured_violating_episodes", "collisions",
-    "ended_in_success", "ended_in_collision", "ended_in_spill", "fallbacks", "jerk_commanded_linear_first_10",
+    "episodes", "success_rate", "success_rate_last_10", "episodes_to_convergence", "mean_return_last_10", "mean_force",
+    "mean_squared_force", "mean_squared_force_since_converged", "peak_force", "max_commanded_violation",
+    "max_measured_violation", "violating_episodes", "measured_violating_episodes", "collisions",
+    "ended_in_success", "ended_in_collision", "ended_in_spill", "fallback_steps", "jerk_commanded_linear_first_10",
     "jerk_commanded_angular_first_10", "jerk_measured_linear_first_10", "total_steps", "wall_time",
 )  # fmt: skip
 JUDGED = (
     "episodes", "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "mean_force",
-    "mean_squared_force", "peak_force", "worst_violation", "violating_episodes", "collisions",
+    "mean_squared_force", "peak_force", "max_commanded_violation", "violating_episodes", "collisions",
     "ended_in_collision", "ended_in_spill",
 )  # fmt: skip
 
@@ -79,7 +79,7 @@ class Job:
         return self.study.methods[self.method].policy == LEARNED
 
     @property
-    def marks(self) -> list[int]:
+    def after_episodes(self) -> list[int]:
         """Training episodes after which it is judged; 0 for what doesn't learn.
 
         Raises:
@@ -88,10 +88,10 @@ class Job:
         if not self.learns:
             return [0]
         own, common = self.study.methods[self.method].learner.episodes, self.study.learner.episodes
-        episodes = own or common or max(self.study.marks, default=0)
+        episodes = own or common or max(self.study.after_episodes, default=0)
         if not episodes:
             raise InputError(f"how long does {self.method} learn? give the study marks, or its learner episodes")
-        return sorted({mark for mark in self.study.marks if mark < episodes} | {episodes})
+        return sorted({mark for mark in self.study.after_episodes if mark < episodes} | {episodes})
 
     def config(self, episodes: int) -> RunConfig:
         """Its run of so many episodes.
@@ -110,7 +110,7 @@ class Job:
     @cached_property
     def folder(self) -> RunFolder:
         """Where its run is, and what was evaluated of it."""
-        config = self.config(self.marks[-1])
+        config = self.config(self.after_episodes[-1])
         words = {"method": self.method, "seed": self.seed, "episodes": config.episodes}
         return RunFolder(self.out / self.study.folder.format(**words, algorithm=config.learner.algorithm))
 
@@ -176,12 +176,12 @@ def study_command(study: Study, out: Path, engine: Engine | None = None, table: 
     if study.sweeps:
         result["picture"] = str(draw_sweeps(study, rows, out / f"{table or study.name}.png"))
         result |= broken(study, rows)
-    for (method, mark, judged), group in rows.groupby(["method", "mark", "judged_on"], sort=False):
+    for (method, mark, judged), group in rows.groupby(["method", "after_episodes", "eval_set"], sort=False):
         after = f" after {mark} episodes" if mark else ""
         if judged:
             result[f"{method}{after}, {judged}, success of each seed"] = each(group, "success_rate", "{:.0%}")
         if mark:
-            result[f"{method}{after}, converged after, each seed"] = each(group, "training_converged_after")
+            result[f"{method}{after}, converged after, each seed"] = each(group, "training_episodes_to_convergence")
     for one in study.ratios:
         result |= ratio(rows, one)
     result["differs_from_thesis"] = differing(study)
@@ -206,7 +206,7 @@ def differing(study: Study) -> dict[str, list[str]]:
 def differences_of(study: Study, method: str) -> list[str]:
     """In what a method differs from the thesis, in words; without a learner's settings where nobody learns."""
     job = Job(study, method, study.seeds[0], Path())
-    return differences(job.config(job.marks[-1]), learns=job.learns)
+    return differences(job.config(job.after_episodes[-1]), learns=job.learns)
 
 
 def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
@@ -264,19 +264,19 @@ def _make_log_folder(job: Job) -> None:
 
 def _check(job: Job) -> None:
     """Refuses what makes no sense before anything runs."""
-    config, policy = job.config(job.marks[-1]), job.study.methods[job.method].policy
+    config, policy = job.config(job.after_episodes[-1]), job.study.methods[job.method].policy
     if policy not in (LEARNED, BEST_CONSTANT):
-        untrained(job.study.task, policy)
+        make_baseline(job.study.task, policy)
     for judged in job.study.judgements:
         sampled = {name: low for name, (low, _) in judged.sampled.items()}
         where = changed_environment(config.task, config.environment, judged.env)
         configure(job.study.task, where | sampled, episodes=1)
         check_reset(job.study.task, judged.options)
-    for mark, judged in itertools.product(job.marks, job.study.judgements):
+    for mark, judged in itertools.product(job.after_episodes, job.study.judgements):
         _refuse_other_rows(job, _evaluated_file(job, mark, judged), judged, mark)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
-        for mark in job.marks:
+        for mark in job.after_episodes:
             if not all(_evaluated_file(job, mark, judged).exists() for judged in job.study.judgements):
                 _refuse_gone(job, mark)
     elif job.learns:
@@ -309,24 +309,24 @@ def run_job(job: Job) -> list[dict[str, Any]]:
     """The rows of a job; it is trained and judged where it isn't yet."""
     import_modules(job.study.imports)
     rows = []
-    for mark in job.marks:
+    for mark in job.after_episodes:
         trained = _train(job, mark).iloc[:mark]
         algorithm = job.config(mark).learner.algorithm if job.learns else ""
         policy = job.study.methods[job.method].policy
-        row = {"method": job.method, "policy": policy, "algorithm": algorithm, "seed": job.seed, "mark": mark}
+        row = {"method": job.method, "policy": policy, "algorithm": algorithm, "seed": job.seed, "after_episodes": mark}
         training = summary(trained, (*TRAINING, *job.study.statistics), "training_")
         training["folder"] = str(job.folder.path)
         for judged in job.study.judgements:
-            rows.append(row | {"judged_on": judged.name} | summary(_evaluated(job, mark, judged), JUDGED) | training)
+            rows.append(row | {"eval_set": judged.name} | summary(_evaluated(job, mark, judged), JUDGED) | training)
         if not job.study.judgements:
-            rows.append(row | {"judged_on": ""} | training)
+            rows.append(row | {"eval_set": ""} | training)
     return rows
 
 
 def _is_done(job: Job) -> bool:
     """Whether its rows only have to be read."""
-    evaluated = (_evaluated_file(job, mark, judged) for mark in job.marks for judged in job.study.judgements)
-    return all(file.exists() for file in evaluated) and not any(_is_to_train(job, mark) for mark in job.marks)
+    evaluated = (_evaluated_file(job, mark, judged) for mark in job.after_episodes for judged in job.study.judgements)
+    return all(file.exists() for file in evaluated) and not any(_is_to_train(job, mark) for mark in job.after_episodes)
 
 
 def _is_to_train(job: Job, mark: int) -> bool:
@@ -348,7 +348,7 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
         from guiderail.tools.learning.trainer import train
 
         config = job.config(mark)
-        shows = untrained(config.task, "rule") if config.learner.demonstration_episodes else None
+        shows = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
         train(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=shows)
     rows = folder.episodes()
     if len(rows) == mark and not (copy / "policy.json").exists():
@@ -358,10 +358,10 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
 
 
 def _policy_folder(job: Job, mark: int) -> Path:
-    return job.folder.path / "marks" / str(mark)
+    return job.folder.path / "after_episodes" / str(mark)
 
 
-def _digest(job: Job, judged: JudgedOn | None = None, mark: int = 0) -> str:
+def _digest(job: Job, judged: EvalSet | None = None, mark: int = 0) -> str:
     """What a file was evaluated with: other episodes of the same name, another method's, or those of a policy that
     learned longer, are not taken for these.
     """
@@ -381,7 +381,7 @@ def _digest(job: Job, judged: JudgedOn | None = None, mark: int = 0) -> str:
     return hashlib.blake2b(told.encode(), digest_size=4).hexdigest()
 
 
-def _evaluated(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
+def _evaluated(job: Job, mark: int, judged: EvalSet) -> pd.DataFrame:
     """Rows of held-out episodes, from the file where they are known already."""
     file = _evaluated_file(job, mark, judged)
     _refuse_other_rows(job, file, judged, mark)
@@ -400,7 +400,7 @@ def _says_of_what(file: Path) -> Path:
     return file.with_name(f".{file.name}.digest")
 
 
-def _refuse_other_rows(job: Job, file: Path, judged: JudgedOn, mark: int) -> None:
+def _refuse_other_rows(job: Job, file: Path, judged: EvalSet, mark: int) -> None:
     """Another study's rows of the same name are not taken for these."""
     says = _says_of_what(file)
     if "{digest}" not in judged.file and says.exists() and says.read_text() != _digest(job, judged, mark):
@@ -410,12 +410,12 @@ def _refuse_other_rows(job: Job, file: Path, judged: JudgedOn, mark: int) -> Non
         )
 
 
-def _evaluated_file(job: Job, mark: int, judged: JudgedOn) -> Path:
-    words = {"name": judged.name.replace(" ", "_"), "mark": mark, "episodes": judged.episodes}
+def _evaluated_file(job: Job, mark: int, judged: EvalSet) -> Path:
+    words = {"name": judged.name.replace(" ", "_"), "after_episodes": mark, "episodes": judged.episodes}
     return job.folder.path / judged.file.format(**words, digest=_digest(job, judged, mark))
 
 
-def _evaluate(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
+def _evaluate(job: Job, mark: int, judged: EvalSet) -> pd.DataFrame:
     config, policy = job.config(mark), _policy(job, mark)
     environment = as_arguments(changed_environment(config.task, config.environment, judged.env))
     every, tables = judged.every if judged.sampled else judged.episodes, []
@@ -428,7 +428,7 @@ def _evaluate(job: Job, mark: int, judged: JudgedOn) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], Act]:
+def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], PolicyFn]:
     """What acts, for an environment."""
     name = job.study.methods[job.method].policy
     if name == LEARNED:
@@ -438,7 +438,7 @@ def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], Act]:
     if name == BEST_CONSTANT:
         best = _best_constant(job)
         return lambda env: always(env, best)
-    return untrained(job.study.task, name, job.seed)
+    return make_baseline(job.study.task, name, job.seed)
 
 
 def _best_constant(job: Job) -> np.ndarray:

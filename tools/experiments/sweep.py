@@ -75,7 +75,7 @@ def break_words(values: Sequence[float], points: Sequence[tuple[float, float, fl
 
 def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], list[tuple[float, float, float]]]:
     """At which values of the quantity a method was judged, the easiest first, and its success with its interval."""
-    points = {value: _success(rows, name, sweep.judged_on(value).name) for value in sweep.at}
+    points = {value: _success(rows, name, sweep.eval_set(value).name) for value in sweep.at}
     known = {value: point for value, point in points.items() if point is not None}
     return list(known), list(known.values())
 
@@ -97,8 +97,8 @@ def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | s
 
 def _success(rows: pd.DataFrame, method: str, judged: str) -> tuple[float, float, float] | None:
     """The success rate of all seeds, and the lowest and the highest end of their intervals."""
-    found = rows[(rows["method"] == method) & (rows["judged_on"] == judged)]
-    found = found[found["mark"] == found["mark"].max()]
+    found = rows[(rows["method"] == method) & (rows["eval_set"] == judged)]
+    found = found[found["after_episodes"] == found["after_episodes"].max()]
     if not len(found):
         return None
     episodes = found["episodes"].astype(int)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from guiderail.diagrams.hardware.clock import Pace, RealTime, StepByStep, check_rate
+from guiderail.diagrams.hardware.clock import Clock, LockstepClock, WallClock, check_rate
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
@@ -21,7 +21,7 @@ from guiderail.tools.hardware.scenario import load_scenario
 
 
 @contextmanager
-def companion(code: str) -> Iterator[subprocess.Popen]:
+def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen]:
     """Runs Python code in a process of its own, which is gone after the block, and wherever this process is.
 
     It holds one end of a pipe, and the system closes the other one even where this process is killed.
@@ -57,7 +57,7 @@ REHEARSAL_RATE = 0.2
 
 
 @dataclass(frozen=True)
-class Other:
+class RobotConnection:
     """The other end of the bus.
 
     Args:
@@ -74,13 +74,13 @@ class Other:
 
     lcm_url: str = ""
     robot: str = DEFAULT_ROBOT
-    rehearse: bool = False
-    lockstep: bool = False
+    sim: bool = False
+    synchronous: bool = False
     rate: float = REHEARSAL_RATE
     scenario: Path | None = None
 
     @classmethod
-    def in_scenario(cls, file: Path | None, **given: Any) -> Other:
+    def in_scenario(cls, file: Path | None, **given: Any) -> RobotConnection:
         """What a scenario's file says, if there is one, and for the rest what is given by name.
 
         Raises:
@@ -93,16 +93,16 @@ class Other:
             if given.get(name) and theirs and given[name] != theirs:
                 option = name.replace("_", "-")
                 raise InputError(f"{file} says {theirs}, and --{option} {given[name]}: leave one of the two out")
-        rehearse = said.is_simulated or given.get("rehearse", False)
-        url = given.get("lcm_url", "") if rehearse else said.lcm_url or given.get("lcm_url", "")
-        return cls(**given | {"lcm_url": url, "robot": said.robot, "scenario": file, "rehearse": rehearse})
+        sim = said.is_simulated or given.get("rehearse", False)
+        url = given.get("lcm_url", "") if sim else said.lcm_url or given.get("lcm_url", "")
+        return cls(**given | {"lcm_url": url, "robot": said.robot, "scenario": file, "rehearse": sim})
 
     def __post_init__(self) -> None:
-        if self.lockstep and not self.rehearse:
+        if self.synchronous and not self.sim:
             raise InputError("a real robot waits for nobody: --lockstep is for a rehearsal")
-        if self.rehearse and self.robot != DEFAULT_ROBOT:
+        if self.sim and self.robot != DEFAULT_ROBOT:
             raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver to rehearse with, not {self.robot}")
-        if self.rehearse and self.lcm_url:
+        if self.sim and self.lcm_url:
             raise InputError(
                 "a rehearsal has a bus of its own, so that no real driver ever hears it: leave --lcm-url out"
             )
@@ -111,26 +111,26 @@ class Other:
     def environment(self, station: str) -> dict[str, Any]:
         """Options of an environment whose station is there."""
         url = self.lcm_url
-        if self.rehearse:
+        if self.sim:
             # With a time to live of zero no message leaves this machine.
             url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
         options: dict[str, Any] = {"station": station, "lcm_url": url, "robot": self.robot}
         # A simulated robot starts with the command.
-        return options | ({"robot_timeout": 60.0} if self.rehearse else {})
+        return options | ({"robot_timeout": 60.0} if self.sim else {})
 
-    def paces(self, station: HardwareStation) -> tuple[Pace, RealTime]:
+    def paces(self, station: HardwareStation) -> tuple[Clock, WallClock]:
         """How time passes, and the wall's clock, whether it counts or not."""
         channel, period = station.driver.status_channel, station.period
-        clock = RealTime(station.lcm, channel, period, self.rate if self.rehearse else 1.0)
-        return (StepByStep(station.lcm, PATIENCE, channel, period) if self.lockstep else clock), clock
+        clock = WallClock(station.lcm, channel, period, self.rate if self.sim else 1.0)
+        return (LockstepClock(station.lcm, PATIENCE, channel, period) if self.synchronous else clock), clock
 
-    def timing(self, station: HardwareStation, clock: RealTime) -> Mapping[str, Any]:
+    def timing(self, station: HardwareStation, clock: WallClock) -> Mapping[str, Any]:
         """How regularly the robot was heard, where the wall's clock counts."""
-        if self.lockstep:
+        if self.synchronous:
             return {}
         return {
             "milliseconds_between_statuses": {
-                "period": station.period / (self.rate if self.rehearse else 1.0) / MM,
+                "period": station.period / (self.rate if self.sim else 1.0) / MM,
                 "99 %": clock.gaps.quantile(0.99) / MM,
                 "longest": clock.gaps.longest / MM,
             }
@@ -145,12 +145,12 @@ class Other:
             url: of the bus.
             imports: what registers the task: modules, files and task folders.
         """
-        if not self.rehearse:
+        if not self.sim:
             yield
             return
-        arguments = ["serve-iiwa", "--url", url, "--task", task, "--patience", "300", "--seconds", str(LONGEST)]
-        arguments += [] if self.lockstep else ["--rate", str(self.rate)]
+        arguments = ["serve-iiwa", "--url", url, "--task", task, "--command-timeout", "300", "--seconds", str(LONGEST)]
+        arguments += [] if self.synchronous else ["--rate", str(self.rate)]
         arguments += [word for module in imports for word in ("--import", module)]
         arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]
-        with companion(f"from guiderail.tools.cli.main import main; main({arguments!r})"):
+        with subprocess_tied_to_parent(f"from guiderail.tools.cli.main import main; main({arguments!r})"):
             yield

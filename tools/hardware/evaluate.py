@@ -15,26 +15,34 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import Act, rollout
+from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.files import write_atomically
-from guiderail.tools.hardware.connection import Other
+from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.executor import on_a_robot
-from guiderail.tools.hardware.session import Say, at_robot
+from guiderail.tools.hardware.session import Say, robot_session
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import table_text
 from guiderail.tools.teleop.teleoperator import no_pauses
 
-FOUND = ("episodes", "success_rate", "success_low", "success_high", "mean_return", "worst_violation", "peak_force")
+FOUND = (
+    "episodes",
+    "success_rate",
+    "success_low",
+    "success_high",
+    "mean_return",
+    "max_commanded_violation",
+    "peak_force",
+)
 
 
 def evaluate_on_robot(
     run: Path,
-    other: Other,
+    other: RobotConnection,
     episodes: int,
     *,
     station: str = "hardware",
     policy: str = "",
-    acting: Callable[[gymnasium.Env], Act] | None = None,
+    acting: Callable[[gymnasium.Env], PolicyFn] | None = None,
     yes: bool = False,
     out: Path | None = None,
     say: Say = print,
@@ -76,14 +84,14 @@ def evaluate_on_robot(
     with RunFolder(path.parent).locked():
         if path.exists():
             raise InputError(f"{path} already exists: name another folder with --out, or remove it")
-        with at_robot(config, other, yes=yes, say=say) as robot:
+        with robot_session(config, other, yes=yes, say=say) as robot:
             env = robot.env
             act = learned if acting is None else acting(env)
             assert act is not None
             with no_pauses(), EpisodeProgress(episodes, name=policy or config.task, window=None) as progress:
                 try:
                     for index in range(episodes):
-                        rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.rehearse))
+                        rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.sim))
                         env.idle()
                         write(rows)
                         env.idle()

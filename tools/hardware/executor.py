@@ -17,8 +17,8 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.assemble import SkillDiagram
 from guiderail.diagrams.envs.config import Options
 from guiderail.diagrams.envs.make import make_skill, resolve
-from guiderail.diagrams.envs.trace import Trace
-from guiderail.diagrams.hardware.clock import NewMessages, Pace, hurry
+from guiderail.diagrams.envs.trace import EpisodeTrace
+from guiderail.diagrams.hardware.clock import Clock, MessageCounter, set_realtime_priority
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -26,16 +26,24 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.control.joint_status import FAULTS, Fault
 from guiderail.models.policy import Policy
-from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.step_log import ledger_file, table, write_ledger
 from guiderail.tools.files import check_writable, write_atomically
-from guiderail.tools.hardware.connection import Other
-from guiderail.tools.hardware.preflight import LISTENING, Check, check_robot, read_out
+from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.tools.hardware.preflight import LISTENING, Check, check_robot, confirm_checks
 from guiderail.tools.hardware.slow_motion import CRAWL, crawl, distance, is_near
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.teleop.teleoperator import listening, no_pauses
 
-SIGNALS = {"wrench": 6, "saturation": 1, "holding": 1, "fallback": 1, "commanded_violation": 1, "fault": 1, "phase": 1}
+SIGNALS = {
+    "wrench": 6,
+    "saturation": 1,
+    "command_timed_out": 1,
+    "fallback": 1,
+    "commanded_violation": 1,
+    "fault": 1,
+    "phase": 1,
+}
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
 WARM_UP = 0.1  # [s], less than a driver's hold-off
 
@@ -56,14 +64,14 @@ class Outcome:
         return 0 if self.words == "done" else 1
 
 
-class Operation:
+class SkillExecutor:
     """A skill on a robot: what is checked, the approach, the execution, and what was recorded of it.
 
     Attributes:
         trace: of the executed control steps.
     """
 
-    def __init__(self, task: InsertionTask, skill: SkillDiagram, pace: Pace, is_stopped: Callable[[], bool]):
+    def __init__(self, task: InsertionTask, skill: SkillDiagram, pace: Clock, is_stopped: Callable[[], bool]):
         """
         Args:
             task: whose skill it is.
@@ -75,14 +83,14 @@ class Operation:
         self._diagram = skill.diagram
         self._skills_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
         # The guidance begins with its first control step. So another station on the same bus approaches the start.
-        self._station = self._skills_station.alike(task.world())
+        self._station = self._skills_station.clone(task.workcell())
         self._steps = round(skill.control_period / self._skills_station.period)
-        self._start = task.start(np.random.default_rng(0))
+        self._start = task.start_pose(np.random.default_rng(0))
         self._simulator = self._initialized()
         # A deputy may need a status or two to be heard; nothing is sent so soon.
-        self._heard = NewMessages(self._station.lcm, self._station.driver.command_channel)
+        self._heard = MessageCounter(self._station.lcm, self._station.driver.command_channel)
         pace.advance(self._simulator, self._station, LISTENING)
-        self.trace = Trace(skill.num_steps, 6, skill.control_period, SIGNALS)
+        self.trace = EpisodeTrace(skill.num_steps, 6, skill.control_period, SIGNALS)
         self._joints: dict[str, list[np.ndarray]] = {name: [] for name in JOINT_SIGNALS}
 
     def _initialized(self) -> Simulator:
@@ -147,7 +155,7 @@ class Operation:
         if station is self._skills_station:
             before = station.GetMyContextFromRoot(root)
             self._simulator = self._initialized()
-            self._station.take_over(self._simulator.get_mutable_context(), before)
+            self._station.copy_state_from(self._simulator.get_mutable_context(), before)
 
     def _acting(self) -> tuple[HardwareStation, Context]:
         """The station that acts now, and the root context."""
@@ -161,10 +169,10 @@ class Operation:
         context = station.GetMyContextFromRoot(root)
         phase, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("phase", "fault"))
         force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
-        if phase in (Phase.DAMPING, Phase.OFF):
+        if phase in (ArmState.DAMPING, ArmState.OFF):
             return Outcome(Fault(fault), FAULTS[Fault(fault)], len(self.trace))
         if self._is_stopped():
-            return Outcome(Fault.ASKED, FAULTS[Fault.ASKED], len(self.trace))
+            return Outcome(Fault.USER_STOP, FAULTS[Fault.USER_STOP], len(self.trace))
         if force > limit:
             return Outcome(
                 Fault.FORCE, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", len(self.trace)
@@ -175,7 +183,7 @@ class Operation:
         station, context = self._station, self._simulator.get_mutable_context()
         desired = station.get_desired_pose_input_port()
         ready = 0.0
-        while station.get_phase_output_port().Eval(context)[0] != Phase.RUNNING:
+        while station.get_phase_output_port().Eval(context)[0] != ArmState.RUNNING:
             desired.FixValue(context, here)
             ready += self._skill.control_period
             if (stopped := self._step()) is not None:
@@ -200,7 +208,7 @@ class Operation:
         simulator = Simulator(self._diagram)
         station.start(simulator)
         context = simulator.get_mutable_context()
-        station.take_over(station.GetMyMutableContextFromRoot(context), before)
+        station.copy_state_from(station.GetMyMutableContextFromRoot(context), before)
         self._simulator = simulator
         while len(self.trace) < self._skill.num_steps:
             stopped = self._step()
@@ -263,7 +271,7 @@ def _next_number(folder: Path) -> int:
 
 def run_policy(
     run: Path,
-    other: Other,
+    other: RobotConnection,
     *,
     station: str = "hardware",
     yes: bool = False,
@@ -296,17 +304,17 @@ def run_policy(
     with other.standing_in(config.task, environment["lcm_url"], config.imports), listening() as keys:
         pace, clock = other.paces(bus)
         say(f"waiting for {other.robot} on {environment['lcm_url'] or 'LCM'}, channel {bus.driver.status_channel}")
-        operation = Operation(task, skill, pace, keys.stops)
+        operation = SkillExecutor(task, skill, pace, keys.stops)
         checks = operation.checks()
-        read_out(checks, say, again=operation.checks_again, is_confirmed=yes)
-        if not other.lockstep and not hurry():
+        confirm_checks(checks, say, again=operation.checks_again, is_confirmed=yes)
+        if not other.synchronous and not set_realtime_priority():
             say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
         say(keys.words())
         found: dict[str, Any] = {
             "task": config.task,
             "run": folder.path.name,
             "robot": other.robot,
-            "rehearsal": other.rehearse,
+            "rehearsal": other.sim,
             "checks": {check.name: check.words for check in checks},
         }
         with no_pauses():

@@ -20,7 +20,7 @@ def _channel(driver: Driver) -> str:
     return driver.status_channel + "_PLACES"
 
 
-class Places:
+class PartRandomizer:
     """Draws where the parts of a task are, and tells a simulated robot, which puts them there."""
 
     def __init__(self, task: InsertionTask, lcm: DrakeLcmInterface, driver: Driver, seed: int):
@@ -42,10 +42,10 @@ class Places:
 
 
 def put(lcm: DrakeLcmInterface, driver: Driver, task: InsertionTask, robot: SimulatedIiwa, context: Context) -> None:
-    """Has a simulated robot do what `Places` say, whenever its bus is heard; `context` is the root context."""
+    """Has a simulated robot do what `PartRandomizer` say, whenever its bus is heard; `context` is the root context."""
 
     def move(message: bytes) -> None:
         fixture, workpiece = json.loads(message)
-        task.move(robot, context, np.array(fixture), np.array(workpiece))
+        task.set_part_offsets(robot, context, np.array(fixture), np.array(workpiece))
 
     lcm.Subscribe(_channel(driver), move)

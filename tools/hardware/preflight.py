@@ -53,7 +53,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     payload = sum(body.default_mass() for body in arm.tool)
     load, along = station.load_of_force(positions).max(), station.impedance.limits[:3]
-    limits, has_deputy = station.limits, station.has_deputy(context)
+    limits, has_safety_monitor = station.limits, station.has_safety_monitor(context)
     nobody = "nobody stands by: start guiderail stand-by on the driver's machine"
     somebody = "somebody commands it: end the other program, or wait until the deputy has brought the arm to rest"
     by_itself = "needed by no driver of this kind: it stops by itself where commands stop"
@@ -61,8 +61,12 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
         Check("robot", f"{name}, {len(positions)} joints, {station.driver.status_channel}"),
         Check(
             "deputy",
-            by_itself if station.driver.stops_by_itself else "stands by at the robot" if has_deputy else nobody,
-            station.driver.stops_by_itself or has_deputy,
+            by_itself
+            if station.driver.has_command_timeout
+            else "stands by at the robot"
+            if has_safety_monitor
+            else nobody,
+            station.driver.has_command_timeout or has_safety_monitor,
         ),
         Check(
             "joints",
@@ -90,7 +94,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
     ]
 
 
-def read_out(
+def confirm_checks(
     checks: Sequence[Check],
     say: Callable[[str], None],
     *,

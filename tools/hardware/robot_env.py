@@ -14,12 +14,12 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.env import GuidedEnv
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
-from guiderail.diagrams.hardware.clock import NewMessages, Pace
+from guiderail.diagrams.hardware.clock import Clock, MessageCounter
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.models.control.joint_status import FAULTS, Fault
-from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.preflight import LISTENING, Check, check_robot
 from guiderail.tools.hardware.slow_motion import back, crawl, distance, is_near
 from guiderail.tools.teleop.teleoperator import Keys
@@ -60,9 +60,9 @@ class RobotEnv(GuidedEnv):
         station: HardwareStation,
         elsewhere: HardwareStation,
         start: np.ndarray,
-        pace: Pace,
+        pace: Clock,
         *,
-        hold: int,
+        action_repeat: int,
         keys: Keys,
         go_on: Callable[[str], None],
         say: Say,
@@ -82,7 +82,7 @@ class RobotEnv(GuidedEnv):
             places: called with random numbers and a reset's options when the arm is at the start: where the parts
                 are is drawn anew, as in a simulation, and returned.
         """
-        super().__init__(task, hold=hold)
+        super().__init__(task, action_repeat=action_repeat)
         self._places = places
         self._skills, self._elsewhere, self._start, self._pace = station, elsewhere, start, pace
         self._keys, self._go_on, self._say = keys, go_on, say
@@ -90,7 +90,7 @@ class RobotEnv(GuidedEnv):
         self._acting, self._is_in_step = elsewhere, False
         self._moving = self._initialized()
         # A deputy may need a status or two to be heard; nothing is sent so soon.
-        self._heard = NewMessages(self._elsewhere.lcm, self._elsewhere.driver.command_channel)
+        self._heard = MessageCounter(self._elsewhere.lcm, self._elsewhere.driver.command_channel)
         self._pass(LISTENING)
         self._way_back: list[np.ndarray] = []
         self.fault = Fault.NONE
@@ -133,7 +133,7 @@ class RobotEnv(GuidedEnv):
     def _hand_over(self, simulator: Simulator, station: HardwareStation) -> None:
         before = self._mine
         station.start(simulator)
-        station.take_over(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), before)
+        station.copy_state_from(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), before)
         if station is self._skills:
             self.simulator = simulator
         else:
@@ -224,11 +224,11 @@ class RobotEnv(GuidedEnv):
         self._pass(self._steps)
         mine = self._mine
         phase, fault = (int(self._acting.GetOutputPort(name).Eval(mine)[0]) for name in ("phase", "fault"))
-        if phase in (Phase.DAMPING, Phase.OFF):
+        if phase in (ArmState.DAMPING, ArmState.OFF):
             raise RobotStoppedError(Fault(fault))
         if self._keys.stops():
             self._acting.stop(self._root)
-            raise RobotStoppedError(Fault.ASKED)
+            raise RobotStoppedError(Fault.USER_STOP)
 
     # Motions between episodes.
 
@@ -294,10 +294,10 @@ class RobotEnv(GuidedEnv):
     def _take_over(self) -> None:
         """Until the arm follows."""
         self._elsewhere_acts()
-        if self._elsewhere.get_phase_output_port().Eval(self._mine)[0] == Phase.WAITING:
+        if self._elsewhere.get_phase_output_port().Eval(self._mine)[0] == ArmState.WAITING:
             self._pace.begin()  # nothing was sent yet: how long nobody listened is no gap between statuses
         here, waited = self.pose, 0.0
-        while self._elsewhere.get_phase_output_port().Eval(self._mine)[0] != Phase.RUNNING:
+        while self._elsewhere.get_phase_output_port().Eval(self._mine)[0] != ArmState.RUNNING:
             self._command(here)
             waited += self.task.control_period
             if waited > PATIENCE:
@@ -321,7 +321,7 @@ class RobotEnv(GuidedEnv):
 
     def _resume(self) -> None:
         """Asks, and goes on, if the arm is at rest."""
-        if self._acting.get_phase_output_port().Eval(self._mine)[0] != Phase.OFF:
+        if self._acting.get_phase_output_port().Eval(self._mine)[0] != ArmState.OFF:
             return
         fault = Fault(int(self._acting.get_fault_output_port().Eval(self._mine)[0]))
         self._go_on(FAULTS[fault])

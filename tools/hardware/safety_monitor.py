@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 from guiderail.diagrams.envs.make import resolve
 from guiderail.diagrams.hardware.bus import open_bus
-from guiderail.diagrams.hardware.clock import hurry
-from guiderail.diagrams.hardware.monitor import Deputy
+from guiderail.diagrams.hardware.clock import set_realtime_priority
+from guiderail.diagrams.hardware.monitor import SafetyMonitor
 from guiderail.diagrams.hardware.station import find_driver, safety_limits
-from guiderail.diagrams.stations.arm import KnownArm
+from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 
@@ -30,10 +30,10 @@ def stand_by(url: str, robot: str, task: str, *, say: Callable[[str], None] = pr
     declared = resolve(task, {}).task
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: name an insertion")
-    plant = KnownArm(declared.world(), robot).plant
+    plant = ArmControllerPlant(declared.workcell(), robot).plant
     lcm = open_bus(url)
-    deputy = Deputy(lcm, driver, plant, safety_limits(plant, driver))
-    words = "" if hurry() else "; the system serves this process as any other"
+    deputy = SafetyMonitor(lcm, driver, plant, safety_limits(plant, driver))
+    words = "" if set_realtime_priority() else "; the system serves this process as any other"
     say(f"standing by on {driver.command_channel} of {url or 'LCM'}{words}")
     before = deputy.duty
     while True:

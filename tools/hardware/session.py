@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from guiderail.diagrams.envs.assemble import assemble
+from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.make import make_guidance, make_station, resolve
-from guiderail.diagrams.hardware.clock import hurry
+from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.tools.hardware.connection import Other
-from guiderail.tools.hardware.part_randomization import Places
-from guiderail.tools.hardware.preflight import confirm, read_out
+from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.tools.hardware.part_randomization import PartRandomizer
+from guiderail.tools.hardware.preflight import confirm, confirm_checks
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.teleop.teleoperator import listening
@@ -28,7 +28,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class AtRobot:
+class RobotSession:
     """What episodes need: the environment, and how regularly the robot was heard until now."""
 
     env: RobotEnv
@@ -36,7 +36,7 @@ class AtRobot:
 
 
 @contextmanager
-def at_robot(config: RunConfig, other: Other, *, yes: bool, say: Say) -> Iterator[AtRobot]:
+def robot_session(config: RunConfig, other: RobotConnection, *, yes: bool, say: Say) -> Iterator[RobotSession]:
     """Waits for the robot, reads out what is assumed of it, and has that confirmed.
 
     In a rehearsal a reset draws what it does in a simulation, and the simulated robot's parts are put there.
@@ -52,7 +52,7 @@ def at_robot(config: RunConfig, other: Other, *, yes: bool, say: Say) -> Iterato
     """
     resolved = resolve(config.task, config.environment)
     task = resolved.task
-    if not isinstance(task, InsertionTask) or task.seen_by_robot() is None:
+    if not isinstance(task, InsertionTask) or task.observable_success() is None:
         raise InputError(f"nobody wrote down how a robot tells that {config.task} is done: learn it in a simulation")
     if task.choice.reward in task.simulated_rewards:
         raise InputError(f"the reward {task.choice.reward!r} is of what a simulation alone knows: choose another")
@@ -60,31 +60,31 @@ def at_robot(config: RunConfig, other: Other, *, yes: bool, say: Say) -> Iterato
     torch.set_num_threads(1)
     station = make_station(resolved)
     assert isinstance(station, HardwareStation)
-    diagram = assemble(task, station, make_guidance(resolved, station))
-    start = task.start(np.random.default_rng(0))
+    diagram = build_task_diagram(task, station, make_guidance(resolved, station))
+    start = task.start_pose(np.random.default_rng(0))
     with other.standing_in(config.task, station.lcm_url, config.imports), listening() as keys:
         pace, clock = other.paces(station)
         say(f"waiting for {other.robot} on {station.lcm_url or 'LCM'}, channel {station.driver.status_channel}")
 
         def go_on(words: str) -> None:
             say(f"the arm is at rest: {words}")
-            if not (yes and other.rehearse):
+            if not (yes and other.sim):
                 confirm("Shall it go on from where it is?")
 
         env = RobotEnv(
             diagram,
             station,
-            station.alike(task.world()),
+            station.clone(task.workcell()),
             start,
             pace,
-            hold=config.hold,
+            action_repeat=config.action_repeat,
             keys=keys,
             go_on=go_on,
             say=say,
-            places=Places(task, station.lcm, station.driver, config.seed) if other.rehearse else None,
+            places=PartRandomizer(task, station.lcm, station.driver, config.seed) if other.sim else None,
         )
-        read_out(env.checks(), say, again=env.checks_again, is_confirmed=yes)
-        if not other.lockstep and not hurry():
+        confirm_checks(env.checks(), say, again=env.checks_again, is_confirmed=yes)
+        if not other.synchronous and not set_realtime_priority():
             say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
         say(keys.words(pauses=True))
-        yield AtRobot(env, lambda: other.timing(station, clock))
+        yield RobotSession(env, lambda: other.timing(station, clock))

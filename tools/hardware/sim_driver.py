@@ -9,8 +9,8 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.envs.config import validated
 from guiderail.diagrams.envs.make import resolve
 from guiderail.diagrams.hardware.bus import open_bus
-from guiderail.diagrams.hardware.clock import check_rate, hurry, serve, serve_in_real_time
-from guiderail.diagrams.hardware.monitor import Deputy
+from guiderail.diagrams.hardware.clock import check_rate, serve, serve_in_real_time, set_realtime_priority
+from guiderail.diagrams.hardware.monitor import SafetyMonitor
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa, safety_limits
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
@@ -26,7 +26,7 @@ PLANT_SHARE = 5  # plant steps to a status in real time: the arm's own loop has 
 def serve_iiwa(
     url: str,
     seconds: float,
-    patience: float,
+    command_timeout: float,
     task: str = TASK,
     *,
     rate: float | None = None,
@@ -52,7 +52,7 @@ def serve_iiwa(
     Raises:
         InputError: if the task or the bus is none, a time or the rate is no positive number, or the offset is too far.
     """
-    for name, value in {"seconds": seconds, "patience": patience}.items():
+    for name, value in {"seconds": seconds, "patience": command_timeout}.items():
         if not 0.0 < value < np.inf:
             raise InputError(f"{name} must be a positive number, not {value:g}")
     if rate is not None:
@@ -63,25 +63,25 @@ def serve_iiwa(
     if offset is not None and len(offset) != 2:
         raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
     moved = None if offset is None else validated(declared.Reset, {"offset": tuple(offset)}, "a robot")
-    start = START if task == TASK else declared.start(np.random.default_rng(0)) + ASIDE
+    start = START if task == TASK else declared.start_pose(np.random.default_rng(0)) + ASIDE
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm, driver = open_bus(url), IIWA_DRIVER
     # In real time, the deputy has ears of its own: beside a real driver it is another process.
     within, ears = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
     robot = SimulatedIiwa(
-        declared.world(), within, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
+        declared.workcell(), within, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
     )
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
-    Deputy(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
+    SafetyMonitor(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
     if moved is not None:
         fixture, workpiece = declared.offsets.draw(np.random.default_rng(0), moved)
-        declared.move(robot, simulator.get_mutable_context(), fixture, workpiece)
+        declared.set_part_offsets(robot, simulator.get_mutable_context(), fixture, workpiece)
     put(lcm if rate is None else ears, driver, declared, robot, simulator.get_mutable_context())
     simulator.Initialize()
     if rate is None:
-        return serve(simulator, within, lcm, driver, seconds, patience) >= seconds
-    hurry()
+        return serve(simulator, within, lcm, driver, seconds, command_timeout) >= seconds
+    set_realtime_priority()
 
     def attend() -> None:
         ears.HandleSubscriptions(0)

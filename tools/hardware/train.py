@@ -18,11 +18,11 @@ from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import ledger_file, table
 from guiderail.tools.files import write_atomically
-from guiderail.tools.hardware.connection import Other
+from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.robot_env import RobotEnv
-from guiderail.tools.hardware.session import Say, at_robot
+from guiderail.tools.hardware.session import Say, robot_session
 from guiderail.tools.learning.learner import LEARNERS, arguments_of
-from guiderail.tools.learning.pipelined import Spaces, Student
+from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, with_defaults
 from guiderail.tools.teleop.teleoperator import no_pauses
@@ -34,7 +34,7 @@ NICENESS = 5  # of the gradient steps, beside whoever has to be in time
 def train_on_robot(
     task: str,
     out: Path,
-    other: Other,
+    other: RobotConnection,
     *,
     environment: Mapping[str, Any],
     given: Mapping[str, Any],
@@ -63,11 +63,11 @@ def train_on_robot(
     config = configure(task, environment, **with_defaults(task, {**given, "settings": settings}))
     if config.learner.demonstration_episodes:
         raise InputError("nobody demonstrates on a robot: leave the setting demonstration_episodes out")
-    with folder.locked(), at_robot(config, other, yes=yes, say=say) as robot:
+    with folder.locked(), robot_session(config, other, yes=yes, say=say) as robot:
         folder.write_config(config)
         try:
             with no_pauses(), EpisodeProgress(config.episodes, name=config.task) as progress:
-                rows = _learn(folder, config, robot.env, waits=other.lockstep, report=progress.update)
+                rows = _learn(folder, config, robot.env, waits=other.synchronous, report=progress.update)
         finally:
             timing = pd.Series(dict(robot.timing()), dtype=object)
             write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
@@ -89,9 +89,9 @@ def _learn(
     """All episodes; whatever is raised, the arm is brought to rest, and what was recorded and learned is kept."""
     named = arguments_of(config, env.task)
     acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **named)
-    student = Student(
+    student = PipelinedLearner(
         acting,
-        ((config.learner, Spaces(env)), named),
+        ((config.learner, SpacesOnlyEnv(env)), named),
         waits=waits,
         leaves_out=UNSOUND,
         niceness=NICENESS,
@@ -122,7 +122,7 @@ def _learn(
             row |= {"episodes_known": student.known, "late": student.late}
             row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
             rows.append(row)
-            due = [student.hand_over, write_ledger, partial(folder.write_episodes, rows)]
+            due = [student.submit_episode, write_ledger, partial(folder.write_episodes, rows)]
             while due:
                 due[0]()
                 due.pop(0)

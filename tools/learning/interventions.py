@@ -20,14 +20,14 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.reference import through
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Act, Decision, EnvObserver, Observer, rollout
+from guiderail.tools.evaluation.rollout import Callback, EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.learning.run_folder import RunConfig
 
 WORTH = {"success": 50.0, "failure": -50.0}  # of what a person says, added to the reward
 APART = 5  # control steps between two via-points of a push
 
 
-class Person:
+class Supervisor:
     """Who watches; this one does nothing."""
 
     def begin(self, env: gymnasium.Env) -> None:
@@ -45,10 +45,10 @@ class Person:
         return None
 
 
-class WithPerson(gymnasium.Wrapper):
+class SupervisedEnv(gymnasium.Wrapper):
     """An environment whose episodes a person may end."""
 
-    def __init__(self, env: gymnasium.Env, person: Person):
+    def __init__(self, env: gymnasium.Env, person: Supervisor):
         """
         Args:
             env: the environment.
@@ -68,7 +68,7 @@ class WithPerson(gymnasium.Wrapper):
         return observation, float(reward) + worth, said in WORTH, said not in WORTH, info
 
 
-class Corrected(Observer):
+class InterventionPolicy(Callback):
     """Acts as the policy does, but where a person pushes; afterwards it knows the via-points of that.
 
     Attributes:
@@ -76,7 +76,7 @@ class Corrected(Observer):
         via_points: of all episodes, as the option of that name: a step and an output each, one after another.
     """
 
-    def __init__(self, env: gymnasium.Env, person: Person, act: Act, known: Corrections):
+    def __init__(self, env: gymnasium.Env, person: Supervisor, act: PolicyFn, known: ViaPointCorrections):
         """
         Args:
             env: the environment.
@@ -94,7 +94,7 @@ class Corrected(Observer):
         """With those of this episode."""
         return self._known.with_pushes(self._pushed, still_pushing=self._push is not None)
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """An episode begins."""
         self._pushed, self._push, self.interventions = {}, None, 0
         self._person.begin(self._env)
@@ -107,17 +107,17 @@ class Corrected(Observer):
         self._push = push
         return self._act(observation) if push is None else np.clip(push, -1.0, 1.0).astype(np.float32)
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Remembers where the tool should have been by then."""
         if self._push is not None:
             self._pushed[int(decision.info["control_steps"]) - 1] = self._push
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """How often the person intervened."""
         return {"interventions": self.interventions}
 
 
-class Corrections:
+class ViaPointCorrections:
     """Where pushes lead in an environment's demonstrations.
 
     Attributes:
@@ -144,10 +144,10 @@ class Corrections:
         self.points = tuple(values["via_points"])
         shown = resolved.task.reference()
         self._reference = through(shown, self.points, values["inverse_length"])
-        explored = values["explored"]
-        self._explored = list(range(shown.num_outputs)) if explored is None else list(explored)
+        action_dims = values["action_dims"]
+        self._explored = list(range(shown.num_outputs)) if action_dims is None else list(action_dims)
         spread = np.sqrt(np.mean(shown.standard_deviations**2, axis=0))
-        self.reach = np.sqrt(3.0) * values["kappa"] * spread[self._explored]
+        self.reach = np.sqrt(3.0) * values["action_scale"] * spread[self._explored]
         """(A,): how far a full action leads on average [output]."""
         self._constraints = resolved.task.constraints()
 
@@ -182,14 +182,14 @@ class Corrections:
         return output if self._constraints is None else self._constraints.nearest(output, step)
 
 
-class Watched:
+class SupervisedTraining:
     """A run's episodes with a person beside them: each in an environment that knows what was corrected before it.
 
     Attributes:
         env: the present environment.
     """
 
-    def __init__(self, config: RunConfig, person: Person, state: Mapping[str, Any]):
+    def __init__(self, config: RunConfig, person: Supervisor, state: Mapping[str, Any]):
         """
         Args:
             config: of the run.
@@ -216,22 +216,22 @@ class Watched:
         """What a checkpoint has to know."""
         return {"via_points": list(self.points)}
 
-    def rollout(self, act: Act, *observers: Observer, index: int) -> dict[str, Any]:
+    def rollout(self, act: PolicyFn, *observers: Callback, index: int) -> dict[str, Any]:
         """One episode; its row says how often the person intervened, and the next one knows the via-points of that."""
-        corrected = Corrected(self.env, self._person, act, self._corrections)
-        row = rollout(WithPerson(self.env, self._person), corrected, *observers, index=index)
+        corrected = InterventionPolicy(self.env, self._person, act, self._corrections)
+        row = rollout(SupervisedEnv(self.env, self._person), corrected, *observers, index=index)
         if corrected.via_points != self.points:
             drawn = self.env.unwrapped.np_random.bit_generator.state
             self.env.close()
             self._enter(corrected.via_points)
             self.env.unwrapped.np_random.bit_generator.state = drawn
             for observer in observers:
-                if isinstance(observer, EnvObserver):
+                if isinstance(observer, EnvCallback):
                     observer.env, observer.base = self.env, self.env.unwrapped
         return row
 
     def _enter(self, points: tuple[float, ...]) -> None:
         environment = {**self._config.environment, "via_points": points}
-        self._corrections = Corrections(self._config.task, environment)
+        self._corrections = ViaPointCorrections(self._config.task, environment)
         self.env: Any = make_environment(self._config.task, environment)
         self.env.reset(seed=self._config.seed)  # what is hidden and constant in a run is sampled here, as in training

@@ -9,17 +9,17 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Observer
+from guiderail.tools.evaluation.rollout import Callback
 
 
-class Learner(Observer, ABC):
+class Learner(Callback, ABC):
     """Acts in training episodes, and learns from what it sees of them as their observer."""
 
     @abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The action for an observation, in the units of the action space."""
 
-    def hand_over(self) -> None:
+    def submit_episode(self) -> None:
         """Called between episodes, when the last one's checkpoint, if it has one, is written."""
 
     def finish(self) -> None:
@@ -45,7 +45,7 @@ class Learner(Observer, ABC):
         """Becomes what it was when `state` was called. KeyError, ValueError or RuntimeError where it does not fit."""
 
 
-# An entry is called with a preset and an environment, and by name with `hold`, `seed`, `decisions` and `symmetry`.
+# An entry is called with a preset and an environment, and by name with `action_repeat`, `seed`, `decisions` and `symmetry`.
 LEARNERS: Registry[Callable[..., Learner]] = Registry("algorithm", entry_points="guiderail.learners")
 register_learner = LEARNERS.register
 learner_names = LEARNERS.names
@@ -57,7 +57,7 @@ def diverged() -> InputError:
 
 
 def arguments_of(config: Any, task: Any) -> dict[str, Any]:
-    """What a learner is called with by name: `hold`, `seed`, `decisions` (the most that the run can take), `symmetry`.
+    """What a learner is called with by name: `action_repeat`, `seed`, `decisions` (the most that the run can take), `symmetry`.
 
     What a person pushed, demonstrations no longer have on their other sides: then there is no symmetry to learn from.
 
@@ -65,11 +65,11 @@ def arguments_of(config: Any, task: Any) -> dict[str, Any]:
         config: the run's `RunConfig`.
         task: its task.
     """
-    decisions = config.episodes * -(-task.num_steps // config.hold)
+    decisions = config.episodes * -(-task.num_steps // config.action_repeat)
     symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
     pushed = config.with_person or bool(config.environment.get("via_points"))
     return {
-        "hold": config.hold,
+        "action_repeat": config.action_repeat,
         "seed": config.seed,
         "decisions": decisions,
         "symmetry": None if pushed else symmetry,

@@ -26,10 +26,10 @@ from torch.nn.utils import parameters_to_vector
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
-from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning import older
 from guiderail.tools.learning.checkpoint import CheckpointSelection
-from guiderail.tools.learning.config import Preset, decision_discount
+from guiderail.tools.learning.config import LearnerConfig, action_gamma
 from guiderail.tools.learning.fast_sb3.ensemble import EnsembleSac, EnsembleTqc
 from guiderail.tools.learning.learner import Learner, diverged
 
@@ -37,7 +37,7 @@ IMAGE_POOL = 5  # pixels; 110×144×3 becomes 22×28×3
 
 
 class PooledImage(BaseFeaturesExtractor):
-    """An image as one vector (thesis, 4.4.1), after averaging squares of pixels.
+    """An image as one vector (thesis, 4.4.1), after actor_ema squares of pixels.
 
     Flattened as it is, 110×144×3 makes a first layer of twelve million weights a network, and a gradient step of most
     of a second on one core; what the task needs to see is larger than a pixel.
@@ -108,10 +108,10 @@ class OffPolicyLearner(Learner):
 
     def __init__(
         self,
-        preset: Preset,
+        preset: LearnerConfig,
         env: gymnasium.Env,
         *,
-        hold: int,
+        action_repeat: int,
         seed: int,
         decisions: int,
         symmetry: Symmetry | None = None,
@@ -127,7 +127,7 @@ class OffPolicyLearner(Learner):
         """
         self.symmetry = symmetry if preset.symmetry else None
         self._sides = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)
-        networks: dict[str, Any] = {"net_arch": list(preset.units), "optimizer_kwargs": {"fused": True}}
+        networks: dict[str, Any] = {"net_arch": list(preset.net_arch), "optimizer_kwargs": {"fused": True}}
         if preset.layer_norm:
             networks["activation_fn"] = NormalizedReLU
         if is_image_space(env.observation_space):
@@ -138,9 +138,9 @@ class OffPolicyLearner(Learner):
             "learning_rate": preset.learning_rate,
             "buffer_size": min(preset.buffer_size, decisions + 1),
             "batch_size": preset.batch_size,
-            "tau": preset.soft_update,
-            "gamma": decision_discount(preset, hold),
-            "ent_coef": preset.entropy if preset.entropy.startswith("auto") else float(preset.entropy),
+            "tau": preset.tau,
+            "gamma": action_gamma(preset, action_repeat),
+            "ent_coef": preset.ent_coef if preset.ent_coef.startswith("auto") else float(preset.ent_coef),
             "policy_kwargs": networks,
             "seed": seed,
             "device": "cpu",
@@ -158,7 +158,7 @@ class OffPolicyLearner(Learner):
         )
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.random = np.random.default_rng(seed)
-        self.averaged = copy.deepcopy(self.model.actor) if preset.averaging else None
+        self.averaged = copy.deepcopy(self.model.actor) if preset.actor_ema else None
         self.selection = CheckpointSelection(preset.selection_window) if preset.selection_window else None
         self.episodes = 0
         self._greedy = False  # whether this episode does not explore
@@ -172,11 +172,11 @@ class OffPolicyLearner(Learner):
         """Whether enough is known to learn from; until then actions are uniformly random."""
         return self.decisions >= self.preset.learning_starts
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """Begins an episode, and decides how it explores."""
         self.episodes += 1
         self._decided = False
-        share = self.preset.greedy_share
+        share = self.preset.greedy_episode_fraction
         own = self.episodes - self.preset.demonstration_episodes  # in those before, somebody else acts
         self._constant = self._uniform() if 0 < own <= self.preset.constant_episodes else None
         due = int(self.episodes * share) > int((self.episodes - 1) * share)
@@ -185,7 +185,7 @@ class OffPolicyLearner(Learner):
         if self.selection is not None and self._greedy:
             self.selection.begin(self.actor(), self._greedy_successes)
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Remembers a decision, and learns if it is time to. Where the simulation failed nothing followed: what came
         before is then the episode's last, as at a time limit.
         """
@@ -201,7 +201,7 @@ class OffPolicyLearner(Learner):
             buffer = self.model.replay_buffer
             buffer.dones[buffer.pos - 1] = buffer.timeouts[buffer.pos - 1] = 1.0
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Ends an episode. One in which a person pushed says nothing of the policy."""
         if row.get("interventions"):
             self.leave_out()
@@ -252,7 +252,7 @@ class OffPolicyLearner(Learner):
         assert isinstance(space, spaces.Box)
         return self.random.uniform(space.low, space.high).astype(space.dtype)
 
-    def remember(self, one: Decision) -> None:
+    def remember(self, one: Transition) -> None:
         """Takes a decision into the replay buffer.
 
         A time limit is not an end of the task: its last decision is bootstrapped (partial-episode bootstrapping, Pardo
@@ -280,14 +280,14 @@ class OffPolicyLearner(Learner):
         self.decisions += 1
 
     def learn(self) -> None:
-        """Trains if it is time to: every `train_every` decisions of the whole run, whatever the episodes' lengths."""
-        if not self.has_begun() or self.decisions % self.preset.train_every:
+        """Trains if it is time to: every `train_freq` decisions of the whole run, whatever the episodes' lengths."""
+        if not self.has_begun() or self.decisions % self.preset.train_freq:
             return
         self.model.train(self.preset.gradient_steps, self.preset.batch_size)
         if self.has_diverged():
             raise diverged()
         if self.averaged is not None:
-            follow = 1.0 - (1.0 - self.preset.averaging) ** self.preset.gradient_steps
+            follow = 1.0 - (1.0 - self.preset.actor_ema) ** self.preset.gradient_steps
             with torch.no_grad():
                 for mean, value in zip(self.averaged.parameters(), self.model.actor.parameters(), strict=True):
                     mean.lerp_(value, follow)

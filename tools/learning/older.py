@@ -9,7 +9,7 @@ SETTINGS = {
     "bursts": "ez_greedy",
     "longest_burst": "ez_greedy_longest",
     "bursts_until": "ez_greedy_until",
-    "practise": "greedy_share",
+    "practise": "greedy_episode_fraction",
     "proven_by": "selection_window",
 }
 # Values of a learner in a checkpoint, and the beginnings of its arrays' names.

@@ -21,7 +21,7 @@ import torch
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.evaluation.step_log import write_ledger
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
@@ -29,7 +29,7 @@ from guiderail.tools.learning.off_policy import OffPolicyLearner
 Weights = dict[str, dict[str, np.ndarray]]
 
 
-class Student(Learner):
+class PipelinedLearner(Learner):
     """Acts, and hands over each episode to another process, which learns from it during the next one.
 
     In episode k it acts with what was learned from the episodes before k − 1: then the learning of one episode has the
@@ -69,8 +69,8 @@ class Student(Learner):
         if not isinstance(acting, OffPolicyLearner):
             raise InputError("only an off-policy learner can learn in a process of its own: choose sac or tqc")
         self._acting, self._waits, self._leaves_out = acting, waits, leaves_out
-        self._decisions: list[Decision] = []
-        self._pending: list[Decision] | None = None  # of an episode that is over and not handed over yet
+        self._decisions: list[Transition] = []
+        self._pending: list[Transition] | None = None  # of an episode that is over and not handed over yet
         self.known = self.given = self.late = 0
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([__name__])  # a study imports once, not for every run
@@ -93,7 +93,7 @@ class Student(Learner):
         """As the learner acts."""
         return self._acting.act(observation)
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """Begins an episode with what was learned until now."""
         behind = self.given - 1
         while self.known < behind and self._waits:
@@ -103,9 +103,9 @@ class Student(Learner):
         self.late += self.known < behind
         self._decisions = []
         self._drawn = self._acting.random.bit_generator.state
-        self._acting.begin()
+        self._acting.on_episode_start()
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Keeps a decision until it is known whether the episode is learned from.
 
         Where the simulation failed nothing followed: what came before is then the episode's last, as at a time limit.
@@ -117,7 +117,7 @@ class Student(Learner):
         self._decisions.append(replace(decision, info={}))
         self._acting.decisions += 1
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Ends an episode. One that is left out leaves no trace in what explores."""
         if row["termination"] in self._leaves_out:
             self._acting.decisions -= len(self._decisions)
@@ -125,11 +125,11 @@ class Student(Learner):
             self._acting.leave_out()
             self._acting.random.bit_generator.state = self._drawn
         else:
-            self._acting.end(row)
+            self._acting.on_episode_end(row)
             self._pending = self._decisions
         return {}
 
-    def hand_over(self) -> None:
+    def submit_episode(self) -> None:
         """Has the last episode learned from, where it is one to learn from."""
         if self._pending is not None:
             self._send(("learn", self._pending))
@@ -142,7 +142,7 @@ class Student(Learner):
 
     def finish(self) -> None:
         """Waits until everything is learned and written, and ends the other process."""
-        self.hand_over()
+        self.submit_episode()
         while self.known < self.given:
             self._take(self._receive())
         self._send(("end",))
@@ -190,9 +190,9 @@ class Student(Learner):
         if of["pending"]:
             columns = [of["pending"][name] for name in _KEPT]
             self._pending = [
-                Decision(**dict(zip(_KEPT, one, strict=True)), info={}) for one in zip(*columns, strict=True)
+                Transition(**dict(zip(_KEPT, one, strict=True)), info={}) for one in zip(*columns, strict=True)
             ]
-        self.hand_over()
+        self.submit_episode()
 
     def _send(self, message: tuple[Any, ...]) -> None:
         try:
@@ -218,7 +218,7 @@ class Student(Learner):
 _KEPT = ("observation", "action", "reward", "following", "terminated", "truncated")
 
 
-class Spaces(gymnasium.Env):
+class SpacesOnlyEnv(gymnasium.Env):
     """Of an environment, for another process."""
 
     def __init__(self, env: gymnasium.Env):
@@ -285,10 +285,10 @@ def _read(pipe: Connection, asked: SimpleQueue[tuple[Any, ...]]) -> None:
 _NOTHING = object()
 
 
-def _learned(learner: OffPolicyLearner, decisions: list[Decision]) -> Weights | InputError:
+def _learned(learner: OffPolicyLearner, decisions: list[Transition]) -> Weights | InputError:
     try:
         for decision in decisions:
-            learner.see(decision)
+            learner.on_step(decision)
     except InputError as error:
         return error
     return _weights(learner)

@@ -21,7 +21,7 @@ from guiderail.tools.environments import check_environment, import_modules, task
 from guiderail.tools.evaluation.metrics import checked_rows
 from guiderail.tools.files import LOCK, remove_parts, write_atomically
 from guiderail.tools.learning import older
-from guiderail.tools.learning.config import Preset
+from guiderail.tools.learning.config import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
@@ -33,7 +33,7 @@ class RunConfig:
 
     task: str  # its name
     environment: dict[str, Any]  # arguments of gymnasium.make
-    learner: Preset  # every setting
+    learner: LearnerConfig  # every setting
     preset: str  # the learner's settings started from it
     episodes: Annotated[int, Field(ge=1, le=10**9, strict=True)]  # how many in all
     seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # of everything random
@@ -44,9 +44,9 @@ class RunConfig:
     with_person: bool = False  # whether a person watches; what was corrected is in the environment's via_points
 
     @property
-    def hold(self) -> int:
+    def action_repeat(self) -> int:
         """Control steps that an action lasts."""
-        return int(self.environment.get("hold", 1))
+        return int(self.environment.get("action_repeat", 1))
 
     def refuse_changed_task(self, path: Path) -> None:
         """Raises an InputError if the task's files are not those with which the run in that folder began."""
@@ -168,7 +168,7 @@ class RunFolder:
 
     def write_config(self, config: RunConfig) -> None:
         """Replaces `config.yaml`."""
-        values = asdict(config) | {"learner": asdict(config.learner) | {"units": list(config.learner.units)}}
+        values = asdict(config) | {"learner": asdict(config.learner) | {"net_arch": list(config.learner.net_arch)}}
         values["imports"] = list(config.imports)
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
@@ -190,7 +190,7 @@ class RunFolder:
         try:
             values = load_yaml(file, "configuration")
             # A setting that did not exist yet was off, as its default is, whatever the preset has become since.
-            values["learner"] = Preset(**(asdict(Preset()) | older.settings(values["learner"])))
+            values["learner"] = LearnerConfig(**(asdict(LearnerConfig()) | older.settings(values["learner"])))
             values["environment"] = as_arguments(values["environment"])
             values.setdefault("ledger", False)
             config = RunConfig(**values)

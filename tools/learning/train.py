@@ -14,12 +14,12 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import check_environment, import_modules, task_content
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import Act, check_seed
+from guiderail.tools.evaluation.rollout import PolicyFn, check_seed
 from guiderail.tools.learning.config import resolve_preset
-from guiderail.tools.learning.interventions import Person
+from guiderail.tools.learning.interventions import Supervisor
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
-DEFAULTS: dict[str, Any] = {"algorithm": "tqc", "preset": "robust", "episodes": 60, "seed": 0}
+DEFAULTS: dict[str, Any] = {"algorithm": "tqc", "preset": "tqc_contact", "episodes": 60, "seed": 0}
 
 
 def own_defaults(task: str) -> dict[str, Any]:
@@ -29,8 +29,8 @@ def own_defaults(task: str) -> dict[str, Any]:
 
 # What a finished run says about itself.
 SUMMARY = (
-    "episodes", "converged_after", "success_rate", "success_rate_last_10", "mean_return_last_10",
-    "worst_violation", "peak_force", "collisions", "wall_time",
+    "episodes", "episodes_to_convergence", "success_rate", "success_rate_last_10", "mean_return_last_10",
+    "max_commanded_violation", "peak_force", "collisions", "wall_time",
 )  # fmt: skip
 
 
@@ -76,8 +76,8 @@ def run(
     resume: bool = False,
     imports: Sequence[str] = (),
     ledger: bool | None = None,
-    person: Callable[[], Person] | None = None,
-    demonstrator: Callable[[str], Callable[[gymnasium.Env], Act]] | None = None,
+    person: Callable[[], Supervisor] | None = None,
+    demonstrator: Callable[[str], Callable[[gymnasium.Env], PolicyFn]] | None = None,
 ) -> dict[str, Any]:
     """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
 
@@ -129,12 +129,12 @@ def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
 def finish(out: Path) -> dict[str, str]:
     """Adds the pictures to a run that has its numbers; what cannot be drawn on this machine is said, not raised."""
     from guiderail.tools.visualization.curves import plot_run
-    from guiderail.tools.visualization.episode_spec import Shown
+    from guiderail.tools.visualization.episode_spec import EpisodeSpec
     from guiderail.tools.visualization.replay import default_page, write_page
 
     curve = str(plot_run(out))
     try:
-        write_page(page := default_page(out, {}), Shown.of_run(out))
+        write_page(page := default_page(out, {}), EpisodeSpec.of_run(out))
         return {"curve": curve, "replay": str(page)}
     except InputError as error:
         return {"curve": curve, "replay": f"none: {error}"}

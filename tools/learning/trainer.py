@@ -9,13 +9,13 @@ import torch
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Act, Observer, rollout, suits
-from guiderail.tools.evaluation.step_log import Ledger
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn, rollout, suits
+from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.interventions import Person, Watched
+from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
 from guiderail.tools.learning.learner import LEARNERS, Learner, arguments_of, diverged
-from guiderail.tools.learning.pipelined import Spaces, Student
+from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
 
@@ -30,8 +30,8 @@ def train(
     *,
     resume: bool = False,
     report: Callable[[dict[str, Any]], None] | None = None,
-    demonstrator: Callable[[gymnasium.Env], Act] | None = None,
-    person: Person | None = None,
+    demonstrator: Callable[[gymnasium.Env], PolicyFn] | None = None,
+    person: Supervisor | None = None,
 ) -> list[dict[str, Any]]:
     """Trains a run to its last episode and writes its folder.
 
@@ -85,8 +85,8 @@ def train(
     try:
         with folder.locked():
             if config.learner.pipelined:
-                given = (config.learner, Spaces(env)), named
-                learner = Student(learner, given, waits=True, imports=config.imports)
+                given = (config.learner, SpacesOnlyEnv(env)), named
+                learner = PipelinedLearner(learner, given, waits=True, imports=config.imports)
             if not resume:
                 folder.create(config)
             try:
@@ -109,8 +109,8 @@ def _train(
     learner: Learner,
     resume: bool,
     report: Callable[[dict[str, Any]], None] | None,
-    demonstrator: Callable[[gymnasium.Env], Act] | None,
-    person: Person | None,
+    demonstrator: Callable[[gymnasium.Env], PolicyFn] | None,
+    person: Supervisor | None,
 ) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     if resume:
@@ -121,13 +121,13 @@ def _train(
             folder.remove_policy()  # killed from here on, it has one of fewer episodes than its table
     watched = None
     if config.with_person and person is not None:
-        watched = Watched(config, person, load_checkpoint(folder.checkpoint)[1] if rows else {})
+        watched = SupervisedTraining(config, person, load_checkpoint(folder.checkpoint)[1] if rows else {})
         watched.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
         env, config = watched.env, watched.config
     folder.write_config(config)
 
-    ledger = Ledger(env, folder.ledger)
-    watching: list[Observer] = [ledger] if config.ledger else []
+    ledger = StepLog(env, folder.ledger)
+    watching: list[Callback] = [ledger] if config.ledger else []
     shown = 0 if demonstrator is None else config.learner.demonstration_episodes
     spent_training, spent_saving, last_saving = 0.0, 0.0, 0.0
     for episode in range(len(rows), config.episodes):
@@ -141,7 +141,7 @@ def _train(
         if learner.has_diverged():
             raise diverged()
         if shown:
-            row["demonstrated"] = int(episode < shown)
+            row["is_demonstration"] = int(episode < shown)
         row["wall_time"] = time.perf_counter() - started
         if rows and rows[0].keys() != row.keys():
             raise InputError(
@@ -158,14 +158,16 @@ def _train(
             _save(folder, rows, learner, env, watched)
             last_saving = time.perf_counter() - started
             spent_saving += last_saving
-        learner.hand_over()
+        learner.submit_episode()
     learner.finish()
     policy = learner.policy({"task": config.task, "observation_shape": list(env.observation_space.shape or ())})
     policy.save(folder.path, write=write_atomically)
     return rows
 
 
-def _save(folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, watched: Watched | None) -> None:
+def _save(
+    folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, watched: SupervisedTraining | None
+) -> None:
     """The checkpoint first: it holds the table too, and whoever is killed between the two loses nothing."""
     arrays, values = learner.state()
     generator = env.unwrapped.np_random.bit_generator.state

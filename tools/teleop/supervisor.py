@@ -13,7 +13,7 @@ from pydrake.geometry import Meshcat
 from guiderail.diagrams.envs.cameras import open_meshcat
 from guiderail.diagrams.envs.scene import View
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.interventions import Person
+from guiderail.tools.learning.interventions import Supervisor
 from guiderail.tools.teleop.teach import look_at
 
 SAYS = {
@@ -26,7 +26,7 @@ LET_GO, LET_GO_KEY = "let go (Space)", "Space"
 FARTHEST, STEP = 4.0, 0.25  # of a slider, in what a full action reaches
 
 
-class PagePerson(Person):
+class MeshcatSupervisor(Supervisor):
     """Sliders push, buttons speak, each with keys; an episode goes on in real time while somebody looks.
 
     Attributes:

@@ -177,7 +177,7 @@ class Teaching:
         if out.suffix not in (".npz", ".csv"):
             raise InputError(f"{out} must end in .npz or .csv")
         resolved = resolve(task, environment)
-        if resolved.task.world_kind != "workcell":
+        if resolved.task.workcell_kind != "workcell":
             raise InputError(f"{task} has no tool that a hand could lead: teach one that puts a part into another")
         self.task, self.out = resolved.task, out
         builder = DiagramBuilder()
@@ -295,7 +295,7 @@ class Teaching:
         task = self.task
         if not isinstance(task, InsertionTask):
             return None
-        success = next((one for one in task.conditions() if one.termination == "success"), None)
+        success = next((one for one in task.termination_terms() if one.termination == "success"), None)
         if success is None or list(success.inputs) != [task.workpiece]:
             return None
         plant = self.station.plant
@@ -334,7 +334,7 @@ class Teaching:
         """Paces the simulation at a rate to the wall's clock, from now on."""
         if rate != self.simulator.get_target_realtime_rate():
             self.simulator.set_target_realtime_rate(rate)
-            # Drake compares all the time since then: it would hurry, or wait, until the new rate held for all of it.
+            # Drake compares all the time since then: it would set_realtime_priority, or wait, until the new rate held for all of it.
             self.simulator.ResetStatistics()
 
     def _press(self, name: str, say: Callable[[str], None]) -> None:
@@ -378,10 +378,10 @@ class Teaching:
         """What the part feels, (3,) in the world [N]."""
         context = self.station.GetMyContextFromRoot(self.simulator.get_context())
         force = self.station.get_wrench_output_port().Eval(context)[:3]
-        return np.asarray(self.task.world().X_WT.rotation().multiply(force))
+        return np.asarray(self.task.workcell().X_WT.rotation().multiply(force))
 
     def _draw_tube(self, mean: np.ndarray, spread: np.ndarray) -> None:
-        X_WT: RigidTransform = self.task.world().X_WT
+        X_WT: RigidTransform = self.task.workcell().X_WT
         for number, factor in enumerate((0.0, 2.0, -2.0)):
             points = X_WT.multiply((mean[:, :3] + factor * spread[:, :3]).T)
             colour = Rgba(0.1, 0.3, 0.8, 1.0 if number == 0 else 0.4)
@@ -389,7 +389,9 @@ class Teaching:
 
     def _start_pose(self) -> np.ndarray:
         return (
-            self.task.start(np.random.default_rng(0)) if isinstance(self.task, InsertionTask) else np.zeros(POSE_SIZE)
+            self.task.start_pose(np.random.default_rng(0))
+            if isinstance(self.task, InsertionTask)
+            else np.zeros(POSE_SIZE)
         )
 
     def _port(self) -> Any:

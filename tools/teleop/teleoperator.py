@@ -15,7 +15,7 @@ import gymnasium
 from guiderail.models.common.errors import InputError
 from guiderail.systems.meshcat_device import MeshcatDevice
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Act, Decision, EnvObserver, rollout
+from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
 
 PAUSE = "p"
 
@@ -90,15 +90,15 @@ AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0), (4, 1.0), (5, 1.0))
 KEYS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"), ("KeyJ", "KeyL"), ("KeyK", "KeyI"), ("KeyH", "KeyY"))
 
 
-class Live(EnvObserver):
+class Live(EnvCallback):
     """Shows every decision while it happens."""
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Shows it."""
         self.env.render()
 
 
-def drive(env: gymnasium.Env, driver: Act, episodes: int) -> list[str]:
+def drive(env: gymnasium.Env, driver: PolicyFn, episodes: int) -> list[str]:
     """Runs episodes with whoever drives; returns how they ended. A policy is a driver, and so is a person's device."""
     return [rollout(env, driver, Live(env), index=i)["termination"] for i in range(episodes)]
 

@@ -9,7 +9,7 @@ from matplotlib.patches import Circle, Rectangle
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage import demonstrations as narrow_passage
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
-from guiderail.tools.evaluation.metrics import WORDS, converged_after
+from guiderail.tools.evaluation.metrics import WORDS, episodes_to_convergence
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.visualization.style import colour, new_figure, rolling, save_figure
 
@@ -17,7 +17,7 @@ from guiderail.tools.visualization.style import colour, new_figure, rolling, sav
 def draw_world(axis: Axes, demonstrations: bool = True, *, named: bool = False) -> None:
     """Walls, zone, obstacle, goal and, in grey, what was demonstrated; `named`: each has a name for a legend."""
     world = PassageGeometry()
-    zone, obstacle, goal, shown = ("forbidden zone", "obstacle", "goal", "demonstrated") if named else 4 * ("",)
+    zone, obstacle, goal, shown = ("forbidden zone", "obstacle", "goal", "is_demonstration") if named else 4 * ("",)
     for lower, upper in zip(*world.walls, strict=True):
         axis.add_patch(Rectangle(tuple(lower), *(upper - lower), color="0.45", linewidth=0))
     axis.add_patch(Rectangle((world.zone_x, -1), 2, 3, color="firebrick", alpha=0.12, linewidth=0, label=zone))
@@ -31,7 +31,7 @@ def draw_world(axis: Axes, demonstrations: bool = True, *, named: bool = False) 
 
 
 DRAWN = {
-    "success", "return", "worst_violation", "worst_measured_violation", "peak_force", "mean_force",
+    "success", "return", "max_commanded_violation", "max_measured_violation", "peak_force", "mean_force",
     "jerk_commanded_linear", "jerk_measured_linear",
 }  # fmt: skip
 
@@ -58,7 +58,7 @@ def plot_run(run: Path) -> Path:
     success.plot(episodes, rolling(column["success"]), color=line)
     success.scatter(episodes, column["success"], s=6, color=line, alpha=0.4)
     success.set(ylabel="success (mean of 10)", ylim=(-0.05, 1.05))
-    converged = converged_after(rows)
+    converged = episodes_to_convergence(rows)
     if converged is not None:
         success.axvline(converged + 0.5, color="0.6", linestyle=":")
         success.set_title(f"ten in a row succeed after episode {converged}", fontsize=9)
@@ -70,7 +70,12 @@ def plot_run(run: Path) -> Path:
             terms.plot(episodes, values, label=name.removeprefix("reward_").replace("_", " "))
     terms.set(ylabel="terms of the return")
     for axis, words, first, second in (
-        (violation, "worst constraint violation\n(negative is slack)", "worst_violation", "worst_measured_violation"),
+        (
+            violation,
+            "worst constraint violation\n(negative is slack)",
+            "max_commanded_violation",
+            "max_measured_violation",
+        ),
         (force, "contact force [N]", "peak_force", "mean_force"),
         (jerk, "mean jerk [m/s³]", "jerk_commanded_linear", "jerk_measured_linear"),
     ):

@@ -13,17 +13,17 @@ import gymnasium
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
-from guiderail.tools.evaluation.rollout import Act, as_learned, check_seed
+from guiderail.tools.evaluation.rollout import PolicyFn, as_learned, check_seed
 from guiderail.tools.learning.run_folder import RunFolder
 
 
 @dataclass(frozen=True)
-class Shown:
+class EpisodeSpec:
     """An episode that is shown, on held-out initial conditions."""
 
     task: str
     environment: Mapping[str, Any]  # its arguments
-    policy: Callable[[gymnasium.Env], Act]  # what acts, for an environment
+    policy: Callable[[gymnasium.Env], PolicyFn]  # what acts, for an environment
     acting: str  # whose actions they are, in a few words
     title: str  # what to say beside task and guidance
     run_seed: int = 0  # decides what is hidden and constant in a run
@@ -31,7 +31,7 @@ class Shown:
     run: Path | None = None  # the folder that it is from
 
     @classmethod
-    def of_run(cls, run: Path, environment: Mapping[str, Any] | None = None, seed: int = HELD_OUT_SEED) -> Shown:
+    def of_run(cls, run: Path, environment: Mapping[str, Any] | None = None, seed: int = HELD_OUT_SEED) -> EpisodeSpec:
         """The deterministic policy of a run, where it learned or with other arguments of the environment.
 
         Raises:

@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Decision, EnvObserver, rollout
+from guiderail.tools.evaluation.rollout import EnvCallback, Transition, rollout
 from guiderail.tools.files import check_picture
-from guiderail.tools.visualization.episode_spec import Shown, outcome
+from guiderail.tools.visualization.episode_spec import EpisodeSpec, outcome
 from guiderail.tools.visualization.style import new_figure, save_figure
 
 ROWS, COLUMNS = 2, 3
@@ -20,18 +20,18 @@ MOST = 24  # frames
 PATH = "#00a33a"  # of what the robot did
 
 
-class Frames(EnvObserver):
+class Frames(EnvCallback):
     """What a camera sees of an episode, evenly spread over it and never much: its length isn't known before.
 
     The environment is made with `render_mode="rgb_array"`.
     """
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """Looks at how it starts."""
         self.seen: list[Any] = [(0.0, 0.0, self.env.render())]
         self._stride, self._decisions = 1, 0
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """Looks at a decision if it is due; where there are `MOST` frames, every second one goes first."""
         self._decisions += 1
         if not decision.is_last and self._decisions % self._stride:
@@ -46,7 +46,7 @@ class Frames(EnvObserver):
         return [self.seen[i] for i in np.linspace(0, len(self.seen) - 1, number).round().astype(int)]
 
 
-def write_film(picture: Path, episode: Shown) -> dict[str, Any]:
+def write_film(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
     """Runs an episode and writes what the task's camera sees of it at `ROWS` × `COLUMNS` moments; returns its row.
 
     Raises:
@@ -61,7 +61,7 @@ def write_film(picture: Path, episode: Shown) -> dict[str, Any]:
     return row
 
 
-def watch(episode: Shown, moments: int) -> tuple[dict[str, Any], list[Any]]:
+def watch(episode: EpisodeSpec, moments: int) -> tuple[dict[str, Any], list[Any]]:
     """Runs an episode; its row, and what the task's camera sees at so many moments: (time, force, image, path) each.
 
     The path (n, 2) is where the robot was until then, in pixels of the image.

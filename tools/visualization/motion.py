@@ -13,14 +13,14 @@ from pydrake.systems.framework import Context, EventStatus
 from guiderail.models.common.units import MM
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.tools.evaluation.rollout import Decision, EnvObserver
+from guiderail.tools.evaluation.rollout import EnvCallback, Transition
 
 POINTS = 400  # at most, of an episode: as many as a page is wide
 DRAWN = "/drake/visualizer"  # where Drake's visualizer keeps the bodies that move
 DIGITS = 5  # of a number that is plotted
 
 
-class Motion(EnvObserver):
+class Motion(EnvCallback):
     """Remembers an episode control step by control step: the poses of all bodies that are drawn, and the actions.
 
     It takes the place of the simulator's monitor, and leaves no other there.
@@ -45,11 +45,11 @@ class Motion(EnvObserver):
         }
         self.base.simulator.set_monitor(self._follow)
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         """Starts a list of actions; the poses of time zero were there already."""
         self._actions: list[np.ndarray] = []
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         """The action that every control step since the last decision had."""
         steps = len(self.base.trace) - len(self._actions)
         self._actions += steps * [np.clip(np.asarray(decision.action, float).ravel(), -1.0, 1.0)]
@@ -108,7 +108,7 @@ def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple
 
 def state_names(task: Any) -> Sequence[str]:
     """The states of a task's template, by number; none where it has no template."""
-    return [state.name for state in task.template().skill.states] if "template" in type(task).knows() else []
+    return [state.name for state in task.template().skill.states] if "template" in type(task).provides() else []
 
 
 def _pose(X_WF: Any) -> list[float]:

@@ -19,11 +19,11 @@ from pydrake.geometry import Rgba
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import NullPolicy, still, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, still, uniform_random
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import Act, rollout
+from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.files import check_page, write_atomically
-from guiderail.tools.visualization.episode_spec import Shown, outcome
+from guiderail.tools.visualization.episode_spec import EpisodeSpec, outcome
 from guiderail.tools.visualization.motion import Motion, state_names, violation_unit
 from guiderail.tools.visualization.style import is_demonstrated
 
@@ -58,7 +58,7 @@ def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
     return run / name if run.is_dir() else Path(name)
 
 
-def write_page(html: Path, episode: Shown, *, episodes: int | None = None) -> dict[str, Any]:
+def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None) -> dict[str, Any]:
     """Runs episodes and writes them as a page; returns the row of the first.
 
     Each of them is run twice, from the same conditions: by who is shown, and beside it without having learned. That is
@@ -88,7 +88,7 @@ def write_page(html: Path, episode: Shown, *, episodes: int | None = None) -> di
     task = base.task.declaration
     scene = Scene(to_world=in_plane) if task is None else task.scene()
     demonstrated = is_demonstrated(episode.environment.get("guidance"))
-    before: Act = still(env) if demonstrated else NullPolicy(white, env, episode.seed)
+    before: PolicyFn = still(env) if demonstrated else BaselinePolicy(uniform_random, env, episode.seed)
     sides = {
         Side("before", "before: the demonstration alone" if demonstrated else "before: random actions", BLACK): before,
         Side("after", episode.acting, GREEN): episode.policy(env),
@@ -155,7 +155,7 @@ def report_beside(html: Path, run: Path | None) -> str | None:
 def _numbers(row: Mapping[str, Any]) -> str:
     violations = (
         f"{name} {'none' if row[key] <= TOLERANCE else format(row[key], '.1e')}"
-        for name, key in (("commanded", "worst_violation"), ("measured", "worst_measured_violation"))
+        for name, key in (("commanded", "max_commanded_violation"), ("measured", "max_measured_violation"))
     )
     return f"return {row['return']:.1f}; violations: {', '.join(violations)}"
 

@@ -13,7 +13,7 @@ import pandas as pd
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import (
     TOLERANCE,
-    converged_after,
+    episodes_to_convergence,
     interquartile_mean,
     median_survival,
     survival,
@@ -124,7 +124,7 @@ def _held_out(gathered: Gathered) -> Table:
     rows, judged = [], gathered.held_out
     several = judged["study"].nunique() > 1
     for (study, method, policy, mark, where), group in judged.groupby(
-        ["study", "method", "policy", "mark", "judged_on"], sort=False
+        ["study", "method", "policy", "after_episodes", "eval_set"], sort=False
     ):
         successes, episodes = int(group["successes"].sum()), int(group["episodes"].sum())
         intervals = wilson_of_each(group["successes"], group["episodes"])
@@ -144,7 +144,7 @@ def _seeds(methods: dict[str, list[Run]]) -> Table:
     names = {"return": "return, last ten", "success": "success, last ten", "steps": "control steps, last ten"}
     rows = []
     for name, runs in methods.items():
-        after, lengths = [converged_after(run.episodes) for run in runs], [len(run.episodes) for run in runs]
+        after, lengths = [episodes_to_convergence(run.episodes) for run in runs], [len(run.episodes) for run in runs]
         median = median_survival(*survival(after, lengths))
         never = sum(one is None for one in after)
         cells = [name, str(len(runs)), "never" if median is None else f"{median:g}", f"{never} of {len(runs)}"]
@@ -159,7 +159,7 @@ def _safety(safety: dict[str, list[dict[str, Any]]]) -> Table:
     counted = {
         "commands_outside": "commands outside", "poses_outside": "poses outside", "collisions": "collisions",
         "collision_steps": "steps in collision", "saturated": "steps saturated", "held": "held by watchdog",
-        "fallbacks": "fallbacks",
+        "fallback_steps": "fallback_steps",
     }  # fmt: skip
     worst = {"worst_command": "worst command", "worst_pose": "worst pose", "peak_force": "peak force [N]"}
     bad = {"commands_outside", "collisions", "collision_steps", "held"}

@@ -15,7 +15,7 @@ import pandas as pd
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import beyond_defaults, known_tasks
-from guiderail.tools.evaluation.baselines import NULL_POLICIES, NullPolicy
+from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, cached, evaluate_run, kept_file, learned_file
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.step_log import read_ledger
@@ -25,15 +25,19 @@ from guiderail.tools.tables import read_table
 from guiderail.tools.visualization.style import colour, is_demonstrated, label
 
 LEARNED = "learned"
-BESIDE = ("zero", "white", "constant")  # null policies that an evaluation for a report has beside the learned one
-STUDY_COLUMNS = {"method", "policy", "seed", "mark", "judged_on", "episodes", "success_rate"}
+BESIDE = (
+    "zero",
+    "uniform_random",
+    "constant",
+)  # null policies that an evaluation for a report has beside the learned one
+STUDY_COLUMNS = {"method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"}
 NEEDED = (
-    "success", "return", "steps", "worst_violation", "worst_measured_violation", "peak_force", "collisions",
-    "fallbacks",
+    "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
+    "fallback_steps",
 )  # fmt: skip
 PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
 LEDGER_COLUMNS = (
-    "commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "holding", "fallback",
+    "commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "command_timed_out", "fallback",
 )  # fmt: skip
 
 
@@ -54,16 +58,16 @@ class Run:
             "source": "table",
             "episodes": len(rows),
             "steps": int(rows["steps"].sum()),
-            "commands_outside": int((~(rows["worst_violation"] <= TOLERANCE)).sum()),
-            "worst_command": float(rows["worst_violation"].max(skipna=False)),
-            "poses_outside": int((~(rows["worst_measured_violation"] <= TOLERANCE)).sum()),
-            "worst_pose": float(rows["worst_measured_violation"].max(skipna=False)),
+            "commands_outside": int((~(rows["max_commanded_violation"] <= TOLERANCE)).sum()),
+            "worst_command": float(rows["max_commanded_violation"].max(skipna=False)),
+            "poses_outside": int((~(rows["max_measured_violation"] <= TOLERANCE)).sum()),
+            "worst_pose": float(rows["max_measured_violation"].max(skipna=False)),
             "peak_force": float(rows["peak_force"].max(skipna=False)),
             "collisions": int(rows["collisions"].sum()),
             "collision_steps": int(rows["collision_steps"].sum()) if "collision_steps" in rows else None,
-            "saturated": int(rows["saturations"].sum()) if "saturations" in rows else None,
+            "saturated": int(rows["saturated_steps"].sum()) if "saturated_steps" in rows else None,
             "held": None,
-            "fallbacks": int(rows["fallbacks"].sum()),
+            "fallback_steps": int(rows["fallback_steps"].sum()),
         }
         folder = RunFolder(self.path).ledger
         if not folder.is_dir():
@@ -82,8 +86,8 @@ class Run:
             "peak_force": float(steps["contact_force"].max(skipna=False)),
             "collision_steps": int(steps["collision"].sum()),
             "saturated": int((steps["saturation"] > 0).sum()),
-            "held": int(steps["holding"].sum()),
-            "fallbacks": int(steps["fallback"].sum()),
+            "held": int(steps["command_timed_out"].sum()),
+            "fallback_steps": int(steps["fallback"].sum()),
         }
 
 
@@ -189,7 +193,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
         table = read_table(file)
         if not set(table.columns) >= STUDY_COLUMNS:
             continue
-        rows = _counted(table[(table["judged_on"] != "") & table["success_rate"].notna()].assign(study=file.stem))
+        rows = _counted(table[(table["eval_set"] != "") & table["success_rate"].notna()].assign(study=file.stem))
         for name, whole in found.items():
             if file.stem.startswith(f"{name}-"):
                 same = list(whole.columns.drop("study"))
@@ -199,7 +203,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
 
 
 def _counted(rows: pd.DataFrame) -> pd.DataFrame:
-    rows = rows[["study", "method", "policy", "seed", "mark", "judged_on", "episodes", "success_rate"]].copy()
+    rows = rows[["study", "method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"]].copy()
     rows["successes"] = (rows["success_rate"] * rows["episodes"]).round().astype(int)
     rows["episodes"] = rows["episodes"].astype(int)
     return rows.drop(columns="success_rate")
@@ -210,7 +214,7 @@ def _judged(run: Run, episodes: int) -> pd.DataFrame:
     if episodes:
         _judge(run, episodes)
     found: dict[str, dict[str, Any]] = {}
-    for file in sorted(file for folder in ("held_out", "beside") for file in (run.path / folder).glob("*.csv")):
+    for file in sorted(file for folder in ("held_out", "baselines") for file in (run.path / folder).glob("*.csv")):
         table, policy = read_table(file), file.stem.split("-")[0]
         if "success" not in table or (
             policy == LEARNED and not file.stem.startswith(f"{LEARNED}-{len(run.episodes)}-{HELD_OUT_SEED}-")
@@ -218,14 +222,14 @@ def _judged(run: Run, episodes: int) -> pd.DataFrame:
             continue
         # An evaluation may have been asked for another environment or other episodes.
         how: dict[str, Any] = {"episodes": len(table), "seed": HELD_OUT_SEED}
-        if file.parent.name == "beside" and file != kept_file(
+        if file.parent.name == "baselines" and file != kept_file(
             file.parent, policy, run.config, run.config.environment, **how
         ):
             continue
         count = {"episodes": len(table), "successes": int(table["success"].sum())}
-        where = {"study": "", "method": run.method, "seed": run.config.seed, "mark": len(run.episodes)}
+        where = {"study": "", "method": run.method, "seed": run.config.seed, "after_episodes": len(run.episodes)}
         if policy not in found or found[policy]["episodes"] < len(table):
-            found[policy] = {**where, "policy": policy, "judged_on": "held out", **count}
+            found[policy] = {**where, "policy": policy, "eval_set": "held out", **count}
     return pd.DataFrame(list(found.values()))
 
 
@@ -237,7 +241,7 @@ def _judge(run: Run, episodes: int) -> None:
     demonstrated = is_demonstrated(run.config.environment.get("guidance"))
     for name in BESIDE:
         called = "demonstration" if name == "zero" and demonstrated else name
-        acts[called] = lambda env, choose=NULL_POLICIES[name]: NullPolicy(choose, env, seed=HELD_OUT_SEED)
+        acts[called] = lambda env, choose=BASELINES[name]: BaselinePolicy(choose, env, seed=HELD_OUT_SEED)
     for name, act in acts.items():
         file = run.path / "held_out" / f"{name}-{HELD_OUT_SEED}-{episodes}.csv"
         cached(file, partial(evaluate_run, run.config, act, episodes=episodes, words=name))

@@ -10,7 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
-from guiderail.tools.evaluation.metrics import bootstrap_band, converged_after, survival, wilson
+from guiderail.tools.evaluation.metrics import bootstrap_band, episodes_to_convergence, survival, wilson
 from guiderail.tools.visualization.report_data import LEARNED, Gathered, Run
 from guiderail.tools.visualization.style import new_figure, rolling
 
@@ -48,7 +48,10 @@ def survival_curve(gathered: Gathered, task: str) -> str:
         axis = axes[0, 0]
         colours = gathered.colours(task)
         for (name, runs), dash in zip(gathered.methods(task).items(), cycle(DASHES), strict=False):
-            after, lengths = [converged_after(run.episodes) for run in runs], [len(run.episodes) for run in runs]
+            after, lengths = (
+                [episodes_to_convergence(run.episodes) for run in runs],
+                [len(run.episodes) for run in runs],
+            )
             steps, left = survival(after, lengths)
             steps, left = np.append(steps, max(lengths)), np.append(left, left[-1])
             axis.step(steps, left, where="post", color=colours[name], linestyle=dash, label=_label(name, runs))
@@ -62,13 +65,15 @@ def survival_curve(gathered: Gathered, task: str) -> str:
 
 def held_out(gathered: Gathered) -> str:
     """The success of each seed on held-out episodes, with its Wilson interval; what learned nothing is grey."""
-    judged, keys = gathered.held_out, ["study", "method", "policy", "seed", "judged_on"]
-    rows = judged[judged["mark"] == judged.groupby(keys)["mark"].transform("max")]  # after the last training episode
-    groups = list(rows.groupby(["study", "method", "policy", "judged_on"], sort=False))
+    judged, keys = gathered.held_out, ["study", "method", "policy", "seed", "eval_set"]
+    rows = judged[
+        judged["after_episodes"] == judged.groupby(keys)["after_episodes"].transform("max")
+    ]  # after the last training episode
+    groups = list(rows.groupby(["study", "method", "policy", "eval_set"], sort=False))
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(1, 1, (1.35 * SIZE[0], 0.6 + 0.13 * len(rows) + 0.2 * len(groups)))
         axis, place, ticks = axes[0, 0], 0.0, []
-        several = rows["study"].nunique() > 1, rows["judged_on"].nunique() > 1
+        several = rows["study"].nunique() > 1, rows["eval_set"].nunique() > 1
         for (study, method, policy, judged), group in groups:
             first = place
             for row in group.itertuples():

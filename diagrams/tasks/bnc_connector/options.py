@@ -12,7 +12,7 @@ from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.config import Number
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.diagrams.tasks.offsets import HiddenOffsets, HiddenPlace, in_ring
+from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, in_ring
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
@@ -20,9 +20,9 @@ from guiderail.models.objects.insertion import COLLISION_FORCE
 
 # Least and largest distance of the jack from where it is thought to be.
 OFFSET_RANGES = {
-    "calibration": (1.0 * MM, 1.5 * MM),
-    "disc": (0.0, 1.5 * MM),
-    "known": (0.0, 0.3 * MM),
+    "per_run": (1.0 * MM, 1.5 * MM),
+    "per_episode": (0.0, 1.5 * MM),
+    "none": (0.0, 0.3 * MM),
 }
 GRASP_RADIUS = 0.3 * MM  # how exactly a plug is picked up again
 LARGEST_GRASP_ANGLE = 2.0  # degrees; beyond it the plug would hang askew enough to be a fault and no uncertainty
@@ -31,10 +31,10 @@ LARGEST_GRASP_ANGLE = 2.0  # degrees; beyond it the plug would hang askew enough
 class BncUncertainty(HiddenOffsets):
     """Draws the offsets of jack and plug; `HiddenOffsets` has the options of a reset.
 
-    - "calibration": the jack is off by 1.0 to 1.5 mm in one direction, hidden and the same for a whole run; the plug
+    - "per_run": the jack is off by 1.0 to 1.5 mm in one direction, hidden and the same for a whole run; the plug
       sits in the tool within 0.3 mm of its place, anew every episode. The thesis's case.
-    - "disc": the jack is anywhere within 1.5 mm, anew every episode.
-    - "known": the jack is within 0.3 mm, anew every episode.
+    - "per_episode": the jack is anywhere within 1.5 mm, anew every episode.
+    - "none": the jack is within 0.3 mm, anew every episode.
 
     The plug may also sit tilted in the tool, anew every episode: its offset then has two angles [rad] about x and y
     after x and y. The jack may be turned about its axis, as often as its place is drawn: its offset then has an angle
@@ -51,7 +51,7 @@ class BncUncertainty(HiddenOffsets):
     ):
         """
         Args:
-            kind: "calibration", "disc" or "known".
+            kind: "per_run", "per_episode" or "none".
             grasp_angle: the largest tilt of the plug in the tool [degrees].
             offset_range: least and greatest distance of the jack from where it should be [m], instead of the kind's.
             jack_turn: the largest turn of the jack about its axis [degrees].
@@ -63,16 +63,16 @@ class BncUncertainty(HiddenOffsets):
         self.offset_range = OFFSET_RANGES[kind] if offset_range is None else tuple(offset_range)
 
     def _draw_run(self, rng: np.random.Generator) -> np.ndarray:
-        # Drawn of every kind, used or not; what "known" and "disc" draw of an episode came after it from the beginning.
+        # Drawn of every kind, used or not; what "none" and "per_episode" draw of an episode came after it from the beginning.
         return self._turned(in_ring(rng, *self.offset_range), rng)
 
     def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if self.kind == "calibration":
+        if self.kind == "per_run":
             jack, plug = run, in_ring(rng, 0.0, GRASP_RADIUS)
         else:
             jack, plug = in_ring(rng, *self.offset_range), np.zeros(2)
         plug = self._tilted(plug, in_ring(rng, 0.0, self.grasp_angle))
-        return (jack if self.kind == "calibration" else self._turned(jack, rng)), plug
+        return (jack if self.kind == "per_run" else self._turned(jack, rng)), plug
 
     def _given(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         jack = np.append(offset, 0.0) if self.jack_turn > 0.0 else offset
@@ -90,12 +90,14 @@ DRAWN = BncDimensions()
 SHIPPED = ("insert", "search")  # demonstrations
 
 
-class BncOptions(HiddenPlace):
+class BncOptions(FixtureOffsetOptions):
     """Of the connector."""
 
     jack_turn: Number = Field(0.0, ge=0, le=10, description="largest turn of the jack about its axis [degrees]")
     grasp_angle: Number = Field(0.0, ge=0, le=LARGEST_GRASP_ANGLE, description="largest tilt of the plug [degrees]")
-    start_beside: Number = Field(0.0, ge=0, le=ALIGNMENT, description="how far beside its start the tool may begin [m]")
+    start_offset_max: Number = Field(
+        0.0, ge=0, le=ALIGNMENT, description="how far beside its start the tool may begin [m]"
+    )
     bound: Number = Field(ALIGNMENT, ge=0.5 * MM, le=6.0 * MM, description="of a command's |x| and |y| [m]")
     force_limit: Number = Field(COLLISION_FORCE, ge=5, le=60, description="more than that ends an episode [N]")
     mouth_chamfer: Number = Field(
@@ -137,10 +139,10 @@ class BncOptions(HiddenPlace):
 
 
 HARD: dict[str, Any] = {
-    "observation": "lever",
+    "observation": "center_of_pressure",
     "demonstrations": "search",
-    "hold": 5,
-    "uncertainty": "disc",
+    "action_repeat": 5,
+    "fixture_offset": "per_episode",
     "offset_range": (2.6 * MM, 3.0 * MM),
     "bound": 3.5 * MM,
     "force_limit": 20.0,

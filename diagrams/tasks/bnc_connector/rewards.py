@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from scipy.linalg import block_diag
 
-from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, HALF_TURN_OF_WRENCH
 from guiderail.models.common.units import DEGREE, MM
@@ -16,7 +16,7 @@ from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 from guiderail.systems.episode_monitor import TERMINATIONS
 from guiderail.systems.reward_system import RewardTerm
 
-OBSERVATIONS = ("state", "lever")
+OBSERVATIONS = ("state", "center_of_pressure")
 
 # The wrench's torques are small, and they are what tells on which side of the rim the plug sits: 0.02 Nm at 4 N.
 POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
@@ -24,17 +24,21 @@ POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
 
-def observed(observation: str, num_steps: int = NUM_STEPS) -> tuple[Observed, ...]:
-    """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
+def observation_terms(observation: str, num_steps: int = NUM_STEPS) -> tuple[ObservationTerm, ...]:
+    """Time, pose and wrench; "center_of_pressure" adds the contact's lever and the commanded x and y."""
     half = 0.5 * num_steps * CONTROL_PERIOD
     state = (
-        Observed("time", half, half),
-        Observed("pose", POSE_CENTRE, POSE_SCALE),
-        Observed("wrench", 0.0, WRENCH_SCALE),
+        ObservationTerm("time", half, half),
+        ObservationTerm("pose", POSE_CENTRE, POSE_SCALE),
+        ObservationTerm("wrench", 0.0, WRENCH_SCALE),
     )
     if observation == "state":
         return state
-    return (*state, Observed("lever", 0.0, LEVER_SCALE), Observed("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
+    return (
+        *state,
+        ObservationTerm("center_of_pressure", 0.0, LEVER_SCALE),
+        ObservationTerm("desired_pose", 0.0, COMMAND_SCALE, (0, 1)),
+    )
 
 
 def half_turn(observation: str) -> tuple[float, ...]:
@@ -43,7 +47,7 @@ def half_turn(observation: str) -> tuple[float, ...]:
     return (1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH, *across)
 
 
-def sides_of_the_rim(observation: str, explored: Iterable[int]) -> tuple[np.ndarray, np.ndarray] | None:
+def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray] | None:
     """Seven other sides from which a plug on the rim feels the same: quarter turns about the axis, and their mirrors.
 
     Vectors across the axis turn; a mirror also changes the sign of torques and tilts. What is about the axis stays.
@@ -57,7 +61,7 @@ def sides_of_the_rim(observation: str, explored: Iterable[int]) -> tuple[np.ndar
     """
     quarter, mirror = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
-    observations, actions, outputs = [], [], list(explored)
+    observations, actions, outputs = [], [], list(action_dims)
     for across in [*turns[1:], *(turn @ mirror for turn in turns)]:
         axial = np.linalg.det(across).round() * across
         # A pose has Ry before Rx.

@@ -20,7 +20,7 @@ TIME, Z, LEVER, COMMAND = 0, 3, slice(13, 15), slice(15, 17)
 STANDS = SEARCH[0] - 0.2  # [s] when the plug may stand on the rim
 
 
-def lever_rule(observation: np.ndarray) -> np.ndarray:
+def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     """From where the command is a step along the lever, towards the point that bears the plug: there is the jack; (2,).
 
     Once the plug has dropped in it stays. Without a memory: what was commanded before is observed.
@@ -29,7 +29,7 @@ def lever_rule(observation: np.ndarray) -> np.ndarray:
         InputError: if the observation has no lever.
     """
     if len(observation) < COMMAND.stop:
-        raise InputError('this rule needs the contact\'s lever: choose observation="lever"')
+        raise InputError('this rule needs the contact\'s lever: choose observation="center_of_pressure"')
     time = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS * CONTROL_PERIOD
     if not STANDS < time < HOLD_UNTIL:
         return np.zeros(2)

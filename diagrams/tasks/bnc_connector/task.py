@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.config import STANDARD
-from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import Station
@@ -22,7 +22,7 @@ from guiderail.diagrams.tasks.bnc_connector.rewards import (
     OBSERVATIONS,
     REWARDS,
     half_turn,
-    observed,
+    observation_terms,
     reward_terms,
     sides_of_the_rim,
 )
@@ -35,14 +35,14 @@ from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.objects.bnc_connector import demonstrations as inserting
 from guiderail.models.objects.bnc_connector import search_demonstrations as searching
-from guiderail.models.objects.insertion import LEAST_FORCE, REPEATED, RHO
+from guiderail.models.objects.insertion import HISTORY_VARIANCE, MIN_CONTACT_FORCE, REPEATABILITY_STD
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.center_of_pressure import ContactLever
-from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.center_of_pressure import CenterOfPressure
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 NUM_STEPS, COMPONENTS = inserting.NUM_STEPS, 16
-FLOOR = np.array(REPEATED)
+FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting, "search": searching}
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
 LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
@@ -72,18 +72,26 @@ class BncConnector(InsertionTask):
     rewards = REWARDS
     observations = OBSERVATIONS
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
-    defaults = {"guidance": "skgrl", "station": "rails", "hold": 10, "explored": (0, 1), "history_variance": RHO}
+    defaults = {
+        "guidance": "skgrl",
+        "station": "gantry",
+        "action_repeat": 10,
+        "action_dims": (0, 1),
+        "history_variance": HISTORY_VARIANCE,
+    }
     isotropic_groups = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
 
     def __init__(self, options: BncOptions, choice: Choice):
         super().__init__(options, choice)
         o = options
-        self.offsets = BncUncertainty(o.uncertainty, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn)
+        self.offsets = BncUncertainty(
+            o.fixture_offset, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn
+        )
         self.collision = Threshold("contact_force", o.force_limit)
         self._workcell = o.workcell()
         self.num_steps = NUM_STEPS if o.demonstrations in DEMONSTRATIONS else self.reference().num_steps
 
-    def world(self) -> BncWorkcell:
+    def workcell(self) -> BncWorkcell:
         """A jack in the world, a plug in the tool."""
         return self._workcell
 
@@ -102,11 +110,11 @@ class BncConnector(InsertionTask):
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Beside where the plug is, the lever of what it stands on."""
-        lever = builder.AddNamedSystem("contact_lever", ContactLever(LEAST_FORCE))
+        lever = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
         builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
-        return {**super().signals(builder, station), "lever": lever.get_lever_output_port()}
+        return {**super().signals(builder, station), "center_of_pressure": lever.get_center_of_pressure_output_port()}
 
-    def seen_by_robot(self) -> tuple[np.ndarray, np.ndarray]:
+    def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Height and turn tell whether it is locked. How far beside the jack it is nobody knows: a pull tells."""
         size = self._workcell.dimensions
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
@@ -114,31 +122,31 @@ class BncConnector(InsertionTask):
         y0[[2, 5]] = size.locked_height, -size.detent_angle
         return D, y0
 
-    def observed(self) -> Sequence[Observed]:
-        """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
-        return observed(self.choice.observation, self.num_steps)
+    def observation_terms(self) -> Sequence[ObservationTerm]:
+        """Time, pose and wrench; "center_of_pressure" adds the contact's lever and the commanded x and y."""
+        return observation_terms(self.choice.observation, self.num_steps)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of actions, forces and the end; of depth where the reward is shaped."""
         return reward_terms(self.choice.reward, num_actions)
 
-    def conditions(self) -> list[Condition]:
+    def termination_terms(self) -> list[TerminationTerm]:
         """Locked for a while, or pushed too hard."""
-        return [Condition("success", {"plug": 6}, self._workcell.locks, steps=LOCKED_STEPS), self.force_limit()]
+        return [TerminationTerm("success", {"plug": 6}, self._workcell.locks, steps=LOCKED_STEPS), self.force_limit()]
 
     def symmetry(self) -> Symmetry:
         """Half a turn about the jack's axis."""
-        explored = self.choice.values["explored"]
-        action = HALF_TURN if explored is None else HALF_TURN[list(explored)]
+        action_dims = self.choice.values["action_dims"]
+        action = HALF_TURN if action_dims is None else HALF_TURN[list(action_dims)]
         return Symmetry.of_signs(half_turn(self.choice.observation), action)
 
     def near_symmetry(self) -> Symmetry:
         """Quarter turns and mirrors too: alike as long as the plug stands on the rim, which has no sides."""
-        explored = self.choice.values["explored"]
-        sides = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if explored is None else explored)
+        action_dims = self.choice.values["action_dims"]
+        sides = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if action_dims is None else action_dims)
         return self.symmetry() if sides is None else Symmetry(*sides)
 
-    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+    def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Moves the jack by (x, y) and its turn, the plug by (x, y) and its tilt about x and y, where they have one."""
         plant_context = station.plant.GetMyMutableContextFromRoot(context)
         tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
@@ -146,11 +154,11 @@ class BncConnector(InsertionTask):
         self._workcell.set_jack_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
         self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform(tilt, [*workpiece[:2], 0.0]))
 
-    def start(self, rng: np.random.Generator) -> np.ndarray:
+    def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Where the demonstrations start, or somewhere beside it, inside the constraints."""
         start = self.reference().means[0].copy()
-        if self.options.start_beside > 0.0:
-            start[:2] += in_ring(rng, 0.0, self.options.start_beside)
+        if self.options.start_offset_max > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
         return self.constraints().nearest(start)
 
     def camera(self) -> Camera:

@@ -13,9 +13,9 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.config import STANDARD, Number, Numbers, Options
-from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
-from guiderail.diagrams.guidance.prior import Approach, Template
+from guiderail.diagrams.guidance.prior import ScriptedApproach, Template
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -26,8 +26,8 @@ from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import MM
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION
-from guiderail.models.templates import Skill, load_skill
-from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, Condition
+from guiderail.models.templates import SharedControlTemplate, load_template
+from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 # More than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m.
@@ -41,8 +41,8 @@ DRAWN = GridClampDimensions()
 class GridClampOptions(Options):
     """Of the clamp."""
 
-    uncertainty: Literal["calibration", "disc", "known"] = Field(
-        "calibration", description="where table and clamp may be"
+    fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
+        "per_run", description="where table and clamp may be"
     )
     start_height: Numbers = Field(
         START_HEIGHT, min_length=2, max_length=2, description="least and greatest height at which it begins [m]"
@@ -85,18 +85,18 @@ ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 REWARDS = ("shaped", "no_force", "sparse", "aligned")
 
 
-def reward_terms(reward: str, num_actions: int, hold: int) -> list[RewardTerm]:
+def reward_terms(reward: str, num_actions: int, action_repeat: int) -> list[RewardTerm]:
     """ "shaped" is the thesis's, "no_force" the same without the cost of force, "sparse" without the distance gained.
 
     "aligned" adds nearness to the holes' axis, which only a simulation knows and a policy does not see, and a cost of
-    pushing too hard. What the thesis gives once a decision is divided among its `hold` control steps.
+    pushing too hard. What the thesis gives once a decision is divided among its `action_repeat` control steps.
     """
     terms = [
         RewardTerm("terminal_reward", {"termination": 1}, _terminal_reward),
-        RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / hold),
+        RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / action_repeat),
     ]
     if reward != "no_force":
-        terms.append(RewardTerm("force_cost", {"wrench": 6}, lambda wrench: _force_cost(wrench[:3]) / hold))
+        terms.append(RewardTerm("force_cost", {"wrench": 6}, lambda wrench: _force_cost(wrench[:3]) / action_repeat))
     if reward != "sparse":
         terms.append(RewardTerm("shaping", {"pose": POSE_SIZE, "last_pose": POSE_SIZE}, _distance_gained))
     if reward == "aligned":
@@ -137,11 +137,11 @@ KNOWN_RADIUS = 0.15 * MM
 class GridClampUncertainty(HiddenOffsets):
     """Draws the offsets of table and clamp; `HiddenOffsets` has the options of a reset.
 
-    - "calibration": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp
+    - "per_run": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp
       offset of its own, all hidden and the same for a whole run. An episode picks up at one of the places, drawn, with
       a repeatability of 0.1 mm. The thesis's case.
-    - "disc": the error of the table and the six grasp offsets are drawn anew every episode.
-    - "known": the clamp is within 0.15 mm of where it is thought to be.
+    - "per_episode": the error of the table and the six grasp offsets are drawn anew every episode.
+    - "none": the clamp is within 0.15 mm of where it is thought to be.
 
     The option `offset` puts the clamp there in the tool and the table in its place.
     """
@@ -149,7 +149,7 @@ class GridClampUncertainty(HiddenOffsets):
     def __init__(self, kind: str):
         """
         Args:
-            kind: "calibration", "disc" or "known".
+            kind: "per_run", "per_episode" or "none".
         """
         super().__init__()
         self.kind = kind
@@ -164,9 +164,9 @@ class GridClampUncertainty(HiddenOffsets):
     def _draw_episode(
         self, rng: np.random.Generator, run: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray]:
-        if self.kind == "known":
+        if self.kind == "none":
             return np.zeros(2), in_ring(rng, 0.0, KNOWN_RADIUS)
-        table, grasps = self._draw_run(rng) if self.kind == "disc" else run
+        table, grasps = self._draw_run(rng) if self.kind == "per_episode" else run
         return table, grasps[rng.integers(NUM_PLACES)] + in_ring(rng, 0.0, REPEATABILITY)
 
     def _given(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -185,9 +185,9 @@ CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 
 
-def make_skill() -> Skill:
+def make_skill() -> SharedControlTemplate:
     """The template of section 3.4.2."""
-    return load_skill("grid_clamp")
+    return load_template("grid_clamp")
 
 
 @register_task("GridClamp")
@@ -201,53 +201,55 @@ class GridClamp(InsertionTask):
     workpiece, fixture = "clamp", "table"
     rewards = REWARDS
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
-    defaults = {"guidance": "sct", "station": "rails", "hold": 5, "active_constraints": True}
-    learner = {"algorithm": "sac", "preset": "clamp"}
+    defaults = {"guidance": "sct", "station": "gantry", "action_repeat": 5, "active_constraints": True}
+    learner = {"algorithm": "sac", "preset": "sac_gridclamp"}
 
     def __init__(self, options: GridClampOptions, choice: Choice):
         super().__init__(options, choice)
-        self.offsets = GridClampUncertainty(options.uncertainty)
+        self.offsets = GridClampUncertainty(options.fixture_offset)
         self.collision = Threshold("contact_force", options.force_limit)
         # 100 decisions at 10 Hz unless given; the thesis's episodes take 140 on average.
         self.num_steps = round(options.seconds / CONTROL_PERIOD)
         self._workcell = options.workcell()
 
-    def world(self) -> GridClampWorkcell:
+    def workcell(self) -> GridClampWorkcell:
         """A table with holes, a clamp in the tool."""
         return self._workcell
 
     def template(self) -> Template:
         """One phase: a cuboid above the hole, upright."""
         active = self.choice.values["active_constraints"]
-        return Template(make_skill(), {"hole": RigidTransform()}, active_constraints=active, leash=LEASH)
+        return Template(make_skill(), {"hole": RigidTransform()}, active_constraints=active, max_tracking_error=LEASH)
 
-    def approach(self) -> Approach:
+    def approach(self) -> ScriptedApproach:
         """Straight down into the hole."""
         parameters = make_skill().parameters
         heights = (max(self.options.start_height), -parameters["push_m"])
-        return Approach(heights, speed=parameters["speed_m_per_s"], reach=parameters["width_m"] / 2)
+        return ScriptedApproach(heights, speed=parameters["speed_m_per_s"], reach=parameters["width_m"] / 2)
 
-    def observed(self) -> Sequence[Observed]:
+    def observation_terms(self) -> Sequence[ObservationTerm]:
         """Position of the clamp in the hole's frame, and force."""
         first_three = (0, 1, 2)
-        return Observed("pose", CENTRE[:3], SCALE[:3], first_three), Observed("wrench", 0.0, SCALE[3:], first_three)
+        return ObservationTerm("pose", CENTRE[:3], SCALE[:3], first_three), ObservationTerm(
+            "wrench", 0.0, SCALE[3:], first_three
+        )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Equations 3.11 and 3.12."""
-        return reward_terms(self.choice.reward, num_actions, self.choice.hold)
+        return reward_terms(self.choice.reward, num_actions, self.choice.action_repeat)
 
-    def conditions(self) -> list[Condition]:
+    def termination_terms(self) -> list[TerminationTerm]:
         """Seated for a while, or pushed too hard."""
-        seated = Condition("success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=SEATED_STEPS)
+        seated = TerminationTerm("success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=SEATED_STEPS)
         return [seated, self.force_limit()]
 
-    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+    def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Moves the table, and the clamp in the tool, by (x, y)."""
         plant_context = station.plant.GetMyMutableContextFromRoot(context)
         self._workcell.set_table_offset(station.plant, plant_context, RigidTransform([*fixture, 0.0]))
         self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece, 0.0]))
 
-    def start(self, rng: np.random.Generator) -> np.ndarray:
+    def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """About where the skill before hands over."""
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
         start[:3] = *rng.uniform(-START_BESIDE, START_BESIDE, 2), rng.uniform(lowest, highest)

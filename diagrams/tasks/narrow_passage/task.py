@@ -14,19 +14,19 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.config import STANDARD, Number, Numbers, Options, ResetOptions
-from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Drawn, Task
+from guiderail.diagrams.tasks.task import Choice, EpisodeConstant, Task
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.objects.narrow_passage import demonstrations
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import SUCCESS, Condition
+from guiderail.systems.episode_monitor import SUCCESS, TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 USUAL = PassageGeometry()
@@ -68,7 +68,7 @@ class NarrowPassageOptions(Options):
         """Whether a reset says where the obstacles are; otherwise there is the usual one, which only costs."""
         return self.obstacle_beside > 0 or self.obstacles_end or self.second_obstacle
 
-    def world(self) -> PassageGeometry:
+    def workcell(self) -> PassageGeometry:
         """Where things usually are with these options."""
         middle = 0.5 * (USUAL.gap_x[0] + USUAL.gap_x[1])
         default = self.gap_width == type(self).model_fields["gap_width"].default
@@ -125,7 +125,7 @@ BLOCKED_STEPS = 20
 BLOCKED_PROGRESS = 1e-4  # [m] along y
 
 
-def conditions(world: PassageGeometry, touching_ends: bool = False) -> list[Condition]:
+def conditions(world: PassageGeometry, touching_ends: bool = False) -> list[TerminationTerm]:
     """At the goal; or pressed against a wall, or stopped before it by a filter, and getting nowhere.
 
     With `touching_ends` also with the robot's centre in an obstacle, wherever the signal `obstacles` says that they
@@ -139,8 +139,8 @@ def conditions(world: PassageGeometry, touching_ends: bool = False) -> list[Cond
         return any(world.obstacle_distance(pose, obstacle) < 0.0 for obstacle in obstacles.reshape(-1, 2))
 
     usual = [
-        Condition("success", {"pose": 2}, world.at_goal),
-        Condition(
+        TerminationTerm("success", {"pose": 2}, world.at_goal),
+        TerminationTerm(
             "blocked",
             {"pose": 2, "contact_force": 1, "fallback": 1},
             blocked,
@@ -149,7 +149,7 @@ def conditions(world: PassageGeometry, touching_ends: bool = False) -> list[Cond
             min_progress=BLOCKED_PROGRESS,
         ),
     ]
-    collision = Condition("collision", {"pose": 2, "obstacles": world.obstacles.size}, touched)
+    collision = TerminationTerm("collision", {"pose": 2, "obstacles": world.obstacles.size}, touched)
     return [collision, *usual] if touching_ends else usual
 
 
@@ -160,7 +160,7 @@ AWAY = 1.0  # of a full action
 PHASE, SIDES = 0, (1, 3)
 
 
-def slalom(observation: np.ndarray) -> np.ndarray:
+def scripted_slalom(observation: np.ndarray) -> np.ndarray:
     """Away from the obstacle that is being passed, along x, (2,)."""
     for (first, last), side in zip(BESIDE, SIDES, strict=True):
         if first < observation[PHASE] < last:
@@ -187,23 +187,23 @@ class NarrowPassage(Task):
     """Through the gap: "sparse" is the thesis's reward (4.22-4.25), "shaped" adds how much nearer the goal came, in
     centimetres; "state" is the time in [-1, 1] (the thesis's policy state), "image" is 110 x 144 x 3."""
 
-    world_kind = "plane"
+    workcell_kind = "plane"
     Options = NarrowPassageOptions
     Reset = NarrowPassageReset
-    draws_held_out = True
+    has_held_out_distribution = True
     options: NarrowPassageOptions
     rewards = ("sparse", "shaped")
     observations = ("state", "image")
-    defaults = {"guidance": "skgrl", "hold": 5}
+    defaults = {"guidance": "skgrl", "action_repeat": 5}
     difficulties = {STANDARD: {}, "hard": HARD}
     num_steps = demonstrations.NUM_STEPS
     clip = 1.0
 
     def __init__(self, options: NarrowPassageOptions, choice: Choice):
         super().__init__(options, choice)
-        self._world = options.world()
+        self._world = options.workcell()
 
-    def world(self) -> PassageGeometry:
+    def workcell(self) -> PassageGeometry:
         """Walls, a zone, an obstacle and a goal."""
         return self._world
 
@@ -211,7 +211,7 @@ class NarrowPassage(Task):
         """Where the obstacles are, one after the other."""
         if not self.options.drawn:
             return {}
-        self.drawn["obstacles"] = Drawn(builder, "obstacles", self._world.obstacles.size)
+        self.drawn["obstacles"] = EpisodeConstant(builder, "obstacles", self._world.obstacles.size)
         return {"obstacles": self.drawn["obstacles"].port}
 
     def reference(self) -> ReferenceTrajectory:
@@ -226,13 +226,13 @@ class NarrowPassage(Task):
         """Walls and zone."""
         return self._world.keep_out()
 
-    def observed(self) -> Sequence[Observed] | Camera:
+    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
         """The phase, and where obstacles are that a reset draws; or the plane from above, lying on its side: the way up
         is to the right."""
         if self.choice.observation == "state":
             usual = self._world.obstacles.ravel()
-            beside = Observed("obstacles", usual, self.options.obstacle_beside or 1.0)
-            return (Observed("phase"), beside) if self.options.obstacle_beside else (Observed("phase"),)
+            beside = ObservationTerm("obstacles", usual, self.options.obstacle_beside or 1.0)
+            return (ObservationTerm("phase"), beside) if self.options.obstacle_beside else (ObservationTerm("phase"),)
         R_WC = RotationMatrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
         return Camera(IMAGE_SIZE, np.deg2rad(30), RigidTransform(R_WC, [0.42, 0.5, 1.5]))
 
@@ -240,7 +240,7 @@ class NarrowPassage(Task):
         """Of the way gone, the obstacle and the goal; of the way to the goal where the reward is shaped."""
         return reward_terms(self.choice.reward, self._world, self.options.drawn)
 
-    def conditions(self) -> list[Condition]:
+    def termination_terms(self) -> list[TerminationTerm]:
         """At the goal, or getting nowhere; where touching obstacles ends an episode, that."""
         return conditions(self._world, self.options.obstacles_end)
 

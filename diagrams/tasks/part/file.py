@@ -19,7 +19,7 @@ from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.common.yaml import load_yaml
-from guiderail.models.objects.insertion import COLLISION_FORCE, REPEATED
+from guiderail.models.objects.insertion import COLLISION_FORCE, REPEATABILITY_STD
 from guiderail.models.parts.symmetry import SIDES
 from guiderail.models.primitives import LinearConstraints
 
@@ -140,7 +140,10 @@ class Shown(Options):
     file: str = Field("demonstrations.npz", description=".npz or .csv, poses in the target frame")
     components: int | None = Field(None, ge=1, description="of their mixture; by information criterion unless given")
     floor: Numbers = Field(
-        REPEATED, min_length=6, max_length=6, description="standard deviation that a hand has anyway [m], [rad]"
+        REPEATABILITY_STD,
+        min_length=6,
+        max_length=6,
+        description="standard deviation that a hand has anyway [m], [rad]",
     )
 
 
@@ -149,16 +152,16 @@ class Recommended(Options):
 
     environment: dict[str, Any] = Field(
         {
-            "uncertainty": "disc",
+            "fixture_offset": "per_episode",
             "offset_range": (1.5 * MM, 2.0 * MM),  # as far off as a straight insertion must fail, and as bounds allow
-            "observation": "lever",
+            "observation": "center_of_pressure",
             "reward": "aligned",
-            "hold": 5,
+            "action_repeat": 5,
         },
         description="options of the environment",
     )
     learner: dict[str, Any] = Field(
-        {"algorithm": "tqc", "preset": "robust", "settings": {"symmetry": "near"}},
+        {"algorithm": "tqc", "preset": "tqc_contact", "settings": {"symmetry": "near"}},
         description="algorithm, preset, and settings in place of the preset's",
     )
 
@@ -179,7 +182,7 @@ class PartTaskFile(Options):
     time_step: Number | None = Field(None, gt=0, description="of the simulation [s]; its own unless given")
     stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
     demonstrations: Shown = Shown.model_validate({})
-    explored: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
+    action_dims: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
     sides: tuple[str, ...] = Field((), description="from which the parts look the same: see models/parts/sides.py")
     rim_sides: tuple[str, ...] = Field((), description="from which a plug on the rim feels nearly the same")
     recommended: Recommended = Recommended.model_validate({})

@@ -14,14 +14,14 @@ from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.config import Number
-from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import REWARDS, reward_terms, sides_of_the_rim
 from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.offsets import HiddenPlace, in_ring, reference_of_file
+from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, in_ring, reference_of_file
 from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
 from guiderail.diagrams.tasks.task import Choice, Threshold
@@ -29,22 +29,30 @@ from guiderail.models.common.files import write_atomically
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.objects.insertion import COLLISION_FORCE, COMMAND_SCALE, LEAST_FORCE, LEVER_SCALE, RHO
+from guiderail.models.objects.insertion import (
+    COLLISION_FORCE,
+    COMMAND_SCALE,
+    HISTORY_VARIANCE,
+    LEVER_SCALE,
+    MIN_CONTACT_FORCE,
+)
 from guiderail.models.parts.model_files import part_sdf
 from guiderail.models.parts.symmetry import SIDES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.center_of_pressure import ContactLever
-from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.center_of_pressure import CenterOfPressure
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
-class PartOptions(HiddenPlace):
+class PartOptions(FixtureOffsetOptions):
     """Of a task of two meshes."""
 
-    start_beside: Number = Field(0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]")
+    start_offset_max: Number = Field(
+        0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]"
+    )
     force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
 
 
@@ -61,18 +69,18 @@ class PartInsertion(InsertionTask):
     options: PartOptions
     workpiece, fixture = PLUG, SOCKET
     rewards = REWARDS
-    observations = ("state", "lever")
+    observations = ("state", "center_of_pressure")
     isotropic_groups = ((0, 1, 2), (3, 4, 5))
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]
 
     def __init__(self, options: PartOptions, choice: Choice):
         super().__init__(options, choice)
-        self.offsets = BncUncertainty(options.uncertainty, offset_range=options.offset_range)
+        self.offsets = BncUncertainty(options.fixture_offset, offset_range=options.offset_range)
         self.collision = Threshold("contact_force", options.force_limit)
         self.num_steps = self.reference().num_steps
 
-    def world(self) -> PartWorkcell:
+    def workcell(self) -> PartWorkcell:
         """The socket in the world, the plug in the tool."""
         return self._workcell
 
@@ -90,10 +98,10 @@ class PartInsertion(InsertionTask):
         return self.file.bounds.constraints(self.reference().num_steps)
 
     @classmethod
-    def knows(cls) -> tuple[str, ...]:
+    def provides(cls) -> tuple[str, ...]:
         """As of every task; but what is to be kept out of can't change on the way."""
         changes = cls.file.bounds.phases is not None
-        return tuple(one for one in super().knows() if not (one == "keep_out" and changes))
+        return tuple(one for one in super().provides() if not (one == "keep_out" and changes))
 
     def keep_out(self) -> KeepOut:
         """No walls are known: what safe residual learning is projected to are the bounds alone."""
@@ -101,28 +109,36 @@ class PartInsertion(InsertionTask):
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Beside where the plug is, the lever of what it stands on."""
-        lever = builder.AddNamedSystem("contact_lever", ContactLever(LEAST_FORCE))
+        lever = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
         builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
-        return {**super().signals(builder, station), "lever": lever.get_lever_output_port()}
+        return {**super().signals(builder, station), "center_of_pressure": lever.get_center_of_pressure_output_port()}
 
-    def observed(self) -> Sequence[Observed]:
-        """Time, pose and wrench; "lever" adds the contact's lever and the commanded x and y."""
+    def observation_terms(self) -> Sequence[ObservationTerm]:
+        """Time, pose and wrench; "center_of_pressure" adds the contact's lever and the commanded x and y."""
         half = 0.5 * self.num_steps * CONTROL_PERIOD
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         centre = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale = np.array([2 * MM, 2 * MM, height, max(abs(turn), 3 * DEGREE), 1.5 * DEGREE, 1.5 * DEGREE])
-        state = (Observed("time", half, half), Observed("pose", centre, scale), Observed("wrench", 0.0, WRENCH_SCALE))
+        state = (
+            ObservationTerm("time", half, half),
+            ObservationTerm("pose", centre, scale),
+            ObservationTerm("wrench", 0.0, WRENCH_SCALE),
+        )
         if self.choice.observation == "state":
             return state
-        return (*state, Observed("lever", 0.0, LEVER_SCALE), Observed("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
+        return (
+            *state,
+            ObservationTerm("center_of_pressure", 0.0, LEVER_SCALE),
+            ObservationTerm("desired_pose", 0.0, COMMAND_SCALE, (0, 1)),
+        )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of actions, forces and the end; of depth and nearness where the reward says so."""
         return reward_terms(self.choice.reward, num_actions)
 
-    def conditions(self) -> list[Condition]:
+    def termination_terms(self) -> list[TerminationTerm]:
         """At the target for a while, or pushed too hard."""
-        seated = Condition("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
+        seated = TerminationTerm("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
         return [seated, self.force_limit()]
 
     def symmetry(self) -> Symmetry | None:
@@ -134,8 +150,8 @@ class PartInsertion(InsertionTask):
         return self._seen_from((*self.file.sides, *self.file.rim_sides))
 
     def _seen_from(self, names: Sequence[str]) -> Symmetry | None:
-        explored = self.choice.values["explored"]
-        every = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if explored is None else explored)
+        action_dims = self.choice.values["action_dims"]
+        every = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if action_dims is None else action_dims)
         chosen = [number for number, name in enumerate(SIDES) if name in names]
         return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
 
@@ -149,19 +165,19 @@ class PartInsertion(InsertionTask):
             and abs(plug[5]) < tolerance.turn * DEGREE
         )
 
-    def move(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
+    def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
         """Moves the socket, and the plug in the tool, by (x, y)."""
         plant_context = station.plant.GetMyMutableContextFromRoot(context)
-        world = self.world()
+        world = self.workcell()
         turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
         world.set_socket_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
         world.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
 
-    def start(self, rng: np.random.Generator) -> np.ndarray:
+    def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Where the demonstrations start, or somewhere beside it, inside the bounds."""
         start = self.reference().means[0].copy()
-        if self.options.start_beside > 0.0:
-            start[:2] += in_ring(rng, 0.0, self.options.start_beside)
+        if self.options.start_offset_max > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
         return self.constraints().nearest(start)
 
     def camera(self) -> Camera:
@@ -172,7 +188,7 @@ class PartInsertion(InsertionTask):
 
     def scene(self) -> Scene:
         """The demonstrations, and the box that commands stay in, in each phase."""
-        to_world, size = in_frame(self.world().X_WT), self.file.motion.travel
+        to_world, size = in_frame(self.workcell().X_WT), self.file.motion.travel
         near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
         lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())
         lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
@@ -231,10 +247,10 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
     file = read_task_file(folder)
     defaults = {
         "guidance": "skgrl",
-        "station": "rails",
-        "hold": 10,
-        "explored": file.explored,
-        "history_variance": RHO,
+        "station": "gantry",
+        "action_repeat": 10,
+        "action_dims": file.action_dims,
+        "history_variance": HISTORY_VARIANCE,
         "force_limit": file.force_limit,
         "time_step": file.time_step,
         **file.recommended.environment,

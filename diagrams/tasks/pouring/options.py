@@ -13,7 +13,7 @@ from guiderail.diagrams.envs.config import Integer, Number, Numbers, Options, Re
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, Ball
-from guiderail.models.templates import Skill, load_skill
+from guiderail.models.templates import SharedControlTemplate, load_template
 
 FULL_SPEED = 0.15  # [m/s] of a full input, along one axis
 FULL_TILT = 0.8  # [rad/s]
@@ -21,18 +21,20 @@ FULL_TILT = 0.8  # [rad/s]
 SPARSE_INPUT_SPEED = 1.7
 
 
-def make_skill(config: PouringConfig, input_speed: float = 1.0) -> Skill:
+def make_skill(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
     """The pouring template for this scene's vessels; `input_speed` times as fast as it is meant."""
     return _load("pouring", config, input_speed)
 
 
-def make_aimed_skill(config: PouringConfig, input_speed: float, aim_speed: float, pour_speed: float) -> Skill:
+def make_aimed_skill(
+    config: PouringConfig, input_speed: float, aim_speed: float, pour_speed: float
+) -> SharedControlTemplate:
     """The template whose Pour can be aimed; `aim_speed` and `pour_speed` are parts of the full speeds in Pour."""
     return _load("pouring_aimed", config, input_speed, aim_speed=aim_speed, pour_speed=pour_speed)
 
 
-def _load(name: str, config: PouringConfig, input_speed: float, **others: float) -> Skill:
-    return load_skill(
+def _load(name: str, config: PouringConfig, input_speed: float, **others: float) -> SharedControlTemplate:
+    return load_template(
         name,
         full_speed_m_per_s=input_speed * FULL_SPEED,
         full_tilt_rad_per_s=input_speed * FULL_TILT,
@@ -42,7 +44,7 @@ def _load(name: str, config: PouringConfig, input_speed: float, **others: float)
     )
 
 
-def frames_of(skill: Skill, X_TMug: RigidTransform) -> dict[str, RigidTransform]:
+def frames_of(skill: SharedControlTemplate, X_TMug: RigidTransform) -> dict[str, RigidTransform]:
     """The poses of a template's objects for a mug, or for where it is believed to be."""
     if "behind_mug" in skill.frames:
         return {"behind_mug": X_TMug @ RigidTransform([0.0, skill.parameters["behind_m"], 0.0])}

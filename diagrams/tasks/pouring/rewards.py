@@ -20,12 +20,12 @@ AIM = np.array([0.0, -0.045])  # [m] in the mug's frame: where a tip that is tip
 AIMING = 2000.0  # [1/m] 50 mm count half as much as the whole tilt
 
 
-def reward_terms(reward: str, inputs: int, hold: int, aimed: bool = False) -> list[RewardTerm]:
-    """The terms of a reward by name, for `inputs` actions and one of `hold` control steps of a decision.
+def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = False) -> list[RewardTerm]:
+    """The terms of a reward by name, for `inputs` actions and one of `action_repeat` control steps of a decision.
 
     Where Pour can be `aimed`, the shaped reward also has how much nearer the tip came to where it should be, in Pour.
 
-    A decision's reward is the sum over its control steps: what the thesis gives once a decision is divided by `hold`.
+    A decision's reward is the sum over its control steps: what the thesis gives once a decision is divided by `action_repeat`.
     """
     terms = [
         RewardTerm(
@@ -33,7 +33,7 @@ def reward_terms(reward: str, inputs: int, hold: int, aimed: bool = False) -> li
             {"termination": 1},
             lambda termination: TERMINAL.get(TERMINATIONS[int(termination[0])], 0.0),
         ),
-        RewardTerm("action_cost", {"action": inputs}, lambda action: -float(action @ action) / hold),
+        RewardTerm("action_cost", {"action": inputs}, lambda action: -float(action @ action) / action_repeat),
     ]
     if reward == "sparse":
         return terms
@@ -49,7 +49,7 @@ def reward_terms(reward: str, inputs: int, hold: int, aimed: bool = False) -> li
         poses = {"tip_in_mug": 6, "last_tip_in_mug": 6}
 
         def approach(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
-            return _approach(tip_in_mug, last_tip_in_mug, hold)
+            return _approach(tip_in_mug, last_tip_in_mug, action_repeat)
 
         def tilting(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
             return _tilting(tip_in_mug, last_tip_in_mug) / 4
@@ -66,10 +66,10 @@ def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarr
     return AIMING * (before - after)
 
 
-def _approach(tip: np.ndarray, last: np.ndarray, hold: int) -> float:
+def _approach(tip: np.ndarray, last: np.ndarray, action_repeat: int) -> float:
     """Equation 3.9."""
     distance = np.linalg.norm(tip[:3])
-    bonus = NEAR_BONUS / hold if distance <= NEAR else 0.0
+    bonus = NEAR_BONUS / action_repeat if distance <= NEAR else 0.0
     return float(APPROACH * (np.linalg.norm(last[:3]) - distance) + bonus)
 
 

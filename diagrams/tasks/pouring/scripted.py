@@ -19,7 +19,7 @@ SOFTNESS = 0.03, 0.02  # [m] from which distance on the inputs get smaller, on t
 ERROR, STATE = slice(6, 8), 8
 
 
-def aiming_person(observation: np.ndarray) -> np.ndarray:
+def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
     """Pushes to where the template begins to pour, then aims at the mug itself, and tips the thermos over; (3,)."""
     p_MP = observation[:3] / POSITION_SCALE
     if observation[STATE] < 0.5:
@@ -32,12 +32,12 @@ def aiming_person(observation: np.ndarray) -> np.ndarray:
     return np.array([*np.clip(to_go / SOFTNESS[1], -1.0, 1.0), float(tips)])
 
 
-def blind_person(observation: np.ndarray) -> np.ndarray:
+def scripted_pour_blind(observation: np.ndarray) -> np.ndarray:
     """The same for where the template believes the mug to be, (3,)."""
     seen = np.array(observation, dtype=float)
     seen[:2] -= POSITION_SCALE * MAX_MUG_ERROR * seen[ERROR]
     seen[ERROR] = 0.0
-    return aiming_person(seen)
+    return scripted_pour_aimed(seen)
 
 
 def _tilt_deg(observation: np.ndarray) -> float:
@@ -55,7 +55,7 @@ POURING = 0.078
 """m: nearer than this to the middle of the mug's opening the person stops steering and just pushes on."""
 
 
-def person(observation: np.ndarray) -> np.ndarray:
+def scripted_pour(observation: np.ndarray) -> np.ndarray:
     """Someone who looks at the mug and pushes a three-axis device towards it, until it is poured."""
     p_MP = observation[:3] / POSITION_SCALE
     horizontal = np.hypot(p_MP[0], p_MP[1])
@@ -68,7 +68,7 @@ def person(observation: np.ndarray) -> np.ndarray:
 
 def noisy_person(rng: np.random.Generator, spread: float = 1.5) -> Inputs:
     """The person, with hands that shake more than they steer."""
-    return lambda observation: np.clip(person(observation) + spread * rng.normal(size=3), -1.0, 1.0)
+    return lambda observation: np.clip(scripted_pour(observation) + spread * rng.normal(size=3), -1.0, 1.0)
 
 
 def random_walk(rng: np.random.Generator) -> Inputs:
@@ -103,8 +103,8 @@ def presser(rng: np.random.Generator) -> Inputs:
     return inputs
 
 
-def white(rng: np.random.Generator) -> Inputs:
-    """An untrained policy."""
+def uniform_random(rng: np.random.Generator) -> Inputs:
+    """An make_baseline policy."""
     return lambda observation: rng.uniform(-1.0, 1.0, 3)
 
 
@@ -113,5 +113,5 @@ ADVERSARIES: dict[str, Callable[[np.random.Generator], Inputs]] = {
     "random_walk": random_walk,
     "rammer": rammer,
     "presser": presser,
-    "white": white,
+    "uniform_random": uniform_random,
 }

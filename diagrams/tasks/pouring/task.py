@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 
 from guiderail.diagrams.envs.cameras import Camera, look_at
 from guiderail.diagrams.envs.config import STANDARD
-from guiderail.diagrams.envs.observation import Observed
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_frame, viewpoint
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import Template
@@ -31,10 +31,10 @@ from guiderail.diagrams.tasks.pouring.options import (
 )
 from guiderail.diagrams.tasks.pouring.rewards import reward_terms
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Drawn, Task, Threshold
+from guiderail.diagrams.tasks.task import Choice, EpisodeConstant, Task, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import transform_to_pose
-from guiderail.systems.episode_monitor import Condition
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 
@@ -52,7 +52,7 @@ def draw_error(episode: np.random.Generator, options: PouringOptions, reset: Pou
     return np.array(reset.mug_error)
 
 
-def conditions(config: PouringConfig, needed: int) -> list[Condition]:
+def conditions(config: PouringConfig, needed: int) -> list[TerminationTerm]:
     """How an episode ends. A collision comes first: nothing that touched the mug on its way is a success.
 
     Args:
@@ -78,10 +78,10 @@ def conditions(config: PouringConfig, needed: int) -> list[Condition]:
 
     balls = {"balls_in_mug": 6 * config.num_balls, "balls_in_thermos": 6 * config.num_balls}
     return [
-        Condition("collision", {"touched": 1}, lambda touched: touched[0] > 0),
+        TerminationTerm("collision", {"touched": 1}, lambda touched: touched[0] > 0),
         # For a tenth of a second: a ball can bounce out again.
-        Condition("success", {"balls_in_mug": 6 * config.num_balls}, poured, steps=10),
-        Condition("spill", balls, spilled),
+        TerminationTerm("success", {"balls_in_mug": 6 * config.num_balls}, poured, steps=10),
+        TerminationTerm("spill", balls, spilled),
     ]
 
 
@@ -100,13 +100,13 @@ class Pouring(Task):
     (3.7), "hand_shaped" as in (3.8-3.10). With the standard template a constant action pours; "hard" is a mug that the
     template believes elsewhere."""
 
-    world_kind = "pouring"
+    workcell_kind = "pouring"
     Options = PouringOptions
     Reset = PouringReset
-    draws_held_out = True
+    has_held_out_distribution = True
     options: PouringOptions
     rewards = ("shaped", "sparse", "hand_shaped")
-    defaults = {"guidance": "sct", "hold": 10}
+    defaults = {"guidance": "sct", "action_repeat": 10}
     difficulties = {STANDARD: {}, "hard": HARD}
     learner = {"algorithm": "sac", "preset": "pouring"}
     num_steps: int  # 1500 unless said otherwise: 150 decisions at 10 Hz, about as many as in the thesis
@@ -133,7 +133,7 @@ class Pouring(Task):
             return self.options.input_speed
         return SPARSE_INPUT_SPEED if (self.choice.guidance, self.choice.reward) == ("sct", "sparse") else 1.0
 
-    def world(self) -> PouringConfig:
+    def workcell(self) -> PouringConfig:
         """The vessels, and where they stand."""
         return self._config
 
@@ -141,25 +141,31 @@ class Pouring(Task):
         """Where the mug is believed to be, from where it is, if that is to be seen."""
         if not self.options.aim:
             return {}
-        self.drawn["mug_error"] = Drawn(builder, "mug_error", 2)
+        self.drawn["mug_error"] = EpisodeConstant(builder, "mug_error", 2)
         return {"mug_error": self.drawn["mug_error"].port}
 
     def template(self) -> Template:
         """Of figure 2.2 and table 3.3, or the one that can be aimed."""
         active = self.choice.values["active_constraints"]
-        return Template(self._skill, frames_of(self._skill, RigidTransform()), active_constraints=active, leash=LEASH)
+        return Template(
+            self._skill, frames_of(self._skill, RigidTransform()), active_constraints=active, max_tracking_error=LEASH
+        )
 
-    def observed(self) -> Sequence[Observed]:
+    def observation_terms(self) -> Sequence[ObservationTerm]:
         """The tip's pose in the frame of the mug's tip, position in units of 0.2 m and a rotation vector; where Pour
         can be aimed, the error of the template's belief and its state, from -1 to 1, too."""
-        tip = Observed("tip_in_mug", 0.0, [1.0 / POSITION_SCALE] * 3 + [1.0] * 3)
-        return (tip, Observed("mug_error", 0.0, MAX_MUG_ERROR), Observed("state", 1.0)) if self.options.aim else (tip,)
+        tip = ObservationTerm("tip_in_mug", 0.0, [1.0 / POSITION_SCALE] * 3 + [1.0] * 3)
+        return (
+            (tip, ObservationTerm("mug_error", 0.0, MAX_MUG_ERROR), ObservationTerm("state", 1.0))
+            if self.options.aim
+            else (tip,)
+        )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Equations 3.5 to 3.10, and aiming."""
-        return reward_terms(self.choice.reward, num_actions, self.choice.hold, self.options.aim)
+        return reward_terms(self.choice.reward, num_actions, self.choice.action_repeat, self.options.aim)
 
-    def conditions(self) -> list[Condition]:
+    def termination_terms(self) -> list[TerminationTerm]:
         """Poured, spilled, or touched."""
         return conditions(self._config, self.options.needed)
 

@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from guiderail.models.objects.bnc_connector.geometry import FOLDER, MM, BncDimensions, bore_mesh, ring_mesh, slot_mesh
-from guiderail.models.objects.sdf import ContactMaterial, at, box, collision, cylinder, made, mesh, model, visual
+from guiderail.models.objects.sdf import (
+    ContactMaterial,
+    at,
+    box,
+    collision,
+    cylinder,
+    generate_assets,
+    mesh,
+    model,
+    visual,
+)
 from guiderail.models.objects.triangle_mesh import equal_area_radius
 
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
@@ -95,7 +105,7 @@ def folder_of(
     """Where the files of a connector lie: beside this one, or made to measure."""
     if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
         return FOLDER
-    return made(files, dimensions, friction, margin, equal_area)
+    return generate_assets(files, dimensions, friction, margin, equal_area)
 
 
 def main(folder: Path = FOLDER) -> None:

@@ -24,7 +24,7 @@ from guiderail.models.objects.sdf import (
     collision,
     convex_mesh,
     cylinder,
-    made,
+    generate_assets,
     mesh,
     model,
     visual,
@@ -95,7 +95,7 @@ def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Pa
     """Where the files of a clamp and its table lie: beside this one, or made to measure."""
     if (dimensions, friction) == (GridClampDimensions(), FRICTION):
         return FOLDER
-    return made(files, dimensions, friction)
+    return generate_assets(files, dimensions, friction)
 
 
 def main(folder: Path = FOLDER) -> None:

@@ -22,7 +22,10 @@ def known(turn, station, period=PERIOD):
     means[:, 3] = np.linspace(0.0, turn, 30)
     reference = ReferenceTrajectory(PERIOD * np.arange(30), means, np.tile(1e-6 * np.eye(6), (30, 1, 1)))
     task = SimpleNamespace(
-        knows=lambda: {"demonstrations"}, reference=lambda: reference, constraints=lambda: None, isotropic_groups=None
+        provides=lambda: {"demonstrations"},
+        reference=lambda: reference,
+        constraints=lambda: None,
+        isotropic_groups=None,
     )
     where = SimpleNamespace(
         wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=period, nominal_period=period

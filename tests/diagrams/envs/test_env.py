@@ -7,10 +7,10 @@ from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from guiderail.diagrams.envs.env import SAID, GuidedEnv
-from guiderail.diagrams.envs.task_diagram import TaskDiagram, exact_period
+from guiderail.diagrams.envs.task_diagram import TaskDiagram, round_period
 from guiderail.models.common.errors import InputError
 
-TICK = exact_period(0.02)
+TICK = round_period(0.02)
 SUBSTEPS = 5
 PERIOD = SUBSTEPS * TICK
 SOLVER_FAILURE = "The SAP solver failed to converge at simulation time = 0.1."
@@ -170,7 +170,7 @@ def test_a_success_in_the_last_step_is_no_time_limit():
 
 
 def test_a_held_action_sums_the_reward_takes_the_worst_and_stops_early():
-    env = make(hold=4)
+    env = make(action_repeat=4)
     env.reset(options={"start": 0.0})
     _, reward, terminated, _, info = env.step([1.0])
     assert reward == pytest.approx(4 + 2 * (0.1 + 0.2 + 0.3 + 0.4))
@@ -185,7 +185,7 @@ def test_a_held_action_sums_the_reward_takes_the_worst_and_stops_early():
 
 
 def test_the_trace_has_every_control_step():
-    env = make(hold=3)
+    env = make(action_repeat=3)
     env.reset(options={"start": 0.0})
     env.step([0.5])
     env.step([-0.5])
@@ -283,7 +283,7 @@ def test_stepping_on_after_the_end_is_refused():
 
 def test_metadata_is_nobody_elses():
     before = dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)
-    first, second = make(hold=1), make(hold=5)
+    first, second = make(action_repeat=1), make(action_repeat=5)
     assert (dict(gymnasium.Env.metadata), dict(DrakeGymEnv.metadata), dict(GuidedEnv.metadata)) == before
     assert (first.metadata["render_fps"], second.metadata["render_fps"]) == (10, 2)
 
@@ -294,9 +294,9 @@ def test_metadata_is_nobody_elses():
         ({"render_mode": "rgb_array"}, "camera"),
         ({"render_mode": "human"}, "Meshcat"),
         ({"render_mode": "ascii"}, "render mode"),
-        ({"hold": 0}, "hold"),
-        ({"hold": 2.5}, "hold"),
-        ({"hold": True}, "hold"),
+        ({"action_repeat": 0}, "action_repeat"),
+        ({"action_repeat": 2.5}, "action_repeat"),
+        ({"action_repeat": True}, "action_repeat"),
     ],
 )
 def test_refuses_what_the_task_can_not_do(arguments, message):
@@ -319,11 +319,11 @@ def test_a_task_that_lacks_a_port_is_refused_by_name():
 
 
 def test_multiples_of_an_exact_period_are_exact():
-    period = exact_period(0.002)
+    period = round_period(0.002)
     assert period == pytest.approx(0.002, rel=1e-9)
     k = np.arange(1, 10000)
     assert all(10 * n * period == n * (10 * period) for n in range(1, 10000))
     np.testing.assert_array_equal(np.cumsum(np.full(len(k), period)), k * period)
     for nonsense in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError):
-            exact_period(nonsense)
+            round_period(nonsense)

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.diagrams.envs.make import make_env, make_skill, resolve
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS
-from guiderail.diagrams.guidance.registry import GUIDANCE, INGREDIENTS, possible_guidance
+from guiderail.diagrams.guidance.registry import GUIDANCE, REQUIREMENTS, possible_guidance
 from guiderail.diagrams.stations.registry import STATIONS, stations_for
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
@@ -18,15 +18,15 @@ PAIRS = [(task, guidance) for task in OWN for guidance in GUIDANCE.names()]
 
 @pytest.mark.parametrize(("task", "guidance"), PAIRS)
 def test_a_pair_runs_or_says_what_is_missing(task, guidance):
-    knows = TASKS.get(task).knows()
-    if guidance not in possible_guidance(knows):
+    provides = TASKS.get(task).provides()
+    if guidance not in possible_guidance(provides):
         with pytest.raises(InputError) as error:
             make_env(task, guidance=guidance)
         message = str(error.value)
-        assert any(words in message for words in INGREDIENTS.values()), message
+        assert any(words in message for words in REQUIREMENTS.values()), message
         assert "\n" not in message
         return
-    env = make_env(task, guidance=guidance, hold=25)
+    env = make_env(task, guidance=guidance, action_repeat=25)
     rng = np.random.default_rng(0)
     _, info = env.reset(seed=0)
     assert not info["fallback"]
@@ -41,7 +41,7 @@ def test_a_pair_runs_or_says_what_is_missing(task, guidance):
 
 @pytest.mark.parametrize("task", OWN)
 def test_both_contracts_hold_in_every_tasks_diagram(task):
-    for name in stations_for(TASKS.get(task).world_kind):
+    for name in stations_for(TASKS.get(task).workcell_kind):
         if STATIONS.get(name).simulated:
             diagram = make_env(task, station=name).task.diagram
         else:
@@ -51,7 +51,7 @@ def test_both_contracts_hold_in_every_tasks_diagram(task):
         station, guidance = (diagram.GetSubsystemByName(part) for part in ("station", "guidance"))
         assert all(station.HasInputPort(port) for port in STATION_INPUTS), name
         assert all(station.HasOutputPort(port) for port in STATION_OUTPUTS), name
-        assert station.GetOutputPort("contact_force").size() == station.GetOutputPort("holding").size() == 1
+        assert station.GetOutputPort("contact_force").size() == station.GetOutputPort("command_timed_out").size() == 1
         assert station.GetInputPort("desired_pose").size() == station.GetOutputPort("pose").size()
         assert all(guidance.HasInputPort(port) for port in INPUTS)
         assert all(guidance.HasOutputPort(port) for port in OUTPUTS)

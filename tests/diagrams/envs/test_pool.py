@@ -32,16 +32,16 @@ def episode(env, seed):
 
 @pytest.mark.parametrize(("task", "options"), CASES)
 def test_an_episode_is_the_same_in_a_diagram_that_was_used_before(task, options):
-    first = make_env(task, **options, hold=2)
+    first = make_env(task, **options, action_repeat=2)
     diagram = first.task.diagram
     expected = episode(first, 3)
     episode(first, 4)
     first.close()
-    second = make_env(task, **options, hold=2)
+    second = make_env(task, **options, action_repeat=2)
     assert second.task.diagram is diagram
     # The first reset hides what is constant in a run: nothing of the run before is left.
     assert episode(second, 3) == expected
-    third = make_env(task, **options, hold=2)
+    third = make_env(task, **options, action_repeat=2)
     assert third.task.diagram is not diagram
     assert episode(third, 3) == expected
     second.close()
@@ -50,7 +50,7 @@ def test_an_episode_is_the_same_in_a_diagram_that_was_used_before(task, options)
 
 def test_two_environments_never_share_a_diagram():
     env = make_env("NarrowPassage")
-    other, different = make_env("NarrowPassage"), make_env("NarrowPassage", kappa=2.0)
+    other, different = make_env("NarrowPassage"), make_env("NarrowPassage", action_scale=2.0)
     assert len({id(one.task.diagram) for one in (env, other, different)}) == 3
     env.close()
     env.close()  # gives back once

@@ -10,10 +10,10 @@ from guiderail.diagrams.envs.make import make_env, make_skill
 from guiderail.models.common.errors import InputError
 
 CASES = {
-    "NarrowPassage": {"guidance": "skgrl", "hold": 5},
-    "BncConnector": {"guidance": "kgrl", "hold": 10, "uncertainty": "disc"},
-    "GridClamp": {"guidance": "sct", "hold": 5},
-    "Pouring": {"guidance": "sct", "hold": 10},
+    "NarrowPassage": {"guidance": "skgrl", "action_repeat": 5},
+    "BncConnector": {"guidance": "kgrl", "action_repeat": 10, "fixture_offset": "per_episode"},
+    "GridClamp": {"guidance": "sct", "action_repeat": 5},
+    "Pouring": {"guidance": "sct", "action_repeat": 10},
 }
 DECISIONS = 8
 
@@ -37,7 +37,7 @@ def test_a_simulator_gives_bit_for_bit_what_the_environment_gives(task):
     skill.randomize(context, np.random.Generator(np.random.PCG64(np.random.SeedSequence(3))), {})
     simulator.Initialize()
     desired, measured = [], []
-    for step in range(1, DECISIONS * env.hold + 1):
+    for step in range(1, DECISIONS * env.action_repeat + 1):
         simulator.AdvanceTo(step * skill.control_period)
         desired.append(skill.diagram.GetOutputPort("desired_pose").Eval(context).copy())
         measured.append(skill.diagram.GetOutputPort("pose").Eval(context).copy())

@@ -8,7 +8,7 @@ from guiderail.diagrams.envs.make import make_env
 CASES = {
     "passage": ("NarrowPassage", {"difficulty": "hard", "guidance": "kgrl"}),
     "pouring": ("Pouring", {"difficulty": "hard"}),
-    "connector": ("BncConnector", {"uncertainty": "disc"}),
+    "connector": ("BncConnector", {"fixture_offset": "per_episode"}),
 }
 
 

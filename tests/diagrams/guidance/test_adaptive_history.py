@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 
@@ -20,12 +20,12 @@ def skill():
     means = np.column_stack([0.1 * np.sin(3 * phase), 0.3 * phase])
     reference = ReferenceTrajectory(PERIOD * np.arange(STEPS), means, np.tile(0.03**2 * np.eye(2), (STEPS, 1, 1)))
     constraints = LinearConstraints([[-1.0, 0.0]], [-0.11])
-    return PrimitiveSkill(reference, constraints, PERIOD, horizon=10, history_variance=1e-8, wrench_size=3)
+    return PrimitiveConfig(reference, constraints, PERIOD, horizon=10, history_variance=1e-8, wrench_size=3)
 
 
 def rollout(skill, actions, forces, kind="skgrl"):
     """Commands and history lengths of every control step; the robot is where it was commanded."""
-    guidance = build_guidance(kind, Known(PERIOD, demonstrations=skill))
+    guidance = build_guidance(kind, PriorKnowledge(PERIOD, demonstrations=skill))
     simulator = Simulator(guidance)
     context = simulator.get_mutable_context()
     action = guidance.GetInputPort("action").FixValue(context, [0.0, 0.0])

@@ -7,8 +7,8 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.primitive_config import PrimitiveSkill
-from guiderail.diagrams.guidance.prior import Known
+from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
+from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance, check_guidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
@@ -31,30 +31,30 @@ def reference():
 def skill():
     constraints = LinearConstraints([[-1.0, 0.0]], [-0.11])
     wall = KeepOut([[0.13, -1.0]], [[0.2, 1.0]], constraints, margin=0.01)
-    return PrimitiveSkill(reference(), constraints, PERIOD, history=5, horizon=10, keep_out=wall, wrench_size=2)
+    return PrimitiveConfig(reference(), constraints, PERIOD, history=5, horizon=10, keep_out=wall, wrench_size=2)
 
 
 def build(kind, skill, task="this task"):
-    return build_guidance(kind, Known(skill.control_period, demonstrations=skill), task)
+    return build_guidance(kind, PriorKnowledge(skill.control_period, demonstrations=skill), task)
 
 
 def rollout(guidance, actions, pose=START, track=True):
-    """Commands and fallbacks of every control step; with `track` the robot is where it was commanded."""
+    """Commands and fallback_steps of every control step; with `track` the robot is where it was commanded."""
     simulator = Simulator(guidance)
     context = simulator.get_mutable_context()
     action = guidance.GetInputPort("action").FixValue(context, np.zeros(guidance.GetInputPort("action").size()))
     measured = guidance.GetInputPort("pose").FixValue(context, pose)
     guidance.GetInputPort("wrench").FixValue(context, np.zeros(guidance.GetInputPort("wrench").size()))
     simulator.Initialize()
-    commands, fallbacks = [], []
+    commands, fallback_steps = [], []
     for n, a in enumerate(actions):
         action.GetMutableData().set_value(a)
         simulator.AdvanceTo((n + 0.5) * PERIOD)
         commands.append(guidance.GetOutputPort("desired_pose").Eval(context).copy())
-        fallbacks.append(guidance.GetOutputPort("fallback").Eval(context)[0])
+        fallback_steps.append(guidance.GetOutputPort("fallback").Eval(context)[0])
         if track:
             measured.GetMutableData().set_value(commands[-1])
-    return np.array(commands), np.array(fallbacks)
+    return np.array(commands), np.array(fallback_steps)
 
 
 def constant(value):
@@ -74,12 +74,12 @@ def test_all_guidance_has_the_same_ports(skill, kind):
 
 @pytest.mark.parametrize("kind", PRIMITIVE_GUIDANCE)
 def test_doing_nothing_follows_the_demonstrations(skill, kind):
-    commands, fallbacks = rollout(build(kind, skill), constant([0.0, 0.0]))
+    commands, fallback_steps = rollout(build(kind, skill), constant([0.0, 0.0]))
     means = skill.reference.means
     # Where the safe variants are not already avoiding what lies at x = 0.1.
     free = means[:, 0] < 0.09
     assert (np.abs(commands - means) < skill.reference.standard_deviations)[free].all()
-    assert not fallbacks[free].any()
+    assert not fallback_steps[free].any()
 
 
 def test_the_demonstrations_alone_ignore_the_action(skill):
@@ -115,11 +115,11 @@ def test_null_space_guidance_keeps_the_constraints_whatever_the_action(skill, ki
 
 
 def test_the_safe_residual_stops_before_walls_and_says_so(skill):
-    commands, fallbacks = rollout(build("safe_residual", skill), constant([1.0, 0.0]))
+    commands, fallback_steps = rollout(build("safe_residual", skill), constant([1.0, 0.0]))
     unsafe, _ = rollout(build("residual", skill), constant([1.0, 0.0]))
     assert unsafe[:, 0].max() > 0.13
     assert commands[:, 0].max() <= 0.10 + 1e-9
-    assert set(fallbacks) <= {0.0, 1.0}
+    assert set(fallback_steps) <= {0.0, 1.0}
 
 
 def test_smooth_guidance_starts_where_the_robot_is(skill):
@@ -145,7 +145,7 @@ def test_a_measured_history_follows_the_robot_and_a_commanded_one_does_not(skill
 
 
 def test_only_explored_outputs_have_an_action(skill):
-    sideways = replace(skill, explored=(0,), constraints=LinearConstraints.none(2))
+    sideways = replace(skill, action_dims=(0,), constraints=LinearConstraints.none(2))
     for kind in ("residual", "kgrl", "skgrl"):
         guidance = build(kind, sideways)
         assert guidance.GetInputPort("action").size() == 1
@@ -216,12 +216,12 @@ def test_safe_residual_is_not_offered_where_nobody_wrote_down_what_to_avoid(skil
     "change",
     [
         {"history_source": "imagined"},
-        {"kappa": 0.0},
-        {"kappa": np.nan},
+        {"action_scale": 0.0},
+        {"action_scale": np.nan},
         {"history": 0},
-        {"explored": ()},
-        {"explored": (2,)},
-        {"explored": (0, 0)},
+        {"action_dims": ()},
+        {"action_dims": (2,)},
+        {"action_dims": (0, 0)},
     ],
 )
 def test_a_skill_that_makes_no_sense_is_refused(skill, change):

@@ -6,7 +6,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.guidance.function import LawGuidance
+from guiderail.diagrams.guidance.function import FunctionGuidance
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.models.common.errors import InputError
@@ -18,7 +18,7 @@ def test_a_tasks_symmetry_is_not_one_of_actions_that_mean_something_else(size, m
 
     @register_guidance("of_mine")
     def of_mine(known):
-        return LawGuidance(known, lambda action, pose, wrench: pose + 0.001 * action.sum(), action_size=size)
+        return FunctionGuidance(known, lambda action, pose, wrench: pose + 0.001 * action.sum(), action_size=size)
 
     env = make_env("BncConnector", guidance="of_mine")
     assert env.action_space.shape == (size,)

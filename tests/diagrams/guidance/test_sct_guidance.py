@@ -7,12 +7,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
 
-from guiderail.diagrams.envs.task_diagram import exact_period
+from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter, SctGuidance
-from guiderail.models.templates import load_skill
+from guiderail.models.templates import load_template
 
-PERIOD = exact_period(0.01)
+PERIOD = round_period(0.01)
 MUG = {"mug_tip": RigidTransform()}
 START = np.array([0.0, -0.28, 0.12, 0.0, 0.0, 0.0])
 
@@ -54,7 +54,7 @@ class Rig:
 
 @pytest.fixture
 def skill():
-    return load_skill("pouring")
+    return load_template("pouring")
 
 
 def test_has_the_ports_of_all_guidance(skill):
@@ -127,7 +127,7 @@ def test_without_active_constraints_it_does_what_it_is_asked(skill):
 
 
 def test_a_velocity_is_filtered_like_anything_else(skill):
-    velocity = load_skill("end_effector_velocity")
+    velocity = load_template("end_effector_velocity")
     rig = Rig(SctGuidance(skill, MUG, PERIOD, input_mapping=velocity)).initialize()
     rng = np.random.default_rng(0)
     for _ in range(200):

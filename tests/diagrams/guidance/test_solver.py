@@ -11,7 +11,7 @@ from guiderail.tools.environments import check_environment
 
 def commands(**options):
     """Whatever is asked for, towards the zone: the constraint is active."""
-    env = make_env("NarrowPassage", guidance="skgrl", kappa=3.0, **options)
+    env = make_env("NarrowPassage", guidance="skgrl", action_scale=3.0, **options)
     env.reset(seed=0)
     violations = []
     for _ in range(12):

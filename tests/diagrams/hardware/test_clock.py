@@ -11,10 +11,10 @@ from guiderail.diagrams.hardware import clock as pace_module
 from guiderail.diagrams.hardware.clock import (
     HEAD,
     TAKEN,
-    Gaps,
-    NewMessages,
-    RealTime,
-    StepByStep,
+    IntervalHistogram,
+    LockstepClock,
+    MessageCounter,
+    WallClock,
     serve,
     serve_in_real_time,
 )
@@ -35,7 +35,7 @@ class Told:
 
 def test_a_step_for_each_status_and_without_one_after_a_while():
     lcm = DrakeLcm("memq://")
-    pace, told = RealTime(lcm, "STATUS"), Told()
+    pace, told = WallClock(lcm, "STATUS"), Told()
     simulator = Simulator(ConstantVectorSource([0.0]))
     pace.begin()
     for number in range(3):
@@ -74,7 +74,7 @@ def test_a_robot_that_speaks_too_often_does_not_hurry_it(monkeypatch, millisecon
 
     monkeypatch.setattr(pace_module.time, "monotonic", lambda: now)
     monkeypatch.setattr(pace_module.time, "sleep", sleep)
-    pace, told = RealTime(Bus(), "STATUS"), Told()
+    pace, told = WallClock(Bus(), "STATUS"), Told()
     simulator = Simulator(ConstantVectorSource([0.0]))
     pace.begin()
     pace.advance(simulator, told, 400)
@@ -100,25 +100,25 @@ def test_what_happens_at_an_instant_knows_the_clock_of_that_instant():
             return EventStatus.Succeeded()
 
     station = Clocked()
-    RealTime(DrakeLcm("memq://"), "STATUS").advance(Simulator(station), station, 3)
+    WallClock(DrakeLcm("memq://"), "STATUS").advance(Simulator(station), station, 3)
     assert station.seen == [None, 0.0, STATUS_PERIOD]
 
 
 def test_a_slower_clock_is_told_as_such():
     slow, fast = Told(), Told()
     for told, rate in ((slow, 0.25), (fast, 1.0)):
-        pace = RealTime(DrakeLcm("memq://"), "STATUS", rate=rate)
+        pace = WallClock(DrakeLcm("memq://"), "STATUS", rate=rate)
         pace.advance(Simulator(ConstantVectorSource([0.0])), told, 2)
     assert slow.clocks[1] - slow.clocks[0] >= 1.5 * STATUS_PERIOD
     assert slow.clocks[0] == pytest.approx(0.25 * fast.clocks[0], rel=0.01)
     for rate in (0.0, 1.1, np.nan):
         with pytest.raises(InputError, match="rate up to 1 of the wall's"):
-            RealTime(DrakeLcm("memq://"), "STATUS", rate=rate)
+            WallClock(DrakeLcm("memq://"), "STATUS", rate=rate)
 
 
 def test_a_message_that_is_sent_again_counts_once():
     lcm = DrakeLcm("memq://")
-    messages = NewMessages(lcm, "STATUS")
+    messages = MessageCounter(lcm, "STATUS")
     for message in (b"one", b"one", b"two", b"one"):
         lcm.Publish("STATUS", message)
         lcm.HandleSubscriptions(0)
@@ -126,7 +126,7 @@ def test_a_message_that_is_sent_again_counts_once():
 
 
 def test_gaps_are_counted_without_being_kept():
-    gaps = Gaps()
+    gaps = IntervalHistogram()
     assert np.isnan(gaps.quantile(0.5))
     for seconds in [0.005] * 98 + [0.0312, 1.5]:
         gaps.add(seconds)
@@ -137,7 +137,7 @@ def test_gaps_are_counted_without_being_kept():
 
 def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
     lcm = DrakeLcm("memq://")
-    messages = NewMessages(lcm, "STATUS")
+    messages = MessageCounter(lcm, "STATUS")
     head = bytes(range(16))
     for message in (head + b"a", head + b"b", head[:-1] + b"\x00" + b"b"):
         lcm.Publish("STATUS", message)
@@ -147,7 +147,7 @@ def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
 
 def test_in_step_a_status_that_comes_again_is_answered_again_and_is_no_step():
     lcm, words = DrakeLcm("memq://"), []
-    pace, simulator = StepByStep(lcm, 0.01, "STATUS"), Simulator(ConstantVectorSource([0.0]))
+    pace, simulator = LockstepClock(lcm, 0.01, "STATUS"), Simulator(ConstantVectorSource([0.0]))
     lcm.Subscribe("STATUS" + TAKEN, words.append)
     pace.begin()
     for number in range(3):

@@ -5,9 +5,9 @@ import pytest
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.monitor import Deputy, Duty, word_channel
+from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor, word_channel
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, safety_limits
-from guiderail.diagrams.stations.arm import KnownArm
+from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import MISSED
 
@@ -17,7 +17,7 @@ MOVING = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.1, -0.1])
 
 @pytest.fixture(scope="module")
 def known():
-    return KnownArm(BncWorkcell())
+    return ArmControllerPlant(BncWorkcell())
 
 
 class Bus:
@@ -26,7 +26,7 @@ class Bus:
     def __init__(self, known):
         self.lcm, self.time, self.heard, self.words = DrakeLcm("memq://"), 100.0, [], []
         self.limits = safety_limits(known.plant, IIWA_DRIVER)
-        self.deputy = Deputy(self.lcm, IIWA_DRIVER, known.plant, self.limits)
+        self.deputy = SafetyMonitor(self.lcm, IIWA_DRIVER, known.plant, self.limits)
         self.lcm.Subscribe("IIWA_COMMAND", self.hear)
         self.lcm.Subscribe(word_channel("IIWA_COMMAND"), self.words.append)
 
@@ -65,17 +65,17 @@ def test_damps_within_the_limits_where_commands_stop_then_says_no_torque_and_fal
     bus.status(steps=MISSED)
     assert bus.heard == []
     bus.status(velocities=10.0 * MOVING, steps=2)
-    assert bus.deputy.duty == Duty.DAMPING
+    assert bus.deputy.duty == MonitorState.DAMPING
     M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
     decay_time = bus.limits.decay_time
     wanted = -(M @ (10.0 * MOVING)) * (1.0 - np.exp(-PERIOD / decay_time)) / PERIOD
     np.testing.assert_allclose(bus.heard[-1], np.clip(wanted, -np.array(bus.limits.torque), bus.limits.torque))
     assert (np.abs(wanted) > bus.limits.torque).any()
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
-    assert bus.deputy.duty == Duty.RESTING
+    assert bus.deputy.duty == MonitorState.RESTING
     np.testing.assert_array_equal(bus.heard[-1], 0.0)
     bus.status(steps=20)
-    assert bus.deputy.duty == Duty.IDLE
+    assert bus.deputy.duty == MonitorState.IDLE
     said = len(bus.heard)
     bus.status(steps=20)
     assert len(bus.heard) == said
@@ -91,7 +91,7 @@ def test_goes_on_to_the_end_where_commands_come_back_and_says_so(known):
     for _ in range(5):
         bus.command([1.0] * 7)
         bus.status()
-    assert bus.deputy.duty == Duty.DAMPING
+    assert bus.deputy.duty == MonitorState.DAMPING
     assert bus.words[-1][-1] == 1
     assert bus.words[-1] != acting
 
@@ -99,13 +99,13 @@ def test_goes_on_to_the_end_where_commands_come_back_and_says_so(known):
 def test_has_nothing_to_do_where_the_last_command_was_no_torque_or_none_ever_came(known):
     bus = Bus(known)
     bus.status(steps=50)
-    assert bus.deputy.duty == Duty.IDLE
+    assert bus.deputy.duty == MonitorState.IDLE
     bus.command([1.0] * 7)
     bus.status()
     bus.command([0.0] * 7)
     bus.heard.clear()
     bus.status(steps=50)
-    assert (bus.deputy.duty, bus.heard) == (Duty.IDLE, [])
+    assert (bus.deputy.duty, bus.heard) == (MonitorState.IDLE, [])
 
 
 def test_what_is_no_sound_message_neither_moves_it_nor_ends_it(known):
@@ -120,7 +120,7 @@ def test_what_is_no_sound_message_neither_moves_it_nor_ends_it(known):
     bus.status(num_joints=3, **{name: [0.0] * 3 for name in lcmt_iiwa_status.__slots__[2:]})
     assert len(bus.words) == said
     bus.status(steps=MISSED)
-    assert bus.deputy.duty == Duty.DAMPING
+    assert bus.deputy.duty == MonitorState.DAMPING
 
 
 def test_a_robot_that_was_started_anew_is_brought_to_rest_at_once(known):
@@ -130,11 +130,11 @@ def test_a_robot_that_was_started_anew_is_brought_to_rest_at_once(known):
     bus.command([1.0] * 7)
     bus.time -= 3.5 * PERIOD
     bus.status()
-    assert bus.deputy.duty == Duty.WATCHING
+    assert bus.deputy.duty == MonitorState.WATCHING
     bus.heard.clear()
     bus.time = 0.0
     bus.status(velocities=0.1 * MOVING)
-    assert bus.deputy.duty == Duty.DAMPING
+    assert bus.deputy.duty == MonitorState.DAMPING
     M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
     share = -np.expm1(-PERIOD / bus.limits.decay_time)
     np.testing.assert_allclose(bus.heard[-1], -(M @ (0.1 * MOVING)) * share / PERIOD, rtol=1e-6)
@@ -146,10 +146,10 @@ def test_a_robots_clock_that_goes_back_does_not_make_it_wait(known):
     bus.command([1.0] * 7)
     bus.time = 3.0
     bus.status(steps=MISSED + 3)
-    assert bus.deputy.duty == Duty.DAMPING
+    assert bus.deputy.duty == MonitorState.DAMPING
     bus.time = 1.0
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
-    assert bus.deputy.duty == Duty.RESTING
+    assert bus.deputy.duty == MonitorState.RESTING
 
 
 def test_statuses_that_overtake_each_other_do_not_make_it_wait(known):
@@ -159,4 +159,4 @@ def test_statuses_that_overtake_each_other_do_not_make_it_wait(known):
     for _ in range(MISSED):
         for ahead in (2, 0):  # the second of two comes first
             bus.status(utime=round((bus.time + ahead * PERIOD) * 1e6))
-    assert bus.deputy.duty == Duty.DAMPING
+    assert bus.deputy.duty == MonitorState.DAMPING

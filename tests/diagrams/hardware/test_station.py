@@ -14,7 +14,7 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.diagrams.hardware.clock import StepByStep
+from guiderail.diagrams.hardware.clock import LockstepClock
 from guiderail.diagrams.hardware.monitor import word_channel
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa, find_driver, safety_limits
 from guiderail.diagrams.stations.arm import ArmStation
@@ -23,7 +23,7 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
-from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 
 WORKCELL = BncWorkcell()
@@ -51,11 +51,11 @@ class OneProcess:
         self._steps = 0
         if settled:
             self.go(START, 0.4)
-            assert self.phase == Phase.RUNNING
+            assert self.phase == ArmState.RUNNING
 
     @property
     def phase(self):
-        return Phase(int(self["phase"][0]))
+        return ArmState(int(self["phase"][0]))
 
     @property
     def fault(self):
@@ -110,7 +110,7 @@ def test_two_processes_on_one_machine(monkeypatch):
         station.get_desired_pose_input_port().FixValue(context, goal)
         station.start(simulator)
         before = station.get_pose_output_port().Eval(context).copy()
-        pace = StepByStep(lcm, 5.0, IIWA_DRIVER.status_channel)
+        pace = LockstepClock(lcm, 5.0, IIWA_DRIVER.status_channel)
         pace.begin()
         pace.advance(simulator, station, round(1.4 / PERIOD))
         after = station.get_pose_output_port().Eval(context)
@@ -159,11 +159,11 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     both.go(goal, PERIOD, robot=False)
     assert both.fault == fault
     both.go(goal, 0.1)
-    assert both.phase == Phase.DAMPING
+    assert both.phase == ArmState.DAMPING
     assert np.isfinite(both.torques).all()
     assert (np.abs(both.torques) <= both.station.limits.torque).all()
     both.go(goal, 0.25)
-    assert (both.phase, both.fault) == (Phase.OFF, fault)
+    assert (both.phase, both.fault) == (ArmState.OFF, fault)
     np.testing.assert_array_equal(both["iiwa.torque_commanded"], 0.0)
     assert both.commands[-1].joint_torque == (0.0,) * 7
     left = np.abs(both["iiwa.velocity_estimated"]).max()
@@ -172,7 +172,7 @@ def test_a_faulty_status_stops_the_arm_and_it_goes_on_from_where_it_is_when_told
     both.go(goal, 0.05)
     assert np.linalg.norm((both["pose"] - before)[:3]) < 1e-3
     both.go(goal, 0.4)
-    assert both.phase == Phase.RUNNING
+    assert both.phase == ArmState.RUNNING
     assert np.linalg.norm((both["pose"] - goal)[:3]) < 0.5 * np.linalg.norm((before - goal)[:3])
     assert np.isfinite(both["wrench"]).all()
     assert left < 0.02
@@ -188,7 +188,7 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     both.go(goal, 0.5, robot=False)
     found = next(step for step, torque in enumerate(both.torques) if (torque @ moving < 0.0) or not torque.any())
     assert found * PERIOD <= 0.05
-    assert (both.phase, both.fault) == (Phase.OFF, Fault.STALE)
+    assert (both.phase, both.fault) == (ArmState.OFF, Fault.STALE)
     sent = len(both.commands)
     assert both.commands[-1].joint_torque == (0.0,) * 7
     both.go(goal, 1.0, robot=False)
@@ -203,7 +203,7 @@ def test_a_status_that_stops_stops_the_arm_and_then_nothing_is_sent():
     np.testing.assert_array_equal(both.torques[back:], 0.0)
     both.station.resume(both.context)
     both.go(goal, 1.0)
-    assert both.phase == Phase.RUNNING
+    assert both.phase == ArmState.RUNNING
     np.testing.assert_allclose(both["pose"][:3], goal[:3], atol=2e-3)
 
 
@@ -219,8 +219,8 @@ def test_stops_when_asked():
     both = OneProcess()
     both.station.stop(both.context)
     both.go(START, 0.05)
-    assert (both.phase, both.fault) == (Phase.DAMPING, Fault.ASKED)
-    assert both["holding"][0] == 1.0
+    assert (both.phase, both.fault) == (ArmState.DAMPING, Fault.USER_STOP)
+    assert both["command_timed_out"][0] == 1.0
 
 
 def test_another_station_takes_over_without_letting_go():
@@ -233,7 +233,7 @@ def test_another_station_takes_over_without_letting_go():
     other.get_desired_pose_input_port().FixValue(context, goal)
     both.lcm.Publish("IIWA_STATUS", status(both))
     other.start(simulator)
-    other.take_over(context, both.context)
+    other.copy_state_from(context, both.context)
     time = both.robot_simulator.get_context().get_time()
     for step in range(1, 40):
         both.robot_simulator.AdvanceTo(time + step * PERIOD)
@@ -262,9 +262,9 @@ def test_an_external_torque_has_the_sign_of_what_the_surroundings_do():
 @pytest.mark.parametrize("robot", ["iiwa14", "panda"])
 def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
     station = HardwareStation(WORKCELL, DrakeLcm("memq://"), robot=robot)
-    trips = np.array(station.driver.trips)
-    assert (np.array(station.limits.torque) < trips).all()
-    assert (np.array(station.limits.external_torque) < trips).all()
+    torque_reflex_limits = np.array(station.driver.torque_reflex_limits)
+    assert (np.array(station.limits.torque) < torque_reflex_limits).all()
+    assert (np.array(station.limits.external_torque) < torque_reflex_limits).all()
     assert station.HasOutputPort(f"{station.driver.name}.torque_external")
 
 
@@ -305,11 +305,11 @@ def test_a_deputy_is_heard_in_a_larger_diagram_too():
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     station.get_desired_pose_input_port().FixValue(context, START)
-    assert not station.has_deputy(context)
+    assert not station.has_safety_monitor(context)
     lcm.Publish(word_channel(IIWA_DRIVER.command_channel), bytes(9))
     lcm.HandleSubscriptions(0)
     simulator.AdvancePendingEvents()
-    assert station.has_deputy(context)
+    assert station.has_safety_monitor(context)
 
 
 def test_all_stations_have_the_same_ports():
@@ -321,7 +321,7 @@ def test_all_stations_have_the_same_ports():
         assert inputs == {"desired_pose": 6, "command_time": 1}
         ports = [station.get_output_port(i) for i in range(station.num_output_ports())]
         outputs = {port.get_name(): port.size() for port in ports if port.get_name() not in simulated_only | robots_own}
-        assert outputs == {"pose": 6, "wrench": 6, "contact_force": 1, "saturation": 1, "holding": 1}
+        assert outputs == {"pose": 6, "wrench": 6, "contact_force": 1, "saturation": 1, "command_timed_out": 1}
         assert station.num_input_ports() == 2
 
 

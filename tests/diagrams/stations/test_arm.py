@@ -14,7 +14,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.recording import drive_along
-from guiderail.diagrams.stations.arm import MIDDLE_OF_TURN, ArmStation, KnownArm
+from guiderail.diagrams.stations.arm import MIDDLE_OF_TURN, ArmControllerPlant, ArmStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
@@ -116,7 +116,7 @@ def test_pushed_and_released_it_comes_to_rest_at_the_plants_step(robot):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_quarter_turn_lies_in_the_middle_of_the_last_joints_range(robot):
-    known = KnownArm(WORKCELL, robot)
+    known = ArmControllerPlant(WORKCELL, robot)
     lower, upper = known.plant.GetPositionLowerLimits()[-1], known.plant.GetPositionUpperLimits()[-1]
     last = [known.solve(MIDDLE_OF_TURN + [0, 0, 0, turn, 0, 0], known.posture)[-1] for turn in (-np.pi / 4, np.pi / 4)]
     assert abs(known.posture[-1] - 0.5 * (lower + upper)) < np.deg2rad(15.0)
@@ -272,7 +272,7 @@ def test_a_rigid_tool_has_no_gripper():
 
 def test_pose_and_transform_agree_over_the_arms_workspace():
     """The tool centre is where its pose says, tilted or not, for a tool that is bolted on turned."""
-    known = KnownArm(WORKCELL, "ur5e")
+    known = ArmControllerPlant(WORKCELL, "ur5e")
     context = known.plant.CreateDefaultContext()
     pose = np.array([0.03, -0.02, 0.08, 0.9, 0.15, -0.2])
     known.plant.SetPositions(context, known.solve(pose, known.posture))

@@ -13,7 +13,7 @@ from guiderail.models.objects.bnc_connector.motion import CLEAR, insert_and_lock
 
 FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
 HARD = resolve("BncConnector", {"difficulty": "hard"}).task
-WORKCELL = HARD.world()
+WORKCELL = HARD.workcell()
 STIFFNESS = Impedance().stiffness[2]
 LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height
 
@@ -22,7 +22,7 @@ LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORK
 def build(request):
     """Makes the station."""
     options = {"difficulty": "hard", **request.param}
-    workcell = resolve("BncConnector", options).task.world()
+    workcell = resolve("BncConnector", options).task.workcell()
     return lambda: RailsStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
 
 

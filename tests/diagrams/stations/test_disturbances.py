@@ -10,7 +10,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.units import MM
 
 DOWN = np.array([0.0, 0.0, -1.0])
-CLAMP = {"uncertainty": "known", "hold": 25}  # where nothing else is drawn that matters
+CLAMP = {"fixture_offset": "none", "action_repeat": 25}  # where nothing else is drawn that matters
 
 
 def descended(decisions=3, seed=1, **options):
@@ -90,7 +90,7 @@ def test_lost_and_late_commands_leave_the_tool_behind(plain):
 
 
 def test_which_commands_are_lost_is_not_read_off_the_stream_of_the_noise():
-    env = make_env("GridClamp", wrench_noise=(0.2, 0.01), lost_commands=0.3, hold=1)
+    env = make_env("GridClamp", wrench_noise=(0.2, 0.01), lost_commands=0.3, action_repeat=1)
     station = env.task.diagram.GetSubsystemByName("station")
     commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))
     env.reset(seed=1)

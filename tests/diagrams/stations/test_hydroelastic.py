@@ -7,16 +7,16 @@ from guiderail import make_env
 
 DOWN = np.array([0.0, 0.0, -1.0])
 CASES = {
-    "connector": ("BncConnector", {"guidance": "kmp", "uncertainty": "known"}, np.zeros(2), {}),
+    "connector": ("BncConnector", {"guidance": "kmp", "fixture_offset": "none"}, np.zeros(2), {}),
     "connector under a controller": (
         "BncConnector",
-        {"guidance": "kmp", "uncertainty": "known", "impedance_control": "cartesian"},
+        {"guidance": "kmp", "fixture_offset": "none", "impedance_control": "cartesian"},
         np.zeros(2),
         {},
     ),
     "connector on an arm": ("BncConnector", {"guidance": "kmp", "station": "arm"}, np.zeros(2), {"offset": (0.0, 0.0)}),
-    "clamp": ("GridClamp", {"uncertainty": "known"}, DOWN, {}),
-    "clamp on an arm": ("GridClamp", {"station": "arm", "uncertainty": "known"}, DOWN, {}),
+    "clamp": ("GridClamp", {"fixture_offset": "none"}, DOWN, {}),
+    "clamp on an arm": ("GridClamp", {"station": "arm", "fixture_offset": "none"}, DOWN, {}),
 }
 
 

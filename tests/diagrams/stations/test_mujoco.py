@@ -155,11 +155,12 @@ def episode(env, seed):
 
 
 @pytest.mark.parametrize(
-    ("task", "options"), [("BncConnector", {"uncertainty": "disc"}), ("GridClamp", {"uncertainty": "disc"})]
+    ("task", "options"),
+    [("BncConnector", {"fixture_offset": "per_episode"}), ("GridClamp", {"fixture_offset": "per_episode"})],
 )
 def test_the_same_seed_is_the_same_episode_bit_for_bit(task, options):
     """With another episode between, and pushed at: nothing of it is left anywhere."""
-    env = make_env(task, station="mujoco", hold=25, **options)
+    env = make_env(task, station="mujoco", action_repeat=25, **options)
     first = episode(env, 3)
     episode(env, 4)
     env.push(np.array([1.0 * MM, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -170,7 +171,7 @@ def test_the_same_seed_is_the_same_episode_bit_for_bit(task, options):
 @pytest.mark.parametrize(
     ("task", "options", "modulus", "most"),
     [
-        ("BncConnector", {"uncertainty": "known", "guidance": "kmp"}, 10.0, 400),
+        ("BncConnector", {"fixture_offset": "none", "guidance": "kmp"}, 10.0, 400),
         ("GridClamp", {}, 10.0, 100),
         ("GridClamp", {}, 30.0, 100),
     ],
@@ -196,10 +197,10 @@ def test_an_engine_that_diverges_ends_the_episode_and_leaves_nothing_for_the_nex
     """MuJoCo by itself goes on from its zero, where the connector is locked, and writes a file about it."""
     monkeypatch.chdir(tmp_path)
 
-    def made():
-        return make_env("BncConnector", station="mujoco", uncertainty="disc", hold=25)
+    def generate_assets():
+        return make_env("BncConnector", station="mujoco", fixture_offset="per_episode", action_repeat=25)
 
-    env = made()
+    env = generate_assets()
     episode(env, 4)
     env.reset(seed=3)
     sound, *_ = env.step(np.zeros(2))
@@ -213,7 +214,7 @@ def test_an_engine_that_diverges_ends_the_episode_and_leaves_nothing_for_the_nex
         assert not info["is_success"]
         np.testing.assert_array_equal(observation, sound)
     assert not list(tmp_path.iterdir())
-    np.testing.assert_array_equal(episode(env, 5), episode(made(), 5))
+    np.testing.assert_array_equal(episode(env, 5), episode(generate_assets(), 5))
 
 
 @pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
@@ -225,7 +226,7 @@ def test_an_engine_without_room_for_its_contacts_ends_the_episode(warning, monke
         step(model, data)
         data.warning[mujoco.mjtWarning.__members__[f"mjWARN_{warning}"].value].number += 1
 
-    env = make_env("BncConnector", station="mujoco", hold=25)
+    env = make_env("BncConnector", station="mujoco", action_repeat=25)
     env.reset(seed=3)
     monkeypatch.setattr(mujoco, "mj_step", step_and_warn)
     *_, terminated, truncated, info = env.step(np.zeros(2))
@@ -234,7 +235,7 @@ def test_an_engine_without_room_for_its_contacts_ends_the_episode(warning, monke
 
 
 def test_what_a_task_draws_is_where_the_engine_has_it():
-    env = make_env("BncConnector", station="mujoco", uncertainty="disc", grasp_angle=1.0)
+    env = make_env("BncConnector", station="mujoco", fixture_offset="per_episode", grasp_angle=1.0)
     _, info = env.reset(seed=2)
     station = env.task.diagram.GetSubsystemByName("station")
     env.step(np.zeros(2))

@@ -7,7 +7,7 @@ from guiderail.models.common.errors import InputError
 PLACES = [
     ("NarrowPassage", "plane"),
     ("Pouring", "pouring"),
-    ("BncConnector", "rails"),
+    ("BncConnector", "gantry"),
     ("BncConnector", "mujoco"),
     ("BncConnector", "arm"),
 ]

@@ -17,7 +17,7 @@ from guiderail.models.common.units import MM
 from guiderail.models.objects.insertion import COLLISION_FORCE
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.scripted import reactive_rule
+from guiderail.tools.evaluation.scripted import scripted_torque_search
 
 NEW_RUN = {"new_run": True}  # every episode is a run of its own
 
@@ -36,17 +36,17 @@ def play(env, policy, *, seed=None, options=None):
 
 @pytest.fixture(scope="module")
 def kmp():
-    return make_env("BncConnector", guidance="kmp", uncertainty="known")
+    return make_env("BncConnector", guidance="kmp", fixture_offset="none")
 
 
 @pytest.fixture(scope="module")
 def kgrl():
-    return make_env("BncConnector", guidance="kgrl", uncertainty="disc")
+    return make_env("BncConnector", guidance="kgrl", fixture_offset="per_episode")
 
 
 @pytest.fixture(scope="module")
 def skgrl():
-    return make_env("BncConnector", guidance="skgrl", uncertainty="calibration")
+    return make_env("BncConnector", guidance="skgrl", fixture_offset="per_run")
 
 
 def test_is_registered():
@@ -75,25 +75,25 @@ def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
 
 
 def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):
-    rows = evaluate_policy(skgrl, reactive_rule, episodes=1, options=NEW_RUN)
+    rows = evaluate_policy(skgrl, scripted_torque_search, episodes=1, options=NEW_RUN)
     assert rows["success"].sum() == 1
-    assert rows["worst_violation"].max() <= 1e-9
+    assert rows["max_commanded_violation"].max() <= 1e-9
 
 
 def test_a_rule_that_feels_the_torque_finds_a_jack_anywhere_in_the_disc(kgrl):
-    rows = evaluate_policy(kgrl, reactive_rule, episodes=1, options=NEW_RUN)
+    rows = evaluate_policy(kgrl, scripted_torque_search, episodes=1, options=NEW_RUN)
     assert rows["success"].sum() == 1
-    assert rows["worst_violation"].max() <= 1e-9
+    assert rows["max_commanded_violation"].max() <= 1e-9
 
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
 def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
     """Corner actions that change at every decision, into every corner of the square."""
-    safe_residual = make_env("BncConnector", guidance="safe_residual", kappa=3.0)
+    safe_residual = make_env("BncConnector", guidance="safe_residual", action_scale=3.0)
     env = {"kgrl": kgrl, "skgrl": skgrl, "safe_residual": safe_residual}[guidance]
     rng = np.random.default_rng(3)
     _, info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
-    assert info["ledger"]["worst_commanded_violation"] <= 1e-9
+    assert info["ledger"]["max_commanded_violation"] <= 1e-9
     assert np.abs(env.trace.commanded[:, :2]).max() <= ALIGNMENT + 1e-9
     assert np.isfinite(observations).all()
     assert "simulation_failure" not in info
@@ -141,7 +141,9 @@ def test_the_same_seed_is_the_same_episode(kgrl):
 
 def test_a_hard_push_is_a_collision():
     """A residual that commands 25 mm sideways against the jack's side, which no constraint keeps from it."""
-    env = make_env("BncConnector", guidance="residual", uncertainty="disc", explored=(0, 1, 2), kappa=20.0)
+    env = make_env(
+        "BncConnector", guidance="residual", fixture_offset="per_episode", action_dims=(0, 1, 2), action_scale=20.0
+    )
     _, info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
     assert info["termination"] == "collision"
     assert info["contact_force"] > COLLISION_FORCE
@@ -154,11 +156,11 @@ def test_reward_is_the_sum_of_its_terms(kgrl):
     action = np.array([0.5, -1.0])
     _, reward, _, _, info = kgrl.step(action)
     assert reward == pytest.approx(info["action_cost"] + info["force_cost"] + info["terminal_reward"])
-    assert info["action_cost"] == pytest.approx(-0.01 * kgrl.hold * action @ action)
+    assert info["action_cost"] == pytest.approx(-0.01 * kgrl.action_repeat * action @ action)
 
 
 def test_shaped_reward_adds_the_depth_gained():
-    env = make_env("BncConnector", guidance="kmp", reward="shaped", uncertainty="known", hold=10)
+    env = make_env("BncConnector", guidance="kmp", reward="shaped", fixture_offset="none", action_repeat=10)
     env.reset(seed=0)
     start = reference_trajectory("insert").means[0, 2]
     depth = 0.0
@@ -169,7 +171,7 @@ def test_shaped_reward_adds_the_depth_gained():
 
 def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
     """From 2 mm beside the jack to where a constant action leads."""
-    env = make_env("BncConnector", guidance="kgrl", reward="aligned", uncertainty="known", hold=10)
+    env = make_env("BncConnector", guidance="kgrl", reward="aligned", fixture_offset="none", action_repeat=10)
     env.reset(seed=0, options={"offset": (2.0 * MM, 0.0)})
     gained = sum(env.step(np.array([1.0, 0.0]))[4]["alignment"] for _ in range(10))
     nearer = np.hypot(2.0 * MM, 0.0) - np.linalg.norm(env.trace.measured[-1, :2] - [2.0 * MM, 0.0])
@@ -179,8 +181,8 @@ def test_an_aligned_reward_adds_the_nearness_gained_to_where_the_jack_is():
 
 def test_the_policy_of_the_rails_drives_the_arm_too():
     """The arm is slower to follow, and locks too."""
-    env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", station="arm")
-    assert play(env, reactive_rule, seed=4, options={"offset": (0.0009, -0.0008)})[1]["is_success"]
+    env = make_env("BncConnector", guidance="kgrl", fixture_offset="per_episode", station="arm")
+    assert play(env, scripted_torque_search, seed=4, options={"offset": (0.0009, -0.0008)})[1]["is_success"]
 
 
 def test_a_push_moves_the_robot(kgrl):
@@ -189,13 +191,13 @@ def test_a_push_moves_the_robot(kgrl):
     before = kgrl.trace.measured[-1].copy()
     kgrl.push(np.array([0.0, 0.0, 0.004, 0.0, 0.0, 0.0]))
     kgrl.step(np.zeros(2))
-    assert kgrl.trace.measured[kgrl.hold, 2] > before[2] + 0.001
+    assert kgrl.trace.measured[kgrl.action_repeat, 2] > before[2] + 0.001
 
 
 class TestUncertainty:
     def test_calibration_keeps_its_hidden_offset_for_a_run(self):
-        uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(0)
-        draws = [uncertainty.draw(rng, InsertionReset()) for _ in range(20)]
+        fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(0)
+        draws = [fixture_offset.draw(rng, InsertionReset()) for _ in range(20)]
         jacks, grasps = (np.array(column) for column in zip(*draws, strict=True))
         assert (jacks == jacks[0]).all()
         assert 1.0 * MM <= np.linalg.norm(jacks[0]) <= 1.5 * MM
@@ -203,21 +205,21 @@ class TestUncertainty:
         assert np.linalg.norm(grasps, axis=1).max() <= 0.3 * MM
 
     def test_a_new_run_has_another_one(self):
-        uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(0)
-        first, _ = uncertainty.draw(rng, InsertionReset())
-        second, _ = uncertainty.draw(rng, InsertionReset(new_run=True))
+        fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(0)
+        first, _ = fixture_offset.draw(rng, InsertionReset())
+        second, _ = fixture_offset.draw(rng, InsertionReset(new_run=True))
         assert (first != second).any()
 
     def test_held_out_keeps_the_run_and_draws_apart(self):
-        uncertainty = BncUncertainty("calibration")
-        jack, grasp = uncertainty.draw(np.random.default_rng(7), InsertionReset())
-        jack_held_out, grasp_held_out = uncertainty.draw(np.random.default_rng(7), InsertionReset(held_out=True))
+        fixture_offset = BncUncertainty("per_run")
+        jack, grasp = fixture_offset.draw(np.random.default_rng(7), InsertionReset())
+        jack_held_out, grasp_held_out = fixture_offset.draw(np.random.default_rng(7), InsertionReset(held_out=True))
         np.testing.assert_array_equal(jack, jack_held_out)
         assert (grasp != grasp_held_out).any()
 
     def test_disc_fills_the_disc(self):
-        uncertainty, rng = BncUncertainty("disc"), np.random.default_rng(1)
-        radii = np.array([np.linalg.norm(uncertainty.draw(rng, InsertionReset())[0]) for _ in range(2000)])
+        fixture_offset, rng = BncUncertainty("per_episode"), np.random.default_rng(1)
+        radii = np.array([np.linalg.norm(fixture_offset.draw(rng, InsertionReset())[0]) for _ in range(2000)])
         assert radii.max() <= 1.5 * MM
         # The density is the same everywhere: half the area lies within 1/√2 of the radius.
         assert np.mean(radii < 1.5 * MM / np.sqrt(2)) == pytest.approx(0.5, abs=0.04)
@@ -244,9 +246,9 @@ class TestUncertainty:
         {"guidance": "sct"},
         {"reward": "dense"},
         {"observation": "image"},
-        {"uncertainty": "none"},
+        {"fixture_offset": "none"},
         {"station": "hardware"},
-        {"explored": (0, 6)},
+        {"action_dims": (0, 6)},
     ],
 )
 def test_refuses_what_makes_no_sense(wrong):

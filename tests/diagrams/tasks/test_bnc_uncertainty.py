@@ -8,7 +8,7 @@ from guiderail.diagrams.tasks.bnc_connector.options import LARGEST_GRASP_ANGLE, 
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.scripted import reactive_rule
+from guiderail.tools.evaluation.scripted import scripted_torque_search
 
 
 def drawn(uncertain, count, seed=0):
@@ -16,7 +16,7 @@ def drawn(uncertain, count, seed=0):
     return [np.concatenate(uncertain.draw(rng, InsertionReset())) for _ in range(count)]
 
 
-@pytest.mark.parametrize("kind", ["calibration", "disc", "known"])
+@pytest.mark.parametrize("kind", ["per_run", "per_episode", "none"])
 def test_a_tilt_is_drawn_anew_within_its_bound_and_changes_nothing_else(kind):
     straight, tilted = drawn(BncUncertainty(kind), 50), drawn(BncUncertainty(kind, grasp_angle=1.0), 50)
     assert np.shape(straight) == (50, 4)
@@ -28,7 +28,7 @@ def test_a_tilt_is_drawn_anew_within_its_bound_and_changes_nothing_else(kind):
 
 def test_a_given_offset_is_without_a_tilt():
     given = InsertionReset(offset=(0.0, 1e-3))
-    _, plug = BncUncertainty("disc", grasp_angle=1.0).draw(np.random.default_rng(0), given)
+    _, plug = BncUncertainty("per_episode", grasp_angle=1.0).draw(np.random.default_rng(0), given)
     np.testing.assert_array_equal(plug, 0.0)
 
 
@@ -39,7 +39,7 @@ def test_refuses_an_angle_that_is_none(angle):
 
 
 def test_the_plug_in_the_tool_is_tilted():
-    env = make_env("BncConnector", guidance="kmp", uncertainty="disc", grasp_angle=1.0)
+    env = make_env("BncConnector", guidance="kmp", fixture_offset="per_episode", grasp_angle=1.0)
     _, info = env.reset(seed=0)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
@@ -49,5 +49,5 @@ def test_the_plug_in_the_tool_is_tilted():
 
 
 def test_a_rule_that_feels_the_torque_locks_a_tilted_plug_too():
-    env = make_env("BncConnector", guidance="kgrl", uncertainty="disc", grasp_angle=1.0)
-    assert evaluate_policy(env, reactive_rule, episodes=2, options={"new_run": True})["success"].sum() == 2
+    env = make_env("BncConnector", guidance="kgrl", fixture_offset="per_episode", grasp_angle=1.0)
+    assert evaluate_policy(env, scripted_torque_search, episodes=2, options={"new_run": True})["success"].sum() == 2

@@ -6,7 +6,7 @@ import pytest
 from guiderail.diagrams.envs.make import make_env, resolve
 from guiderail.diagrams.tasks.bnc_connector import options as bnc_options
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.scripted import lever_rule
+from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
 from guiderail.diagrams.tasks.grid_clamp import task as grid_clamp_options
 from guiderail.diagrams.tasks.insertion import InsertionReset
@@ -16,7 +16,7 @@ from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.scripted import gentle_rule, straight_descent
+from guiderail.tools.evaluation.scripted import scripted_gentle_search, straight_descent
 
 HARD = {"BncConnector": bnc_options.HARD, "GridClamp": grid_clamp_options.HARD}
 FRESH = {"options": {"new_run": True}, "seed": 300_000}
@@ -46,7 +46,7 @@ def test_hard_is_what_its_numbers_say_and_each_can_be_given_by_itself(task):
 def test_standard_is_what_it_was(task):
     declared = resolve(task, {}).task
     drawn = {"BncConnector": BncDimensions(), "GridClamp": GridClampDimensions()}[task]
-    assert declared.world() == type(declared.world())(drawn)
+    assert declared.workcell() == type(declared.workcell())(drawn)
     assert declared.collision.above == 35.0
     assert declared.num_steps == {"BncConnector": 400, "GridClamp": 500}[task]
     assert declared.choice.observation == "state"
@@ -60,8 +60,8 @@ JACK, PLUG = [0.08709568301284622, 1.0485589162894264], [0.12997660481050205, 0.
 
 def test_what_a_seed_draws_at_standard_is_what_it_drew():
     """Of a generator, so the same everywhere."""
-    uncertainty, rng = BncUncertainty("calibration"), np.random.default_rng(3)
-    jack, plug = uncertainty.draw(rng, InsertionReset())
+    fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(3)
+    jack, plug = fixture_offset.draw(rng, InsertionReset())
     np.testing.assert_allclose(1e3 * jack, JACK, atol=1e-12)
     np.testing.assert_allclose(1e3 * plug, PLUG, atol=1e-12)
 
@@ -77,7 +77,7 @@ WRONG = [
     ("BncConnector", {"bound": 0.0}, "bound must be at least"),
     ("BncConnector", {"friction": np.nan}, "friction"),
     ("BncConnector", {"jack_turn": -1.0}, "jack_turn must be at least 0"),
-    ("BncConnector", {"start_beside": 0.01}, "start_beside must be at most"),
+    ("BncConnector", {"start_offset_max": 0.01}, "start_offset_max must be at most"),
     ("BncConnector", {"demonstrations": "none"}, "demonstrations cannot be 'none'"),
     ("BncConnector", {"difficulty": "harder"}, "did you mean hard"),
     ("GridClamp", {"force_limit": 100.0}, "force_limit must be at most 60"),
@@ -101,7 +101,7 @@ def test_what_is_out_of_range_is_refused_in_a_sentence(task, wrong, words):
 
 def test_the_connector_at_its_hardest_is_searched_for_where_it_may_be(connector):
     declared = connector.unwrapped.task.declaration
-    assert declared.world().dimensions.mouth_chamfer == 0.1 * MM
+    assert declared.workcell().dimensions.mouth_chamfer == 0.1 * MM
     assert declared.collision.above == 20.0
     radii = []
     for seed in range(20):
@@ -113,7 +113,7 @@ def test_the_connector_at_its_hardest_is_searched_for_where_it_may_be(connector)
 
 
 def test_a_turned_jack_is_turned():
-    env = make_env("BncConnector", jack_turn=5.0, uncertainty="disc")
+    env = make_env("BncConnector", jack_turn=5.0, fixture_offset="per_episode")
     _, info = env.reset(seed=1)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
@@ -133,14 +133,14 @@ def test_the_lever_says_where_to_go(connector):
 
 
 def test_at_its_hardest_the_rule_locks_and_the_demonstrations_do_not(connector):
-    row = evaluate_policy(connector, lever_rule, episodes=1, **FRESH).iloc[0]
+    row = evaluate_policy(connector, scripted_center_of_pressure, episodes=1, **FRESH).iloc[0]
     assert row["success"]
-    assert row["worst_violation"] <= 1e-9
+    assert row["max_commanded_violation"] <= 1e-9
     assert not evaluate_policy(connector, still(connector), episodes=1, **FRESH)["success"].any()
 
 
 def test_at_its_hardest_the_rule_snaps_the_clamp_in_and_the_straight_descent_does_not(clamp):
-    assert evaluate_policy(clamp, gentle_rule, episodes=1, **FRESH)["success"].all()
+    assert evaluate_policy(clamp, scripted_gentle_search, episodes=1, **FRESH)["success"].all()
     assert not evaluate_policy(clamp, straight_descent, episodes=1, **FRESH)["success"].any()
 
 

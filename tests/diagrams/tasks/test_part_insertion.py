@@ -61,7 +61,7 @@ def write(folder, **changes):
 
 def test_bounds_that_change_on_the_way_hold_at_every_step(tmp_path):
     folder = write(tmp_path / "by_phase", bounds=BY_PHASE)
-    env = make_env(str(folder), hold=10, horizon=4)
+    env = make_env(str(folder), action_repeat=10, horizon=4)
     env.reset(seed=0)
     done = False
     while not done:
@@ -125,28 +125,28 @@ def test_a_folder_is_the_same_task_until_a_file_of_it_changes(tmp_path):
 def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp_path):
     folder = write(tmp_path / "written")
     task = resolve(str(folder), {}).task
-    assert task.world() is task.world()
+    assert task.workcell() is task.workcell()
     assert "from task.yaml; change the dimensions there" in (folder / "plug.sdf").read_text()
     assert sorted(path.name for path in folder.glob("*.sdf*")) == ["plug.sdf", "socket.sdf"]
     (folder / "plug.sdf").unlink()
     (folder / "plug.sdf").mkdir()
     with pytest.raises(InputError, match=r"plug\.sdf cannot be written"):
-        resolve(str(folder), {}).task.world()
+        resolve(str(folder), {}).task.workcell()
 
 
 def test_a_parts_mass_is_where_its_file_says(tmp_path):
     centre = [0.001, -0.002, 0.003]
     folder = write(tmp_path / "centred", plug=part("plug", centre=centre))
     plant = MultibodyPlant(0.0)
-    plug = resolve(str(folder), {}).task.world().add_workpiece(plant, plant.world_frame())
+    plug = resolve(str(folder), {}).task.workcell().add_workpiece(plant, plant.world_frame())
     np.testing.assert_allclose(plug.default_com(), centre)
 
 
 def test_it_starts_inside_its_bounds(tmp_path):
     bounds = {"lower": [*[None] * 3, *[-0.01] * 3], "upper": [0.0001, None, 0.015, *[0.01] * 3]}
-    task = resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_beside": 0.002}).task
+    task = resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_offset_max": 0.002}).task
     for seed in range(5):
-        start = task.start(np.random.default_rng(seed))
+        start = task.start_pose(np.random.default_rng(seed))
         assert task.constraints().violation(start) <= 1e-9
         assert start[2] == pytest.approx(0.015)
 

@@ -11,7 +11,7 @@ from guiderail.diagrams.envs.make import make_env, option_models, resolve
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import as_value, check_environment
-from guiderail.tools.learning.config import PRESETS, Preset
+from guiderail.tools.learning.config import PRESETS, LearnerConfig
 from guiderail.tools.learning.train import configure
 
 TASK_NAMES = ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"]
@@ -38,23 +38,38 @@ WORDS = st.sampled_from(
         "7",
         "0.5",
     ]
-    + ["sparse", "shaped", "skgrl", "kgrl", "kmp", "sct", "none", "rails", "arm", "image", "hard", "disc", "tqc", "sac"]
+    + [
+        "sparse",
+        "shaped",
+        "skgrl",
+        "kgrl",
+        "kmp",
+        "sct",
+        "none",
+        "gantry",
+        "arm",
+        "image",
+        "hard",
+        "per_episode",
+        "tqc",
+        "sac",
+    ]
 )
 WHAT_IS_TYPED = NUMBERS | WORDS | st.lists(NUMBERS, min_size=1, max_size=3).map(",".join) | st.text(max_size=8)
 BOMB = (
     "{a: &a [1,1,1,1,1,1,1,1,1], b: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a], c: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b], d: [*c,*c,*c]}"
 )
-SETTINGS = [name for name in Preset.__dataclass_fields__ if name != "algorithm"]
+SETTINGS = [name for name in LearnerConfig.__dataclass_fields__ if name != "algorithm"]
 
 
 @given(
     st.sampled_from(sorted(PRESETS)),
     st.lists(st.tuples(st.sampled_from(SETTINGS) | st.text(max_size=5), WHAT_IS_TYPED), min_size=1, max_size=2),
 )
-@example("robust", [("entropy", "inf")])
-@example("robust", [("units", "1000000,1000000")])
-@example("robust", [("batch_size", "1e20")])
-@example("robust", [("layer_norm", "7")])
+@example("tqc_contact", [("ent_coef", "inf")])
+@example("tqc_contact", [("net_arch", "1000000,1000000")])
+@example("tqc_contact", [("batch_size", "1e20")])
+@example("tqc_contact", [("layer_norm", "7")])
 def test_settings_of_a_learner(preset, pairs):
     given = dict(pairs)
     config = attempt("--set", InputError, lambda: configure("NarrowPassage", {}, preset=preset, settings=given))
@@ -90,15 +105,15 @@ OPTIONS = {task: options_of(task) for task in TASK_NAMES}
 def environments(draw):
     task, typed = draw(st.sampled_from(TASK_NAMES)), {}
     for _ in range(draw(st.integers(1, 3))):
-        name = draw(st.sampled_from([*OPTIONS[task]] * 3 + ["guidance", "uncertainty", "x", "", "render_mode"]))
+        name = draw(st.sampled_from([*OPTIONS[task]] * 3 + ["guidance", "fixture_offset", "x", "", "render_mode"]))
         sound = st.just(OPTIONS[task].get(name) or "kmp") | st.floats(0, 1).map(repr) | st.integers(1, 50).map(str)
         typed[name] = draw(sound | sound | WHAT_IS_TYPED)
     return task, typed
 
 
 @given(environments())
-@example(("NarrowPassage", {"hold": BOMB}))
-@example(("NarrowPassage", {"hold": "2001-99-99"}))
+@example(("NarrowPassage", {"action_repeat": BOMB}))
+@example(("NarrowPassage", {"action_repeat": "2001-99-99"}))
 def test_options_of_an_environment(chosen):
     task, typed = chosen
     found = attempt("--env", InputError, lambda: check_environment(task, {k: as_value(v) for k, v in typed.items()}))

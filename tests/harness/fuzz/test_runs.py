@@ -39,9 +39,9 @@ def written(config, folder):
 
 
 CONFIGS = [
-    configure("NarrowPassage", {"guidance": "skgrl", "explored": [1], "hold": 3}, episodes=7, seed=3),
-    configure("BncConnector", {"guidance": "kgrl"}, preset="clamp", algorithm="sac", seed=2**31 - 1),
-    configure("Pouring", {}, preset="pouring", settings={"units": "32", "entropy": "0.2"}, ledger=False),
+    configure("NarrowPassage", {"guidance": "skgrl", "action_dims": [1], "action_repeat": 3}, episodes=7, seed=3),
+    configure("BncConnector", {"guidance": "kgrl"}, preset="sac_gridclamp", algorithm="sac", seed=2**31 - 1),
+    configure("Pouring", {}, preset="pouring", settings={"net_arch": "32", "ent_coef": "0.2"}, ledger=False),
 ]
 
 
@@ -99,7 +99,7 @@ def test_configurations_with_characters_changed(folder, texts, data):
 
 
 ROW = {"episode": 0, "return": -1.25, "success": 1, "termination": "success", "steps": 40, "peak_force": 1.5}
-ROW |= {"worst_violation": -1e-3, "collisions": 0, "wall_time": 0.125}
+ROW |= {"max_commanded_violation": -1e-3, "collisions": 0, "wall_time": 0.125}
 ROWS = [ROW | {"episode": n, "return": -n / 3, "success": n % 2} for n in range(12)]
 TABLE = table_text(ROWS).encode()
 FIELDS = st.sampled_from(
@@ -212,9 +212,9 @@ def test_policies_with_entries_changed_that_have_their_digest(folder, data):
 def resumable(folder):
     """A small learner that has seen something, and what a checkpoint of it holds."""
     env = Line()
-    settings = {"units": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_every": 1}
+    settings = {"net_arch": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_freq": 1}
     learner = LEARNERS.get("tqc")(
-        resolve_preset("robust", "tqc", settings), env, hold=1, seed=0, decisions=12, symmetry=None
+        resolve_preset("tqc_contact", "tqc", settings), env, action_repeat=1, seed=0, decisions=12, symmetry=None
     )
     arrays, values = learner.state()
     arrays = {key: array.copy() for key, array in arrays.items()}

@@ -17,7 +17,7 @@ from fuzz.changes import changed_texts, changed_trees
 from fuzz.tally import attempt
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.yaml import parse_yaml
-from guiderail.models.templates import parse_skill
+from guiderail.models.templates import parse_template
 from guiderail.models.templates.transitions import TransitionDistance
 from oracles.files import skill_numbers
 
@@ -135,7 +135,7 @@ def works(skill):
 
 
 def try_skill(target, text):
-    skill = attempt(target, InputError, lambda: parse_skill(text))
+    skill = attempt(target, InputError, lambda: parse_template(text))
     if skill is not None:
         means_what_it_says(skill, text)
         works(skill)

@@ -12,12 +12,12 @@ from drake import lcmt_iiwa_command, lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.monitor import Deputy, Duty, word_channel
+from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor, word_channel
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa, safety_limits
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
-from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 
 PERIOD = IIWA_DRIVER.period
@@ -63,9 +63,9 @@ class Bus:
         limits = dataclasses.replace(limits, damping_time=0.2, ramp_time=0.1)
         self.limits = np.array(limits.torque)
         self.station = HardwareStation(workcell, self.near_station, robot_timeout=1.0, limits=limits)
-        self.deputy = Deputy(self.near_robot, IIWA_DRIVER, self.robot.known.plant, limits)
+        self.deputy = SafetyMonitor(self.near_robot, IIWA_DRIVER, self.robot.known.plant, limits)
         self.on_status = self.on_command = passes
-        self.has_robot = self.has_controller = self.has_deputy = True
+        self.has_robot = self.has_controller = self.has_safety_monitor = True
         self.torques: list[np.ndarray] = []
         self.step = 0
         self._statuses: list[bytes] = []
@@ -119,9 +119,9 @@ class Bus:
         return plant.GetVelocities(plant.GetMyContextFromRoot(self.robot_simulator.get_context()))
 
     @property
-    def phase(self) -> Phase:
+    def phase(self) -> ArmState:
         """What the station does."""
-        return Phase(int(self.station.get_phase_output_port().Eval(self.simulator.get_context())[0]))
+        return ArmState(int(self.station.get_phase_output_port().Eval(self.simulator.get_context())[0]))
 
     @property
     def fault(self) -> Fault:
@@ -131,8 +131,12 @@ class Bus:
     @property
     def is_detected(self) -> bool:
         """Whether somebody stops the arm now."""
-        is_stopping = self.has_controller and self.phase in (Phase.DAMPING, Phase.OFF)
-        return is_stopping or (self.has_controller and self.fault != Fault.NONE) or self.deputy.duty > Duty.WATCHING
+        is_stopping = self.has_controller and self.phase in (ArmState.DAMPING, ArmState.OFF)
+        return (
+            is_stopping
+            or (self.has_controller and self.fault != Fault.NONE)
+            or self.deputy.duty > MonitorState.WATCHING
+        )
 
     # How time passes.
 
@@ -172,7 +176,7 @@ class Bus:
         for message in statuses:
             self._send(self.near_station, IIWA_DRIVER.status_channel, self.on_status(message), settle)
         # What a deputy says goes the same way as the statuses, and is lost with them.
-        if self.has_deputy and self.on_status(b""):
+        if self.has_safety_monitor and self.on_status(b""):
             self._send(self.near_station, WORDS, words[-1:], settle)
 
     def _send(self, lcm: DrakeLcm, channel: str, messages: list[bytes], settle: bool = True) -> None:
@@ -198,9 +202,9 @@ class Bus:
     def run_in(self, seconds: float = 0.15) -> None:
         """Until the arm follows."""
         for _ in range(round(3.0 / PERIOD)):
-            if self.phase == Phase.RUNNING and self.fault == Fault.NONE:
+            if self.phase == ArmState.RUNNING and self.fault == Fault.NONE:
                 break
-            if self.phase == Phase.OFF:
+            if self.phase == ArmState.OFF:
                 with contextlib.suppress(InputError):  # while something is wrong still
                     self.station.resume(self.simulator.get_mutable_context())
             self.one()
@@ -227,9 +231,11 @@ class Bus:
             now, speed = (self.step - begun) * PERIOD, float(np.abs(self.velocities).max())
             if seen.detected is None and self.is_detected:
                 seen.detected, seen.fastest = now, speed
-                seen.fault = self.fault.name if self.has_controller else "DEPUTY"
+                seen.fault = self.fault.name if self.has_controller else "MONITOR_STOP"
             # A program that was started anew moves the arm again; one that goes on must be told to.
-            is_anew = self.has_controller and self.phase in (Phase.RAMPING, Phase.RUNNING) and not self.is_detected
+            is_anew = (
+                self.has_controller and self.phase in (ArmState.RAMPING, ArmState.RUNNING) and not self.is_detected
+            )
             if (
                 seen.detected is not None
                 and self.has_robot

@@ -7,11 +7,11 @@ import numpy as np
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.clock import RealTime, hurry
+from guiderail.diagrams.hardware.clock import WallClock, set_realtime_priority
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 from guiderail.tools.teleop.teleoperator import no_pauses
 
@@ -19,20 +19,20 @@ from guiderail.tools.teleop.teleoperator import no_pauses
 def main(url: str, rate: float) -> None:
     """Until it is killed."""
     station = HardwareStation(BncWorkcell(), DrakeLcm(url), robot_timeout=60.0)
-    pace = RealTime(station.lcm, station.driver.status_channel, station.period, rate)
+    pace = WallClock(station.lcm, station.driver.status_channel, station.period, rate)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
     desired = station.get_desired_pose_input_port()
     desired.FixValue(context, START)
     station.start(simulator)
-    hurry()
+    set_realtime_priority()
     pace.begin()
     with no_pauses():
         while True:
             angle = 2.0 * np.pi * context.get_time()
             side = 0.01 * np.array([np.cos(angle), np.sin(angle)])
             desired.FixValue(context, START + [*side, 0.0, 0.15 * np.sin(angle), 0.0, 0.0])
-            if station.get_phase_output_port().Eval(context)[0] == Phase.OFF:
+            if station.get_phase_output_port().Eval(context)[0] == ArmState.OFF:
                 with contextlib.suppress(InputError):  # while something is wrong still
                     station.resume(context)
             pace.advance(simulator, station, 1)

@@ -200,7 +200,9 @@ def controller_held_up(seconds: float) -> Injection:
     def end(bus: Bus) -> None:
         bus.has_controller = True
 
-    return Injection("controller held up", f"{seconds} s", begin, end, seconds, _must_stop(seconds), Fault.LATE)
+    return Injection(
+        "controller held up", f"{seconds} s", begin, end, seconds, _must_stop(seconds), Fault.DEADLINE_MISSED
+    )
 
 
 def controller_killed(seconds: float) -> Injection:
@@ -225,10 +227,10 @@ def deputy_killed(seconds: float) -> Injection:
     """Nobody stands by any more."""
 
     def begin(bus: Bus) -> None:
-        bus.has_deputy = False
+        bus.has_safety_monitor = False
 
     def end(bus: Bus) -> None:
-        bus.has_deputy = True
+        bus.has_safety_monitor = True
 
     return Injection("deputy killed", f"back after {seconds} s", begin, end, seconds, True)
 

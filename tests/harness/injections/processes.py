@@ -21,10 +21,10 @@ import numpy as np
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.clock import hurry
+from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.monitor import word_channel
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, safety_limits
-from guiderail.diagrams.stations.arm import KnownArm
+from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 
 STANDSTILL, STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.05, 0.06  # [rad/s], [s] of the robot's clock
@@ -44,7 +44,7 @@ class Ear:
         self.speeds: list[tuple[float, float]] = []
         self.acting: list[float] = []
         self.commands: list[tuple[float, float]] = []  # when it came by the wall's clock, and the largest torque
-        self.limits = np.array(safety_limits(KnownArm(BncWorkcell()).plant, IIWA_DRIVER).torque)
+        self.limits = np.array(safety_limits(ArmControllerPlant(BncWorkcell()).plant, IIWA_DRIVER).torque)
         self.wrong: list[str] = []
         self.lcm.Subscribe(IIWA_DRIVER.status_channel, self._status)
         self.lcm.Subscribe(IIWA_DRIVER.command_channel, self._command)
@@ -130,7 +130,7 @@ def main() -> int:
     os.environ.setdefault("DRAKE_ALLOW_NETWORK", "lcm")
     rate, url = arguments.rate, f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     ear, rng = Ear(url), np.random.default_rng(0)
-    hurry()
+    set_realtime_priority()
     ends = {"robot": robot(url, rate), "controller": controller(url, rate)}
     counts: Counter[tuple[str, str]] = Counter()
     kinds = ["controller killed", "controller held up", "robot killed", "robot held up"]

@@ -1,6 +1,6 @@
 """A simulated robot, its deputy and whoever drives it, stepped in turn in one process."""
 
-from guiderail.diagrams.hardware.monitor import Deputy
+from guiderail.diagrams.hardware.monitor import SafetyMonitor
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa, safety_limits
 
 
@@ -18,13 +18,13 @@ class Together:
         self.robot = SimulatedIiwa(workcell, lcm)
         plant = self.robot.known.plant
         if deputy:
-            self.deputy = Deputy(lcm, IIWA_DRIVER, plant, safety_limits(plant, IIWA_DRIVER))
+            self.deputy = SafetyMonitor(lcm, IIWA_DRIVER, plant, safety_limits(plant, IIWA_DRIVER))
         self.simulator = self.robot.simulator()
         self.robot.set_pose(self.simulator.get_mutable_context(), start)
         self.simulator.Initialize()
         self.step, self.happens, self.is_silent = 0, {}, False
 
-    def begin(self):
+    def on_episode_start(self):
         pass
 
     def advance(self, simulator, station, steps):

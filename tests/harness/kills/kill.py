@@ -30,9 +30,18 @@ TESTS = Path(__file__).parents[2]
 sys.path.insert(0, str(TESTS))
 from oracles.same_runs import differences  # noqa: E402
 
-SMALL = ["--set", "units=32,32", "--set", "learning_starts=10", "--set", "batch_size=32", "--set", "gradient_steps=2"]
+SMALL = [
+    "--set",
+    "net_arch=32,32",
+    "--set",
+    "learning_starts=10",
+    "--set",
+    "batch_size=32",
+    "--set",
+    "gradient_steps=2",
+]
 RUNS = {
-    "NarrowPassage": ["--guidance", "kgrl", "--preset", "quick", "--episodes", "12", *SMALL],
+    "NarrowPassage": ["--guidance", "kgrl", "--preset", "tqc_fast", "--episodes", "12", *SMALL],
     "GridClamp": ["--episodes", "6", *SMALL],
     "Pouring": ["--episodes", "8", *SMALL],
 }
@@ -42,13 +51,13 @@ STUDY = {
     "task": "NarrowPassage",
     "env": {"guidance": "kgrl"},
     "learner": {
-        "preset": "quick",
+        "preset": "tqc_fast",
         "episodes": 4,
-        "settings": {"units": "32,32", "learning_starts": 10, "batch_size": 32, "gradient_steps": 2},
+        "settings": {"net_arch": "32,32", "learning_starts": 10, "batch_size": 32, "gradient_steps": 2},
     },
     "methods": {"kgrl": {}},
     "seeds": [0, 1, 2],
-    "marks": [2],
+    "after_episodes": [2],
     "judged on": [{"episodes": 2}],
 }
 PATIENCE = 600.0  # s

@@ -18,7 +18,7 @@ from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.certificate.bounds import certify
 from guiderail.models.certificate.files import BUDGET, CERTIFICATE, OTHER_CLOCK, certificate_files, digest
 from guiderail.models.certificate.lagrange_bounds import Budget, _Market, _of_residue
-from guiderail.models.certificate.loop import Skill, reach
+from guiderail.models.certificate.loop import SharedControlTemplate, reach
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
 
@@ -39,7 +39,7 @@ def skill(history, bound=None, tied=0.0):
         horizon=10, history=history, history_variance=1e-6, constraints=constraints,
     )  # fmt: skip
     gains = authority_gains(primitive, outputs=np.array([0]))
-    return Skill(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
+    return SharedControlTemplate(primitive, gains, PERIOD, means[0], np.array([0.01, 0.0]))
 
 
 CASES = {

@@ -43,8 +43,8 @@ def test_a_plug_made_to_measure_has_those_measures():
 
 def test_a_wider_slot_is_wider():
     wider = dataclasses.replace(BncDimensions(), slot_clearance=0.2 * MM)
-    made, drawn = (vertices(write_bnc.folder_of(d) / "bnc_slots.obj") for d in (wider, BncDimensions()))
-    assert made[:, 2].max() - drawn[:, 2].max() == pytest.approx(0.075 * MM, abs=1e-6)
+    generate_assets, drawn = (vertices(write_bnc.folder_of(d) / "bnc_slots.obj") for d in (wider, BncDimensions()))
+    assert generate_assets[:, 2].max() - drawn[:, 2].max() == pytest.approx(0.075 * MM, abs=1e-6)
 
 
 def test_a_table_and_a_clamp_made_to_measure_have_those_measures():

@@ -31,20 +31,22 @@ def deviation_rms(primitive, actions):
 
 
 def test_constant_actions_end_up_where_authority_says(primitive):
-    gains = authority_gains(primitive, kappa=1.5)
+    gains = authority_gains(primitive, action_scale=1.5)
     np.testing.assert_allclose(authority(primitive, gains), np.sqrt(3) * 1.5)
     for o in range(2):
         reached = deviation_rms(primitive, np.tile(gains * np.eye(2)[o], (150, 1)))[o]
         assert reached == pytest.approx(np.sqrt(3) * 1.5, rel=1e-6)
 
 
-@pytest.mark.parametrize("hold", [1, 5])
-def test_white_actions_stir_up_what_rms_says(primitive, hold):
-    gains = rms_gains(primitive, kappa=1.0, hold=hold)
-    np.testing.assert_allclose(exploration_rms(primitive, gains, hold), 1.0)
+@pytest.mark.parametrize("action_repeat", [1, 5])
+def test_white_actions_stir_up_what_rms_says(primitive, action_repeat):
+    gains = rms_gains(primitive, action_scale=1.0, action_repeat=action_repeat)
+    np.testing.assert_allclose(exploration_rms(primitive, gains, action_repeat), 1.0)
     rng = np.random.default_rng(0)
     samples = [
-        deviation_rms(primitive, gains * np.repeat(rng.uniform(-1, 1, (150 // hold, 2)), hold, axis=0))
+        deviation_rms(
+            primitive, gains * np.repeat(rng.uniform(-1, 1, (150 // action_repeat, 2)), action_repeat, axis=0)
+        )
         for _ in range(40)
     ]
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(samples), axis=0)), 1.0, rtol=0.15)
@@ -59,12 +61,12 @@ def test_only_named_outputs_are_explored(primitive):
 
 
 def test_refuses(primitive):
-    with pytest.raises(InputError, match="kappa"):
-        authority_gains(primitive, kappa=0)
-    with pytest.raises(InputError, match="explored"):
+    with pytest.raises(InputError, match="action_scale"):
+        authority_gains(primitive, action_scale=0)
+    with pytest.raises(InputError, match="action_dims"):
         rms_gains(primitive, outputs=[2])
-    with pytest.raises(InputError, match="hold"):
-        rms_gains(primitive, hold=0)
+    with pytest.raises(InputError, match="action_repeat"):
+        rms_gains(primitive, action_repeat=0)
     deaf = LcNsKmp(primitive.reference, beta=0.0, lambda_=12.0, horizon=20)
     with pytest.raises(InputError, match="beta"):
         authority_gains(deaf)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from guiderail.models.templates import Command, Skill, SkillState, Transition
+from guiderail.models.templates import Command, SharedControlTemplate, TemplateState, Transition
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates import mappings as im
 from guiderail.models.templates import transitions as td
@@ -19,13 +19,13 @@ PERIOD = 0.02
 
 def state(name="only", constraints=(), to=(), **changes):
     numbers = {"starts_at": 1.0, "ends_at": 0.0, **changes}
-    return SkillState(
+    return TemplateState(
         name, (im.Translation((0, 1, 2), 0.5),), tuple(constraints), td.Height("f"), transitions=to, **numbers
     )
 
 
 def skill(*states, speed=0.2, turn=1.0, initial=0):
-    return Skill("s", 3, ("f",), states or (state(),), initial, speed, turn)
+    return SharedControlTemplate("s", 3, ("f",), states or (state(),), initial, speed, turn)
 
 
 def pose(rng, spread):
@@ -137,7 +137,7 @@ def test_a_displacement_turns_about_the_origin_of_the_end_effector_and_adds_up()
     np.testing.assert_allclose(moved.translation(), [1.1, 2.2, 3.3])
     expected = RotationMatrix.MakeZRotation(0.3) @ RotationMatrix.MakeXRotation(0.4)
     np.testing.assert_allclose(moved.rotation().matrix(), expected.matrix(), atol=1e-12)
-    both = SkillState(
+    both = TemplateState(
         "b", (im.Translation((0, 1, 2), 0.5), im.Rotation((0,), 2.0, axes=((0, 0, 1),))), (), td.Height("f"), 1, 0
     )
     total = skill(both).map(0, np.array([0.5, 9.0, -9.0]), X, F, 0.1)
@@ -204,7 +204,7 @@ def test_progress_goes_on_where_the_state_before_ended():
 
 
 def test_a_state_needs_the_frames_of_all_its_parts():
-    s = SkillState(
+    s = TemplateState(
         "x", (im.TiltTowards((0, 1), 1.0, "a"),), (ac.Cylinder("b"),), td.Distance("c"), starts_at=1.0, ends_at=0.0
     )
     assert s.frame_names == {"a", "b", "c"}

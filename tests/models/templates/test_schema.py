@@ -9,7 +9,7 @@ import yaml
 from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.templates import load_skill, parse_skill
+from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register
 
@@ -23,7 +23,7 @@ def changed(change):
 
 
 def test_reads_states_in_order_with_units_turned_into_si():
-    skill = parse_skill(SKILL)
+    skill = parse_template(SKILL)
     assert [state.name for state in skill.states] == ["far", "near"]
     assert skill.initial_state == 0
     assert skill.states[1].starts_at == pytest.approx(np.pi / 2)
@@ -31,10 +31,10 @@ def test_reads_states_in_order_with_units_turned_into_si():
 
 
 def test_numbers_may_be_arithmetic_on_the_objects_sizes():
-    cylinder = parse_skill(SKILL).states[0].active_constraints[0]
+    cylinder = parse_template(SKILL).states[0].active_constraints[0]
     assert isinstance(cylinder, Cylinder)
     assert (cylinder.min_radius_m, cylinder.max_radius_m) == pytest.approx((0.06, 0.3))
-    larger = parse_skill(SKILL, rim_m=0.06).states[0].active_constraints[0]
+    larger = parse_template(SKILL, rim_m=0.06).states[0].active_constraints[0]
     assert isinstance(larger, Cylinder)
     assert (larger.min_radius_m, larger.max_radius_m) == pytest.approx((0.07, 0.36))
 
@@ -56,7 +56,7 @@ def test_a_new_kind_is_one_class_and_one_registration():
                 {"kind": "at_origin", "frame": "cup", "height_m": "2 * rim_m"}
             ]
 
-        skill = parse_skill(changed(use))
+        skill = parse_template(changed(use))
         X_WP = skill.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
         np.testing.assert_allclose(X_WP.translation(), [1.0, 0.0, 0.1])
         with pytest.raises(ValueError, match="already registered"):
@@ -166,7 +166,7 @@ TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
 )
 def test_says_what_is_wrong_and_what_to_do(change, said):
     with pytest.raises(InputError) as refused:
-        parse_skill(changed(change))
+        parse_template(changed(change))
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 500
@@ -175,37 +175,37 @@ def test_says_what_is_wrong_and_what_to_do(change, said):
 def test_refuses_parameters_that_are_no_numbers():
     for value in (None, [0.04], True, float("nan"), 1e300, 10**400):
         with pytest.raises(InputError, match="rim_m"):
-            parse_skill(SKILL, rim_m=value)
-    assert parse_skill(SKILL, rim_m=np.float32(0.25)).parameters["rim_m"] == 0.25
+            parse_template(SKILL, rim_m=value)
+    assert parse_template(SKILL, rim_m=np.float32(0.25)).parameters["rim_m"] == 0.25
 
 
 def test_refuses_what_other_readers_would_stumble_over():
     for text in ("inputs: 010", "inputs: 2001-99-99", "inputs: 2\ninputs: 3", "inputs: !!int 2", "inputs: 1:30"):
         with pytest.raises(InputError):
-            parse_skill(SKILL.replace("inputs: 2", text, 1))
+            parse_template(SKILL.replace("inputs: 2", text, 1))
     bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
         f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
     )
     with pytest.raises(InputError, match="more than 10000"):
-        parse_skill(SKILL + bomb)
+        parse_template(SKILL + bomb)
 
 
 def test_refuses_what_is_not_there(tmp_path):
     with pytest.raises(InputError, match="did you mean pouring"):
-        load_skill("puoring")
+        load_template("puoring")
     with pytest.raises(InputError, match="there is no skill"):
-        load_skill(tmp_path / "missing.yaml")
+        load_template(tmp_path / "missing.yaml")
     with pytest.raises(InputError, match="no parameter"):
-        load_skill("pouring", mug_size_m=0.1)
+        load_template("pouring", mug_size_m=0.1)
     broken = tmp_path / "broken.yaml"
     broken.write_text("name: [")
     with pytest.raises(InputError, match="not YAML"):
-        load_skill(broken)
+        load_template(broken)
 
 
 def test_a_parameter_is_made_of_no_other_and_the_sentence_names_them():
     with pytest.raises(InputError, match=r"'far' is no number, and no parameter \(near, far\) is made of others"):
-        parse_skill(
+        parse_template(
             "{name: x, inputs: 1, parameters: {near: far, far: 1}, max_speed_m_per_s: 1, "
             "max_speed_rad_per_s: 1, states: {}}"
         )

@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.templates import Command, Skill, SkillState, Transition, load_skill
+from guiderail.models.templates import Command, SharedControlTemplate, TemplateState, Transition, load_template
 from guiderail.models.templates import constraints as ac
 from guiderail.models.templates import mappings as im
 from guiderail.models.templates import transitions as td
@@ -19,7 +19,7 @@ MUG = {"mug_tip": RigidTransform(RotationMatrix.MakeZRotation(0.3), [0.7, 0.1, 0
 
 @pytest.fixture(scope="module")
 def pouring():
-    return load_skill("pouring")
+    return load_template("pouring")
 
 
 def in_mug(p):
@@ -192,8 +192,8 @@ def test_without_active_constraints_what_is_asked_is_done(pouring):
 
 
 def test_the_template_follows_the_object():
-    wide = load_skill("pouring", mug_radius_m=0.06)
-    narrow = load_skill("pouring", mug_radius_m=0.04)
+    wide = load_template("pouring", mug_radius_m=0.06)
+    narrow = load_template("pouring", mug_radius_m=0.04)
     assert wide.states[1].ends_at - narrow.states[1].ends_at == pytest.approx(0.02)
 
 
@@ -225,11 +225,11 @@ class UpTo(ac.ActiveConstraint):
 
 def one_state(*constraints, name="only", **numbers):
     numbers = {"starts_at": 1.0, "ends_at": 0.0, **numbers}
-    return SkillState(name, (im.Translation((0, 1, 2), 1.0),), constraints, td.Height("world"), **numbers)
+    return TemplateState(name, (im.Translation((0, 1, 2), 1.0),), constraints, td.Height("world"), **numbers)
 
 
 def one(*constraints):
-    return Skill("one", 3, (), (one_state(*constraints),), 0, REACH, 1.0)
+    return SharedControlTemplate("one", 3, (), (one_state(*constraints),), 0, REACH, 1.0)
 
 
 def shifted(x):
@@ -300,5 +300,5 @@ def test_the_progress_of_states_that_go_round_ends():
     a, b, c = (
         one_state(name=name, transitions=(Transition(to, 0.5),)) for name, to in (("a", "b"), ("b", "c"), ("c", "b"))
     )
-    skill = Skill("round", 3, (), (a, b, c), 0, REACH, 1.0)
+    skill = SharedControlTemplate("round", 3, (), (a, b, c), 0, REACH, 1.0)
     assert [skill.progress(number, RigidTransform(), {}) for number in range(3)] == [1.0, 2.0, 3.0]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from guiderail.models.templates import load_skill, parse_skill
+from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.drawing import draw, to_dot
 from guiderail.models.templates.validate import validate
 
@@ -16,7 +16,7 @@ def findings(change=None):
     data = yaml.safe_load(SKILL)
     if change:
         change(data)
-    return validate(parse_skill(yaml.safe_dump(data, sort_keys=False)))
+    return validate(parse_template(yaml.safe_dump(data, sort_keys=False)))
 
 
 def errors(change):
@@ -25,7 +25,7 @@ def errors(change):
 
 @pytest.mark.parametrize("name", ["pouring", "pouring_aimed", "grid_clamp", "end_effector_velocity"])
 def test_our_own_skills_have_no_errors(name):
-    assert [f.message for f in validate(load_skill(name)) if f.is_error] == []
+    assert [f.message for f in validate(load_template(name)) if f.is_error] == []
 
 
 def test_a_sound_skill_is_left_alone():
@@ -96,7 +96,7 @@ def test_draws_whatever_a_state_is_called(tmp_path, name):
 
     data = yaml.safe_load(SKILL)
     change(data)
-    skill = parse_skill(yaml.safe_dump(data, sort_keys=False))
+    skill = parse_template(yaml.safe_dump(data, sort_keys=False))
     draw(skill, tmp_path / "a.png")
     # Quotes and backslashes inside a quoted word are escaped: what is left pairs up.
     for line in to_dot(skill).splitlines():
@@ -104,7 +104,7 @@ def test_draws_whatever_a_state_is_called(tmp_path, name):
 
 
 def test_draws_every_state_and_every_way(tmp_path):
-    skill = load_skill("pouring")
+    skill = load_template("pouring")
     dot = to_dot(skill)
     assert all(f'"{state.name}"' in dot for state in skill.states)
     assert dot.count("->") == 3  # forward twice, and back from tilt

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from guiderail.diagrams.envs.trace import Trace
+from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import transform_to_pose
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Observer, rollout
+from guiderail.tools.evaluation.rollout import Callback, rollout
 from guiderail.tools.evaluation.step_log import read_ledger
 from guiderail.tools.tables import read_table
 from research.action_fuzzing import STRESSED, bnc_connector, narrow_passage
@@ -19,17 +19,17 @@ from research.action_fuzzing.pouring import EarlyTilt
 from research.action_fuzzing.recompute import RecomputedViolation
 
 
-class Counter(Observer):
+class Counter(Callback):
     def __init__(self, env):
         self.decisions = 0
 
-    def begin(self):
+    def on_episode_start(self):
         self.decisions = 0
 
-    def see(self, decision):
+    def on_step(self, decision):
         self.decisions += 1
 
-    def end(self, row):
+    def on_episode_end(self, row):
         return {"decisions": self.decisions}
 
 
@@ -50,7 +50,12 @@ def test_actions_are_within_limits_and_follow_from_the_seed(name):
     np.testing.assert_array_equal(first, second)
     assert np.abs(first).max() <= 1.0
     changes = np.any(np.diff(first, axis=0) != 0.0, axis=1).sum()
-    assert {"white": changes == 49, "held": changes == 4, "corners": 0 < changes < 20, "stuck": changes == 0}[name]
+    assert {
+        "uniform_random": changes == 49,
+        "random_hold": changes == 4,
+        "bang_bang": 0 < changes < 20,
+        "random_corner": changes == 0,
+    }[name]
 
 
 def test_a_campaign_goes_on_where_it_was_stopped(tmp_path):
@@ -70,14 +75,14 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path):
 
 
 def test_a_witness_sees_every_decision_and_a_case_takes_further_options():
-    for hold in (1, 2):
-        row = run_campaign(BEAD, at_least(1), environment={"hold": hold})[0]
-        assert row["decisions"] == -(-row["steps"] // hold)
+    for action_repeat in (1, 2):
+        row = run_campaign(BEAD, at_least(1), environment={"action_repeat": action_repeat})[0]
+        assert row["decisions"] == -(-row["steps"] // action_repeat)
 
 
 def _tilted_at(*steps, state=0):
     """An episode of twenty control steps, two decisions of pouring, in which the command leans over in some."""
-    trace = Trace(20, 6, 0.01, {"state": 1})
+    trace = EpisodeTrace(20, 6, 0.01, {"state": 1})
     for step in range(20):
         pose = transform_to_pose(RigidTransform(RollPitchYaw(0.3 * (step in steps), 0.0, 0.5), [0.1, 0.0, 0.2]))
         trace.append(pose, pose, 0.0, 0.0, {"state": np.array([state])})
@@ -90,8 +95,8 @@ def _tilted_at(*steps, state=0):
 )
 def test_a_tilt_that_comes_too_early_is_seen_at_every_control_step(env, tilt):
     witness = EarlyTilt(env)
-    witness.begin()
-    assert witness.end({})["early_tilt"] == pytest.approx(tilt, abs=1e-9)
+    witness.on_episode_start()
+    assert witness.on_episode_end({})["early_tilt"] == pytest.approx(tilt, abs=1e-9)
 
 
 def test_numbers_that_are_none_are_counted():
@@ -109,15 +114,15 @@ def test_numbers_that_are_none_are_counted():
 MISLED = "what was said of a command is not what it was"
 SOUND = {
     "case": "one",
-    "actions": "white",
+    "actions": "uniform_random",
     "seed": 0,
     "constrained": 1,
     "waits": 0,
     "termination": "success",
     "steps": 3,
     "not_finite": 0,
-    "fallbacks": 0,
-    "worst_violation": -0.1,
+    "fallback_steps": 0,
+    "max_commanded_violation": -0.1,
     "recomputed_violation": -0.1,
     "collisions": 0,
     "peak_force": 5.0,
@@ -131,13 +136,13 @@ SOUND = {
         ({}, []),
         ({"termination": "simulation_failure"}, ["the simulation failed"]),
         ({"not_finite": 2}, ["something was not finite"]),
-        ({"fallbacks": 1}, ["a prediction failed"]),
-        ({"fallbacks": 1, "waits": 1}, []),
-        ({"worst_violation": 1e-6, "recomputed_violation": 1e-6}, ["a command violated the constraints"]),
+        ({"fallback_steps": 1}, ["a prediction failed"]),
+        ({"fallback_steps": 1, "waits": 1}, []),
+        ({"max_commanded_violation": 1e-6, "recomputed_violation": 1e-6}, ["a command violated the constraints"]),
         ({"recomputed_violation": 1e-6}, ["a command violated the constraints", MISLED]),
-        ({"worst_violation": float("nan")}, ["a command violated the constraints", MISLED]),
+        ({"max_commanded_violation": float("nan")}, ["a command violated the constraints", MISLED]),
         ({"recomputed_violation": -0.2}, [MISLED]),
-        ({"worst_violation": 1e-6, "constrained": 0}, []),
+        ({"max_commanded_violation": 1e-6, "constrained": 0}, []),
         ({"depth": 0.3}, ["depth beyond 0.2"]),
     ],
 )
@@ -171,15 +176,15 @@ def test_a_violation_is_recomputed_from_what_was_commanded(lie):
     base, recorded = env.unwrapped, env.unwrapped.trace.append
     base.trace.append = lambda commanded, *rest: recorded(commanded + [lie, 0.0], *rest)
     row = rollout(env, lambda observation: np.ones(2), RecomputedViolation(env), seed=0)
-    assert row["worst_violation"] > -1e-9, "it never came to the zone's edge"
-    assert row["recomputed_violation"] == pytest.approx(row["worst_violation"] + lie, abs=1e-15)
+    assert row["max_commanded_violation"] > -1e-9, "it never came to the zone's edge"
+    assert row["recomputed_violation"] == pytest.approx(row["max_commanded_violation"] + lie, abs=1e-15)
 
 
 def test_all_tasks_are_stressed_in_one_folder_and_go_on_there(tmp_path, monkeypatch):
     monkeypatch.setattr(campaign_module, "STRESSED", {"NarrowPassage": "narrow_passage", "GridClamp": "grid_clamp"})
     found = stress("all", steps=20, seed=5, out=tmp_path)
     assert found["wrong"] == []
-    assert found["worst_violation"] <= 1e-9
+    assert found["max_commanded_violation"] <= 1e-9
     assert found["control_steps"] == sum(
         len(read_ledger(tmp_path / "ledger" / task)) for task in ("NarrowPassage", "GridClamp")
     )

@@ -32,4 +32,4 @@ def test_a_run_that_fails_says_why(monkeypatch):
     said = subprocess.CompletedProcess([], 2, stderr="at work\nguiderail: hold must be at least 1\n")
     monkeypatch.setattr(cold_start.subprocess, "run", lambda *_, **__: said)
     with pytest.raises(InputError, match="hold must be at least 1"):
-        cold_start.measure("NarrowPassage", {"hold": -1}, episodes=1)
+        cold_start.measure("NarrowPassage", {"action_repeat": -1}, episodes=1)

@@ -15,14 +15,14 @@ def test_two_points_are_nearer_to_the_axis_than_the_area_between_them():
 
 
 def test_the_rims_lever_is_that_of_an_even_pressure_on_what_is_soft_and_falls_as_it_hardens():
-    soft, nominal = (engines._lever("rails", 2.0 * MM, modulus) for modulus in (0.01, 1.0))
+    soft, nominal = (engines._lever("gantry", 2.0 * MM, modulus) for modulus in (0.01, 1.0))
     assert soft == pytest.approx(even_lever(D, 2.0 * MM), rel=0.1)
     assert rigid_lever(D, 2.0 * MM) < nominal < 0.8 * soft
 
 
 def test_as_hard_as_it_is_the_rim_bears_a_plug_nearly_where_the_other_engine_says():
     pytest.importorskip("mujoco")
-    ours, theirs = (engines._lever(station, 2.0 * MM, 1.0) for station in ("rails", "mujoco"))
+    ours, theirs = (engines._lever(station, 2.0 * MM, 1.0) for station in ("gantry", "mujoco"))
     assert rigid_lever(D, 2.0 * MM) < theirs < ours == pytest.approx(theirs, rel=0.4)
 
 
@@ -30,10 +30,10 @@ def test_a_plug_drops_in_from_about_as_far_beside_as_it_is_drawn():
     """Drake's surfaces let it in from up to half as far again, at the plant's step: nothing may make that worse."""
     pytest.importorskip("mujoco")
     drawn = engines.NARROW.bore_clearance + engines.NARROW.mouth_chamfer
-    ours, theirs = (engines._capture(station) for station in ("rails", "mujoco"))
+    ours, theirs = (engines._capture(station) for station in ("gantry", "mujoco"))
     assert theirs == pytest.approx(drawn, abs=0.02 * MM)
     assert drawn < ours < 1.5 * drawn
-    assert engines._capture("rails", equal_area=True) == pytest.approx(drawn, abs=0.05 * MM)
+    assert engines._capture("gantry", equal_area=True) == pytest.approx(drawn, abs=0.05 * MM)
 
 
 def test_a_plug_that_slides_fast_over_a_sharp_rim_is_held_back_by_friction_alone_where_steps_are_short():

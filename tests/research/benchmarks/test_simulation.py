@@ -17,7 +17,7 @@ def test_systems_are_left_as_they_were():
 
 
 @pytest.mark.parametrize(
-    ("name", "contact"), [("rails", "CONTACT"), ("grid_clamp", "CLAMP_CONTACT"), ("pouring", "POUR_CONTACT")]
+    ("name", "contact"), [("gantry", "CONTACT"), ("grid_clamp", "CLAMP_CONTACT"), ("pouring", "POUR_CONTACT")]
 )
 def test_pythons_share_is_a_part_of_the_whole(monkeypatch, name, contact):
     monkeypatch.setattr("research.benchmarks.simulation.REPEATS", 1)

@@ -5,9 +5,9 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import NullPolicy
+from guiderail.tools.evaluation.baselines import BaselinePolicy
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from research.figures.chapter_5 import _first
 
 
@@ -18,7 +18,7 @@ def sometimes(rng, size):
 
 
 def acting(seed):
-    return Shown("Bead", {}, lambda env: NullPolicy(sometimes, env, seed=seed), "at random", "", seed=5)
+    return EpisodeSpec("Bead", {}, lambda env: BaselinePolicy(sometimes, env, seed=seed), "at random", "", seed=5)
 
 
 @pytest.mark.parametrize("success", [True, False])

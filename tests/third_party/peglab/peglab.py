@@ -8,23 +8,23 @@ from pydantic import Field
 from pydrake.systems.framework import Context, Diagram
 
 from guiderail import (
-    Condition,
+    FunctionGuidance,
     Guidance,
-    Known,
-    LawGuidance,
     LinearConstraints,
-    Observed,
+    ObservationTerm,
     Options,
+    PriorKnowledge,
     ReferenceTrajectory,
     RewardTerm,
     Station,
     Task,
+    TerminationTerm,
     register_guidance,
     register_task,
 )
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.learner import Learner, register_learner
 
 NUM_STEPS, PERIOD = 80, 0.02
@@ -40,15 +40,15 @@ class SlotOptions(Options):
 class Slot(Task):
     """Through a slot and on to a goal that two demonstrations never quite reach."""
 
-    world_kind = "plane"
+    workcell_kind = "plane"
     Options = SlotOptions
     options: SlotOptions
-    defaults = {"guidance": "kgrl", "hold": 5}
+    defaults = {"guidance": "kgrl", "action_repeat": 5}
     num_steps = NUM_STEPS
     clip = 1.0
-    draws_held_out = True
+    has_held_out_distribution = True
 
-    def world(self) -> PassageGeometry:
+    def workcell(self) -> PassageGeometry:
         middle = 0.35
         gap = (middle - self.options.width / 2, middle + self.options.width / 2)
         return PassageGeometry(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=gap)
@@ -62,15 +62,15 @@ class Slot(Task):
     def constraints(self) -> LinearConstraints:
         return LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
 
-    def observed(self) -> Sequence[Observed]:
-        return (Observed("phase"), Observed("pose", 0.5, 0.5))
+    def observation_terms(self) -> Sequence[ObservationTerm]:
+        return (ObservationTerm("phase"), ObservationTerm("pose", 0.5, 0.5))
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        goal = np.array(self.world().goal)
+        goal = np.array(self.workcell().goal)
         return [RewardTerm("nearness", {"pose": 2}, lambda pose: -float(np.linalg.norm(pose - goal)))]
 
-    def conditions(self) -> list[Condition]:
-        return [Condition("success", {"pose": 2}, self.world().at_goal)]
+    def termination_terms(self) -> list[TerminationTerm]:
+        return [TerminationTerm("success", {"pose": 2}, self.workcell().at_goal)]
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
@@ -87,9 +87,9 @@ class OffsetOptions(Options):
 
 
 @register_guidance("peglab_offset", label="offset", options=OffsetOptions)
-def offset(known: Known) -> Guidance:
+def offset(known: PriorKnowledge) -> Guidance:
     """Commands the measured pose and what the policy adds."""
-    return LawGuidance(known, lambda action, pose, wrench: pose + known.options["reach"] * action, action_size=2)
+    return FunctionGuidance(known, lambda action, pose, wrench: pose + known.options["reach"] * action, action_size=2)
 
 
 @register_learner("peglab_hill_climbing")
@@ -102,17 +102,17 @@ class HillClimbing(Learner):
         self.best = np.zeros((self.space.shape[0], env.observation_space.shape[0] + 1))
         self.score, self.tried, self.total = -np.inf, self.best, 0.0
 
-    def begin(self) -> None:
+    def on_episode_start(self) -> None:
         self.tried = self.best + 0.3 * self.rng.standard_normal(self.best.shape)
         self.total = 0.0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         return np.tanh(self.tried @ np.append(observation, 1.0)).astype(np.float32)
 
-    def see(self, decision: Decision) -> None:
+    def on_step(self, decision: Transition) -> None:
         self.total += decision.reward
 
-    def end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         if self.total > self.score:
             self.best, self.score = self.tried, self.total
         return {}

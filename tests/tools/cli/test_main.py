@@ -40,7 +40,7 @@ def trained(bead_run):
         (["train", "NarrowPassage", "--out", "new", "--guidance", "magic"], "kmp, none, residual, safe_residual"),
         (["train", "Bead", "--out", "new", "--algorithm", "ppo"], "sac, tqc"),
         (["train", "Bead", "--out", "new", "--preset", "robst"], "did you mean robust?"),
-        (["train", "Bead", "--out", "new", "--uncertainty", "disc"], "no option 'uncertainty'"),
+        (["train", "Bead", "--out", "new", "--fixture-offset", "per_episode"], "no option 'uncertainty'"),
         (["train", "Bead", "--out", "new", "--episodes", "0"], "at least one episode"),
         (["train", "Bead", "--out", "new", "--episodes", "many"], "see guiderail train --help"),
         (["train", "Bead", "--out", "new", "--seed", "-1"], "a seed is a whole number"),
@@ -51,7 +51,7 @@ def trained(bead_run):
         (["train", "--resume", "--out", "new"], "not a run"),
         (["train", "Bead", "--fast"], "no option --fast"),
         (["train", "Bead", "--epsiodes", "3"], "did you mean --episodes?"),
-        (["train", "Bead", "--out", "new", "--env", "hold"], "--env takes name=value"),
+        (["train", "Bead", "--out", "new", "--env", "action_repeat"], "--env takes name=value"),
         (["train", "Bead", "--out", "new", "--env", "hodl=2"], "did you mean hold?"),
         (["train", "Bead", "--out", "new", "--env", "hold=two"], "give a value such as 1"),
         (["train", "Bead", "--out", "new", "--env", "wall=[1, 2]"], "give a value such as 1.0"),
@@ -105,10 +105,10 @@ def trained(bead_run):
         (["check", "pouring", "--fit"], "this is a skill: leave it out"),
         (["serve-iiwa", "--seconds", "nan"], "seconds must be a positive number, not nan"),
         (["serve-iiwa", "--seconds", "-1"], "seconds must be a positive number, not -1"),
-        (["serve-iiwa", "--patience", "0"], "patience must be a positive number, not 0"),
+        (["serve-iiwa", "--command-timeout", "0"], "patience must be a positive number, not 0"),
         (["serve-iiwa", "--offset", "1.5,0"], "offset cannot be (1.5, 0.0): give x and y in metres"),
         (["serve-iiwa", "--rate", "0"], "a rate up to 1 of the wall's, not 0"),
-        (["run", "new", "--rehearse", "--lcm-url", "udpm://239.255.76.67:7667"], "a bus of its own"),
+        (["run", "new", "--sim", "--lcm-url", "udpm://239.255.76.67:7667"], "a bus of its own"),
         (["generate", "objects"], "nothing called 'objects'"),
         (["generate", "clamp-objects", "--out", "none"], "make it first"),
         (["list", "metrix"], "did you mean metrics?"),
@@ -127,7 +127,7 @@ def test_what_makes_no_sense_is_one_sentence_and_touches_nothing(arguments, says
 
 @pytest.mark.parametrize("policy", ["none", "white,rule", "whit"])
 def test_in_a_robots_episodes_one_policy_acts_that_there_is(policy, capsys, trained):
-    code, out, err = call(capsys, "run", trained, "--rehearse", "--episodes", 1, "--policy", policy)
+    code, out, err = call(capsys, "run", trained, "--sim", "--episodes", 1, "--policy", policy)
     assert (code, out) == (2, "")
     assert f"Bead has no policy {policy!r}" in err
     assert err.count("\n") == 1
@@ -159,7 +159,7 @@ def test_a_demo_replaces_no_run_that_is_none_of_its_own(capsys, trained):
 
 
 def test_training_leaves_the_whole_folder(capsys, tmp_path):
-    options = ["--episodes", 2, "--set", "units=8", "--json"]
+    options = ["--episodes", 2, "--set", "net_arch=8", "--json"]
     code, out, err = call(capsys, "train", "Bead", "--out", tmp_path / "run", *options)
     assert code == 0
     assert json.loads(out)["episodes"] == 2
@@ -174,7 +174,13 @@ def test_evaluation_can_be_read_by_a_program(capsys, trained):
     assert code == 0
     assert "series 1 of 4: the policy 3/3" in err
     result = json.loads(out)
-    assert {"success_rate", "demonstration_success_rate", "episodes", "worst_violation", "peak_force"} <= result.keys()
+    assert {
+        "success_rate",
+        "demonstration_success_rate",
+        "episodes",
+        "max_commanded_violation",
+        "peak_force",
+    } <= result.keys()
     assert result["episodes"] == 3
     assert 0 <= result["success_rate"] <= 1
 
@@ -212,7 +218,7 @@ def test_every_help_has_an_example_that_can_be_typed_and_starts_nothing(command,
 
 def test_help_names_the_choices(capsys):
     for command, words in (
-        ("train", ("NarrowPassage", "skgrl", "tqc", "robust")),
+        ("train", ("NarrowPassage", "skgrl", "tqc", "tqc_contact")),
         ("study", ("connector_disc", "smoothness")),
         ("reproduce", ("table 3.3", "5.10")),
         ("bench", ("primitive", "simulation", "learner", "training", "Pouring")),
@@ -252,10 +258,10 @@ def test_the_version_is_the_packages(capsys):
 
 
 def test_any_option_of_an_environment_can_be_trained_with(capsys, tmp_path):
-    options = ["--env", "hold=3", "--env", "wall=0.75", "--episodes", 1, "--set", "units=8"]
+    options = ["--env", "hold=3", "--env", "wall=0.75", "--episodes", 1, "--set", "net_arch=8"]
     assert call(capsys, "train", "Bead", "--out", tmp_path / "run", *options)[0] == 0
     environment = RunFolder(tmp_path / "run").config().environment
-    assert (environment["hold"], environment["wall"]) == (3, 0.75)
+    assert (environment["action_repeat"], environment["wall"]) == (3, 0.75)
 
 
 @pytest.mark.parametrize(
@@ -281,7 +287,7 @@ def test_lists_can_be_read_by_a_program(capsys):
     listed = json.loads(call(capsys, "list", "--json")[1])
     assert {"tasks", "guidance", "learners", "presets", "studies", "figures"} <= listed.keys()
     assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
-    assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["hold"]
+    assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["action_repeat"]
     assert "ten in a row" in call(capsys, "list", "metrics")[1]
     # What `hard` stands for can be given option by option.
     assert "offset_range=[0.0026,0.003]" in call(capsys, "list", "BncConnector")[1]

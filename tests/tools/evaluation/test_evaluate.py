@@ -6,8 +6,8 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import NullPolicy, still, white
-from guiderail.tools.evaluation.evaluate import COMPARED, cached, claim, evaluate, evaluate_policy
+from guiderail.tools.evaluation.baselines import BaselinePolicy, still, uniform_random
+from guiderail.tools.evaluation.evaluate import COMPARED, cached, evaluate, evaluate_policy, evaluation_scope
 from guiderail.tools.learning.run_folder import RunFolder
 
 
@@ -52,32 +52,32 @@ def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_run, capsy
 def test_what_learned_nothing_meets_the_same_episodes_once(bead_run, capsys):
     policies = {
         "zero": still,
-        "white": partial(NullPolicy, white),
+        "uniform_random": partial(BaselinePolicy, uniform_random),
         "other": lambda env: lambda observation: np.zeros(7),
     }
-    first = evaluate(bead_run, episodes=3, beside=policies)
-    assert first["beside"] == ["demonstration", "zero", "white"]
+    first = evaluate(bead_run, episodes=3, baselines=policies)
+    assert first["baselines"] == ["demonstration", "zero", "uniform_random"]
     for name in COMPARED:
         assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
     assert first["white_mean_return"] != first["zero_mean_return"]
     assert "series 4 of 5: white noise 3/3" in capsys.readouterr().err
-    again = evaluate(bead_run, episodes=3, beside=policies)
+    again = evaluate(bead_run, episodes=3, baselines=policies)
     said = capsys.readouterr().err
     for who in ("series 2 of 5: demonstration alone", "series 4 of 5: white noise"):
         assert f"{who}: kept from before, and not run again" in said
         assert f"{who} 3/3" not in said
     assert again == first
-    assert evaluate(bead_run, episodes=4, beside=policies)["white_mean_return"] != first["white_mean_return"]
+    assert evaluate(bead_run, episodes=4, baselines=policies)["white_mean_return"] != first["white_mean_return"]
 
 
 def test_a_policy_for_one_offset_and_one_for_any_are_two_claims(bead_run):
-    one = claim("BncConnector", {"uncertainty": "calibration"}, fresh=False)
-    for_any = claim("BncConnector", {"uncertainty": "calibration"}, fresh=True)
+    one = evaluation_scope("BncConnector", {"fixture_offset": "per_run"}, resample_offsets=False)
+    for_any = evaluation_scope("BncConnector", {"fixture_offset": "per_run"}, resample_offsets=True)
     assert "the one offset that is hidden in this run" in one
-    assert for_any == claim("GridClamp", {"uncertainty": "disc"}, fresh=False) != one
-    assert evaluate(bead_run, episodes=1)["claim"] == "a policy for starts that training never drew"
+    assert for_any == evaluation_scope("GridClamp", {"fixture_offset": "per_episode"}, resample_offsets=False) != one
+    assert evaluate(bead_run, episodes=1)["evaluation_scope"] == "a policy for starts that training never drew"
     with pytest.raises(InputError, match="hides nothing that could be drawn anew: leave --fresh out"):
-        evaluate(bead_run, episodes=1, fresh=True)
+        evaluate(bead_run, episodes=1, resample_offsets=True)
 
 
 def test_what_a_run_hid_is_not_among_what_is_drawn_anew(bead_run, monkeypatch):
@@ -85,11 +85,11 @@ def test_what_a_run_hid_is_not_among_what_is_drawn_anew(bead_run, monkeypatch):
     own = RunFolder(bead_run).config().seed
     for seed, episodes in ((own, 1), (own - 2, 3)):
         with pytest.raises(InputError, match="hides what the run itself hid"):
-            evaluate(bead_run, episodes=episodes, seed=seed, fresh=True)
+            evaluate(bead_run, episodes=episodes, seed=seed, resample_offsets=True)
 
 
 def test_what_is_hidden_in_a_run_is_drawn_anew_only_where_that_is_asked_for():
-    env = make_environment("BncConnector", {"uncertainty": "calibration"})
+    env = make_environment("BncConnector", {"fixture_offset": "per_run"})
     env.reset(seed=3)
     for options, places in (({}, 1), ({"new_run": True}, 3)):
         drawn = [env.reset(seed=seed, options={"held_out": True} | options)[1]["jack_offset"] for seed in (7, 8, 9)]

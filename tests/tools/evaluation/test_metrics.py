@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS, converged_after, first_in_a_row, summary
+from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS, episodes_to_convergence, first_in_a_row, summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
 
 
@@ -18,7 +18,7 @@ def episodes(successes="", **columns):
     [("1" * 10, 0), ("0" + "1" * 10, 1), ("1" * 9, None), ("1" * 9 + "0" + "1" * 12, 10), ("", None)],
 )
 def test_converged_after_is_how_many_came_before_ten_in_a_row(successes, episode):
-    assert converged_after(episodes(successes)) == episode
+    assert episodes_to_convergence(episodes(successes)) == episode
 
 
 def test_first_in_a_row_is_before_the_first_of_them():
@@ -33,9 +33,9 @@ def test_a_collision_and_an_episode_that_ends_in_one_are_two_numbers():
 
 
 def test_what_is_no_number_does_not_hide_behind_what_is():
-    rows = episodes("11", worst_violation=[-1.0, np.nan], peak_force=[np.nan, 2.0])
-    found = summary(rows, ("worst_violation", "violating_episodes", "peak_force"))
-    assert np.isnan(found["worst_violation"])
+    rows = episodes("11", max_commanded_violation=[-1.0, np.nan], peak_force=[np.nan, 2.0])
+    found = summary(rows, ("max_commanded_violation", "violating_episodes", "peak_force"))
+    assert np.isnan(found["max_commanded_violation"])
     assert np.isnan(found["peak_force"])
     assert found["violating_episodes"] == 1
 
@@ -91,13 +91,13 @@ def test_without_a_ledger_what_the_trace_saw_is_counted(gone):
     touches = env.unwrapped.trace.force > 0
     assert row["collision_steps"] == touches.sum() > 0
     assert row["collisions"] == (np.diff(touches, prepend=False) & touches).sum()
-    assert row["saturations"] == env.unwrapped.trace.signals["saturation"].any(axis=1).sum()
+    assert row["saturated_steps"] == env.unwrapped.trace.signals["saturation"].any(axis=1).sum()
 
 
 def test_what_was_demonstrated_is_no_success_of_the_learner():
     rows = episodes("1" * 12 + "00" + "1" * 10, demonstrated=[1] * 12 + [0] * 12)
-    assert converged_after(rows) == 14
-    assert converged_after(episodes("1" * 12, demonstrated=[1] * 12)) is None
+    assert episodes_to_convergence(rows) == 14
+    assert episodes_to_convergence(episodes("1" * 12, demonstrated=[1] * 12)) is None
     found = summary(rows, ("success_rate", "success_low", "success_rate_last_10"))
     assert found["success_rate"] == pytest.approx(10 / 12)
     assert found["success_low"] == pytest.approx(0.5520, abs=1e-3)

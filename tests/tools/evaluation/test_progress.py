@@ -7,7 +7,7 @@ from guiderail.tools.evaluation.progress import EpisodeProgress
 
 def rows(count):
     return [
-        {"episode": i, "success": int(i % 2), "return": 10.0, "worst_violation": -1.0 if i < 3 else 2e-3}
+        {"episode": i, "success": int(i % 2), "return": 10.0, "max_commanded_violation": -1.0 if i < 3 else 2e-3}
         for i in range(count)
     ]
 
@@ -34,7 +34,7 @@ def test_an_evaluation_says_the_mean_of_all_its_episodes():
     last, whole = EpisodeProgress(40), EpisodeProgress(40, window=None)
     for i in range(40):
         for progress in (last, whole):
-            progress.update({"episode": i, "success": int(i >= 30), "return": 0.0, "worst_violation": -1.0})
+            progress.update({"episode": i, "success": int(i >= 30), "return": 0.0, "max_commanded_violation": -1.0})
     assert last.says().startswith("last 10: success 100%")
     assert whole.says().startswith("success 25%")
 

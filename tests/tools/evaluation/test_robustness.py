@@ -12,7 +12,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation import robustness as axes
 from guiderail.tools.evaluation import robustness as module
-from guiderail.tools.evaluation.baselines import NullPolicy, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, kept_file
 from guiderail.tools.evaluation.robustness import AXES, Axis, _Who, breaks, chosen_axes, draw, points, robustness
 from guiderail.tools.learning.run_folder import RunFolder
@@ -29,9 +29,9 @@ def run(bead_run, monkeypatch):
 
 def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):
     told = []
-    how = {"episodes": 3, "beside": {"white": partial(NullPolicy, white)}, "tell": told.append}
+    how = {"episodes": 3, "baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)}, "tell": told.append}
     first = robustness([run], **how)
-    assert {row["who"] for row in first["rows"]} == {"policy", "demonstration", "white"}
+    assert {row["who"] for row in first["rows"]} == {"policy", "demonstration", "uniform_random"}
     assert [row["value"] for row in first["rows"] if row["who"] == "policy"] == [-0.5, 1.0]
     assert all(row["success_low"] <= row["success_rate"] <= row["success_high"] for row in first["rows"])
     assert "4/6 wall 1 policy 3/3" in capsys.readouterr().err
@@ -43,8 +43,8 @@ def test_each_place_is_judged_once_and_what_was_done_is_used_again(run, capsys):
 
 
 def test_another_question_leaves_the_answer_to_the_first(run, monkeypatch):
-    asked = [{}, {"axes": "wall"}, {"environment": {"hold": 2}}]
-    asked += [{"episodes": 2}, {"seed": 7}, {"beside": {"white": partial(NullPolicy, white)}}]
+    asked = [{}, {"axes": "wall"}, {"environment": {"action_repeat": 2}}]
+    asked += [{"episodes": 2}, {"seed": 7}, {"baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)}}]
     monkeypatch.setattr(module, "EPISODES", 1)
     tables = [robustness([run], **{"episodes": 1, **one})["table"] for one in asked]
     words = ["", "-wall", "-hold=2", "-episodes=2", "-seed=7", "-white"]
@@ -138,10 +138,10 @@ def test_a_policy_that_learned_with_a_whole_range_is_judged_at_each_value_of_it(
     assert {point.axis.name: point.trained for point in found} == {"friction": None, "stiffness": None, "lost": 0.0}
 
 
-@pytest.mark.parametrize(("uncertainty", "anew"), [("calibration", True), ("disc", False)])
-def test_offsets_that_a_run_hides_are_drawn_anew_in_every_episode_of_their_axis_alone(uncertainty, anew):
+@pytest.mark.parametrize(("fixture_offset", "anew"), [("per_run", True), ("per_episode", False)])
+def test_offsets_that_a_run_hides_are_drawn_anew_in_every_episode_of_their_axis_alone(fixture_offset, anew):
     """What is drawn in every episode anyway is asked for as before, and found where it was kept."""
-    found, _ = points("BncConnector", {"uncertainty": uncertainty}, AXES)
+    found, _ = points("BncConnector", {"fixture_offset": fixture_offset}, AXES)
     for point in found:
         assert point.options == ({"new_run": True} if anew and point.axis.name == "offsets" else {})
 
@@ -150,9 +150,11 @@ def test_everybody_meets_a_new_offset_in_every_episode_and_what_was_kept_of_one_
     bead_config, tmp_path, monkeypatch
 ):
     """Of a learned policy, here one that stands still, and of who acts beside it."""
-    environment = check_environment("BncConnector", {"uncertainty": "calibration", "guidance": "kgrl", "hold": 25})
+    environment = check_environment(
+        "BncConnector", {"fixture_offset": "per_run", "guidance": "kgrl", "action_repeat": 25}
+    )
     config = replace(bead_config, task="BncConnector", environment=environment)
-    met = {"policy": [], "white": []}
+    met = {"policy": [], "uniform_random": []}
 
     def watching(name):
         def acts(env):
@@ -170,11 +172,11 @@ def test_everybody_meets_a_new_offset_in_every_episode_and_what_was_kept_of_one_
     (offsets,) = chosen_axes("offsets")
     monkeypatch.setattr("guiderail.tools.evaluation.robustness._policies", one)
     monkeypatch.setattr(axes, "AXES", (replace(offsets, values=(2.0,)),))
-    robustness([tmp_path], episodes=2, beside={"white": watching("white")}, out=tmp_path)
+    robustness([tmp_path], episodes=2, baselines={"uniform_random": watching("uniform_random")}, out=tmp_path)
     # In the run's own place, the first, it is only asked whether it suits the environment.
     places = {name: set(seen) - {seen[0]} for name, seen in met.items()}
     assert len(places["policy"]) == 2
-    assert places["policy"] == places["white"]
+    assert places["policy"] == places["uniform_random"]
     assert all(2.0 * MM <= np.hypot(*place) <= 3.0 * MM for place in places["policy"])
     (point,), _ = points("BncConnector", environment, axes.AXES)
     before = kept_file(tmp_path / "episodes", "policy", config, point.environment, episodes=2, seed=HELD_OUT_SEED)
@@ -185,5 +187,5 @@ def test_everybody_meets_a_new_offset_in_every_episode_and_what_was_kept_of_one_
 
 def test_offsets_go_up_to_twice_the_trained_ones():
     (offsets,) = chosen_axes("offsets")
-    found, _ = points("BncConnector", {"uncertainty": "disc"}, [offsets])
+    found, _ = points("BncConnector", {"fixture_offset": "per_episode"}, [offsets])
     assert found[-1].environment["offset_range"] == (0.0, 2.0 * 1.5e-3)

@@ -4,28 +4,28 @@ import gymnasium
 import numpy as np
 
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import NULL_POLICIES, NullPolicy
+from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
 from guiderail.tools.evaluation.metrics import COLUMNS
-from guiderail.tools.evaluation.rollout import Observer, rollout
+from guiderail.tools.evaluation.rollout import Callback, rollout
 
 
-class Diary(Observer):
+class Diary(Callback):
     def __init__(self):
         self.said = []
 
-    def begin(self):
+    def on_episode_start(self):
         self.said.append("begin")
 
-    def see(self, decision):
+    def on_step(self, decision):
         self.said.append(decision)
 
-    def end(self, row):
+    def on_episode_end(self, row):
         self.said.append("end")
         return {"decisions": len(self.said) - 2}
 
 
 def test_observers_see_an_episode_from_its_beginning_to_its_end():
-    env, diary = make_environment("Bead", {"hold": 2}), Diary()
+    env, diary = make_environment("Bead", {"action_repeat": 2}), Diary()
     row = rollout(env, lambda observation: np.array([0.5, -1.0]), diary, index=7, seed=3)
     first, *decisions, last = diary.said
     assert (first, last) == ("begin", "end")
@@ -51,8 +51,8 @@ def test_the_same_seed_is_the_same_episode_and_held_out_ones_are_others():
 def test_a_policy_that_watches_is_told_once():
     env, told = make_environment("Bead", {}), []
 
-    class Policy(Observer):
-        def begin(self):
+    class Policy(Callback):
+        def on_episode_start(self):
             told.append("begin")
 
         def __call__(self, observation):
@@ -74,27 +74,27 @@ def test_an_episode_whose_simulation_failed_has_a_row_too():
     row = rollout(Failing(make_environment("Bead", {})), lambda observation: np.zeros(2), seed=0)
     assert row["termination"] == "simulation_failure"
     assert (row["steps"], row["success"], row["collisions"]) == (1, 0, 0)
-    assert (row["worst_violation"], row["peak_force"]) == (0.25, 1.0)
+    assert (row["max_commanded_violation"], row["peak_force"]) == (0.25, 1.0)
 
 
-def acted(policy: NullPolicy, episodes: int) -> np.ndarray:
+def acted(policy: BaselinePolicy, episodes: int) -> np.ndarray:
     actions = []
     for _ in range(episodes):
-        policy.begin()
+        policy.on_episode_start()
         actions.append([policy(np.zeros(3)) for _ in range(5)])
     return np.array(actions)
 
 
 def test_null_policies_are_what_their_names_say():
     env = make_environment("Bead", {})
-    zero, white, constant = (
-        acted(NullPolicy(NULL_POLICIES[name], env, 3), 4) for name in ("zero", "white", "constant")
+    zero, uniform_random, constant = (
+        acted(BaselinePolicy(BASELINES[name], env, 3), 4) for name in ("zero", "uniform_random", "constant")
     )
     assert not zero.any()
-    assert len(np.unique(white.reshape(-1, 2), axis=0)) == 20
+    assert len(np.unique(uniform_random.reshape(-1, 2), axis=0)) == 20
     assert (constant == constant[:, :1]).all()
     assert len(np.unique(constant[:, 0], axis=0)) == 4
-    for name, actions in (("white", white), ("constant", constant)):
+    for name, actions in (("uniform_random", uniform_random), ("constant", constant)):
         assert np.abs(actions).max() <= 1.0
-        np.testing.assert_array_equal(acted(NullPolicy(NULL_POLICIES[name], env, 3), 4), actions)
-        assert not np.array_equal(acted(NullPolicy(NULL_POLICIES[name], env, 4), 4), actions)
+        np.testing.assert_array_equal(acted(BaselinePolicy(BASELINES[name], env, 3), 4), actions)
+        assert not np.array_equal(acted(BaselinePolicy(BASELINES[name], env, 4), 4), actions)

@@ -11,7 +11,7 @@ from guiderail.tools.experiments.progress import Board
 def job(folder: Path, seed: int):
     (folder / f"run-{seed}").mkdir()
     run = SimpleNamespace(path=folder / f"run-{seed}")
-    return SimpleNamespace(method="kgrl", seed=seed, marks=[2, 4], folder=run, log=folder / f"{seed}.txt")
+    return SimpleNamespace(method="kgrl", seed=seed, after_episodes=[2, 4], folder=run, log=folder / f"{seed}.txt")
 
 
 def begin(one, episodes, workers=1):
@@ -47,5 +47,5 @@ def test_a_log_file_gets_a_line_for_each_that_ends(tmp_path):
     one, console = job(tmp_path, 0), Console(file=io.StringIO())
     with Board({0: one}, 1, console) as board:
         begin(one, 4, workers=2)
-        board.end(0, one, Outcome(({"judged_on": "held out", "success_rate": 0.5},)))
+        board.end(0, one, Outcome(({"eval_set": "held out", "success_rate": 0.5},)))
     assert console.file.getvalue() == "1/1 kgrl, seed 0: held out 50% (by worker 2, those before it were lost)\n"

@@ -12,7 +12,7 @@ from guiderail.tools.environments import import_modules, make_environment
 from guiderail.tools.evaluation.baselines import always
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import STATISTICS
-from guiderail.tools.experiments.declaration import JudgedOn, Ratio, Study, load_study, shipped_studies
+from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study, shipped_studies
 from guiderail.tools.experiments.engines.engine import make_engine
 from guiderail.tools.experiments.study import (
     Job,
@@ -29,14 +29,14 @@ from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import read_table
 
-SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
+SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
 BEAD = {
     "name": "beads",
     "task": "Bead",
     "learner": {"settings": SETTINGS},
     "methods": {"learner": {}},
     "seeds": [5, 6],
-    "marks": [2, 4],
+    "after_episodes": [2, 4],
     "judged on": [{"episodes": 3}],
 }
 
@@ -58,7 +58,7 @@ def written(folder):
 
 
 def test_there_is_a_row_for_every_method_seed_mark_and_what_is_judged_on(tmp_path):
-    methods = {"learner": {}, "nothing": {"policy": "zero"}, "anything": {"policy": "white", "seeds": [9]}}
+    methods = {"learner": {}, "nothing": {"policy": "zero"}, "anything": {"policy": "uniform_random", "seeds": [9]}}
     judged = [{"episodes": 2}, {"name": "far away", "episodes": 3, "env": {"wall": -0.5}}]
     rows = run(study(methods=methods, **{"judged on": judged}), tmp_path)
     expected = [
@@ -66,10 +66,10 @@ def test_there_is_a_row_for_every_method_seed_mark_and_what_is_judged_on(tmp_pat
         *(("nothing", seed, 0, name) for seed in (5, 6) for name in ("held out", "far away")),
         *(("anything", 9, 0, name) for name in ("held out", "far away")),
     ]
-    assert list(rows[["method", "seed", "mark", "judged_on"]].itertuples(index=False, name=None)) == expected
-    assert rows[rows["judged_on"] == "far away"]["success_rate"].eq(0).all()
-    assert rows[rows["judged_on"] == "far away"]["episodes"].eq(3).all()
-    assert rows[rows["method"] == "learner"]["training_episodes"].eq(rows["mark"][:8]).all()
+    assert list(rows[["method", "seed", "after_episodes", "eval_set"]].itertuples(index=False, name=None)) == expected
+    assert rows[rows["eval_set"] == "far away"]["success_rate"].eq(0).all()
+    assert rows[rows["eval_set"] == "far away"]["episodes"].eq(3).all()
+    assert rows[rows["method"] == "learner"]["training_episodes"].eq(rows["after_episodes"][:8]).all()
     assert rows[rows["method"] == "nothing"]["training_success_rate"].isna().all()
 
 
@@ -79,14 +79,14 @@ def test_a_finished_study_is_not_touched_and_one_that_was_stopped_goes_on_to_the
     before = written(whole)
     assert without_clock(run(study(), whole)) == without_clock(expected)
     assert written(whole) == before
-    run(study(marks=[2], seeds=[5]), parts)
+    run(study(after_episodes=[2], seeds=[5]), parts)
     assert without_clock(run(study(), parts)) == without_clock(expected)
 
 
 def test_a_run_that_fails_stops_no_other_and_is_named_at_the_end(tmp_path, capsys):
     file, out = tmp_path / "beads.yaml", tmp_path / "out"
     expected = run(study(), tmp_path / "undisturbed")
-    run(study(marks=[2]), out)
+    run(study(after_episodes=[2]), out)
     checkpoint = out / "learner-5" / "checkpoint" / "state.safetensors"
     whole = checkpoint.read_bytes()
     checkpoint.write_bytes(whole[:-1000])
@@ -120,8 +120,8 @@ def test_a_study_names_what_registers_its_task(tmp_path):
         "    gymnasium.register('guiderail/Pearl-v0', entry_point=bead.Bead)\n"
     )
     with pytest.raises(InputError, match="there is none for"):
-        run(study(task="Pearl", imports=[str(tmp_path / "perl.py")], marks=[2]), tmp_path / "out")
-    rows = run(study(task="Pearl", imports=[str(file)], seeds=[5], marks=[2]), tmp_path / "out")
+        run(study(task="Pearl", imports=[str(tmp_path / "perl.py")], after_episodes=[2]), tmp_path / "out")
+    rows = run(study(task="Pearl", imports=[str(file)], seeds=[5], after_episodes=[2]), tmp_path / "out")
     assert rows["seed"].tolist() == [5]
     assert RunFolder(tmp_path / "out" / "learner-5").config().imports == (str(file),)
 
@@ -135,7 +135,7 @@ def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
     run(study(**{"judged on": []}), tmp_path)
     late, expected = run(study(), tmp_path), run(study(), tmp_path / "other")
     assert without_clock(late) == without_clock(expected)
-    for mark in (tmp_path / "learner-5" / "marks").iterdir():
+    for mark in (tmp_path / "learner-5" / "after_episodes").iterdir():
         for file in mark.iterdir():
             file.unlink()
         mark.rmdir()
@@ -161,30 +161,30 @@ def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
         "if 'guiderail/Twin-v0' not in gymnasium.registry:\n"
         "    gymnasium.register('guiderail/Twin-v0', entry_point=bead.Bead)\n"
     )
-    white = {"methods": {"anything": {"policy": "white"}}, "folder": "{method}", "seeds": [5]}
+    uniform_random = {"methods": {"anything": {"policy": "uniform_random"}}, "folder": "{method}", "seeds": [5]}
     out = tmp_path / "out"
     for changed in ({}, {"seeds": [6]}, {"task": "Twin", "imports": [str(tmp_path / "pearl.py")]}):
-        run(study(**(white | changed)), out)
+        run(study(**(uniform_random | changed)), out)
     assert len(list((out / "anything").glob("held_out-0-*.csv"))) == 3
     named = {"judged on": [{"episodes": 3, "file": "held_out.csv"}]}
-    run(study(**white, **named), out)
+    run(study(**uniform_random, **named), out)
     before = written(out)
-    run(study(**white, **named), out)
+    run(study(**uniform_random, **named), out)
     assert written(out) == before
     for changed in ({"env": {"wall": -0.5}}, {"seeds": [6]}, {"judged on": [{"episodes": 4, "file": "held_out.csv"}]}):
         with pytest.raises(InputError, match="episodes of another study"):
-            run(study(**(white | named | changed)), out)
+            run(study(**(uniform_random | named | changed)), out)
     assert written(out) == before
 
 
 def test_a_study_says_in_what_its_methods_differ_from_the_thesis():
-    study = load_study("connector_hard").only(["kgrl", "skgrl", "white", "rule"])
+    study = load_study("connector_hard").only(["kgrl", "skgrl", "uniform_random", "scripted"])
     told = differing(study)
     assert "reward aligned (thesis: sparse)" in told["all methods"]
     assert any(words.startswith("difficulty 'hard', which is ours") for words in told["all methods"])
     assert any("checkpoint selection" in words for words in told["kgrl"])
     assert any("ρ" in words for words in told["skgrl"])
-    assert not any("checkpoint selection" in words for words in differences_of(study, "white"))
+    assert not any("checkpoint selection" in words for words in differences_of(study, "uniform_random"))
     for method in study.methods:
         own = [one for methods, words in told.items() if method in methods.split(", ") for one in words]
         assert sorted([*told["all methods"], *own]) == sorted(differences_of(study, method))
@@ -206,7 +206,7 @@ def test_results_that_are_older_than_an_option_are_of_its_default():
 
 
 def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_path):
-    run(study(seeds=[5], marks=[2]), tmp_path)
+    run(study(seeds=[5], after_episodes=[2]), tmp_path)
     before = written(tmp_path)
     with pytest.raises(InputError, match="another learner"):
         run(study(learner={"settings": SETTINGS | {"batch_size": 8}}), tmp_path)
@@ -243,7 +243,7 @@ def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
         {
             "name": "passage",
             "task": "NarrowPassage",
-            "methods": {"anything": {"policy": "white"}},
+            "methods": {"anything": {"policy": "uniform_random"}},
             "seeds": [0],
             "judged on": [{"episodes": 1}],
         }
@@ -253,7 +253,7 @@ def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
 
 
 def test_the_command_says_what_each_seed_came_to(tmp_path, capsys):
-    one = study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], marks=[2])
+    one = study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], after_episodes=[2])
     result = study_command(one, tmp_path, make_engine(processes=1))
     rows = read_table(tmp_path / "beads.csv")
     assert len(rows) == 2
@@ -283,13 +283,16 @@ WRONG = [
     ({"seeds": ["x"]}, "seeds"),
     ({"seeds": [True]}, "seeds, 0: input should be a valid integer, not True"),
     ({"methods": {"learner": {"seeds": [True]}}}, "input should be a valid integer, not True"),
-    ({"marks": [0]}, "greater than or equal to 1"),
-    ({"marks": [True]}, "input should be a valid integer, not True"),
-    ({"marks": [5], "learner": {"episodes": 1}}, "no method learns as long as the mark 5"),
-    ({"marks": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}}, "no method learns as long as the mark 5"),
+    ({"after_episodes": [0]}, "greater than or equal to 1"),
+    ({"after_episodes": [True]}, "input should be a valid integer, not True"),
+    ({"after_episodes": [5], "learner": {"episodes": 1}}, "no method learns as long as the mark 5"),
+    (
+        {"after_episodes": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}},
+        "no method learns as long as the mark 5",
+    ),
     ({"task": "NarrowPassage", "judged on": [{"options": {"held_otu": True}}]}, "did you mean held_out"),
     ({"task": "NarrowPassage", "judged on": [{"options": {"held_out": "far"}}]}, "held_out cannot be 'far'"),
-    ({"marks": [], "learner": {}}, "how long does learner learn"),
+    ({"after_episodes": [], "learner": {}}, "how long does learner learn"),
     ({"task": "Beat"}, "did you mean Bead"),
     ({"tsak": "Bead"}, "did you mean task"),
     ({"methods": {"learner": {"enf": {}}}}, "did you mean env"),
@@ -325,8 +328,8 @@ def test_what_makes_no_sense_is_one_sentence_and_nothing_is_written(changed, wor
 def test_a_mark_that_only_some_methods_reach_is_of_these():
     methods = {"short": {"learner": {"episodes": 2}}, "long": {}, "nothing": {"policy": "zero"}}
     one = study(methods=methods)
-    assert [Job(one, name, 5, None).marks for name in methods] == [[2], [2, 4], [0]]
-    assert study(methods={"nothing": {"policy": "zero"}}, learner={"episodes": 1}).marks == (2, 4)
+    assert [Job(one, name, 5, None).after_episodes for name in methods] == [[2], [2, 4], [0]]
+    assert study(methods={"nothing": {"policy": "zero"}}, learner={"episodes": 1}).after_episodes == (2, 4)
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "a: [", "", "\x00", "just words"])
@@ -365,19 +368,19 @@ def test_every_study_that_comes_along_makes_sense(name, tmp_path):
 
 def test_a_person_pours_and_the_constraints_are_why(tmp_path):
     declared = load_study("pouring_mugs").only(["person", "person_unconstrained"])
-    declared = declared.model_copy(update={"judged_on": (JudgedOn(episodes=1),)})
+    declared = declared.model_copy(update={"eval_set": (EvalSet(episodes=1),)})
     bound, free = run(declared, tmp_path).to_dict("records")
     assert (bound["success_rate"], free["success_rate"]) == (1.0, 0.0)
     assert bound["ended_in_spill"] + bound["ended_in_collision"] == 0
     assert free["ended_in_spill"] + free["ended_in_collision"] == 1
-    assert bound["worst_violation"] <= 1e-9
+    assert bound["max_commanded_violation"] <= 1e-9
 
 
 def test_a_policy_learns_on_rails_wherever_it_is_judged(tmp_path):
     declared = load_study("connector_on_arm")
     config = Job(declared, "skgrl", 30, tmp_path).config(80)
-    assert config.environment["station"] == "rails"
-    assert declared.judged_on[0].env == {"station": "arm"}
+    assert config.environment["station"] == "gantry"
+    assert declared.eval_set[0].env == {"station": "arm"}
 
 
 def test_a_run_of_a_study_is_a_run(tmp_path):
@@ -390,32 +393,32 @@ def test_a_run_of_a_study_is_a_run(tmp_path):
 def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
     """The wall of beads is where they start, or far away, where nothing succeeds."""
     walls = {"quantity": "wall [m]", "at": {0.0: {}, -0.5: {"wall": -0.5}}, "episodes": 2}
-    methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "white"}}
+    methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "uniform_random"}}
     one = study(methods=methods, sweeps=[walls], **{"judged on": []})
     found = study_command(one, tmp_path, make_engine(processes=1))
     rows = read_table(tmp_path / "beads.csv")
-    assert rows["judged_on"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
-    assert rows[rows["judged_on"] == "wall [m] -0.5"]["success_rate"].eq(0).all()
+    assert rows["eval_set"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
+    assert rows[rows["eval_set"] == "wall [m] -0.5"]["success_rate"].eq(0).all()
     assert found["picture"] == str(tmp_path / "beads.png")
     assert found["nothing, below 90% at wall [m]"] == "from the easiest on"
     assert (tmp_path / "beads.png").stat().st_size > 10_000
-    assert run_study(one, tmp_path, make_engine(processes=1))["judged_on"].tolist() == rows["judged_on"].tolist()
+    assert run_study(one, tmp_path, make_engine(processes=1))["eval_set"].tolist() == rows["eval_set"].tolist()
 
 
 def test_a_policy_that_learned_longer_is_judged_by_itself_whatever_the_file_is_called(tmp_path):
     judged = [{"episodes": 2, "file": "held_out-{episodes}-{digest}.csv"}]
-    run(study(marks=[2], seeds=[5], **{"judged on": judged}), tmp_path)
-    run(study(marks=[4], seeds=[5], **{"judged on": judged}), tmp_path)
+    run(study(after_episodes=[2], seeds=[5], **{"judged on": judged}), tmp_path)
+    run(study(after_episodes=[4], seeds=[5], **{"judged on": judged}), tmp_path)
     assert len(list((tmp_path / "learner-5").glob("held_out-2-*.csv"))) == 2
     same = [{"episodes": 2, "file": "held_out.csv"}]
-    run(study(marks=[4], seeds=[5], **{"judged on": same}), tmp_path)
+    run(study(after_episodes=[4], seeds=[5], **{"judged on": same}), tmp_path)
     with pytest.raises(InputError, match="after other training"):
-        run(study(marks=[6], seeds=[5], **{"judged on": same}), tmp_path)
+        run(study(after_episodes=[6], seeds=[5], **{"judged on": same}), tmp_path)
 
 
 def test_a_part_of_a_study_does_not_take_the_place_of_its_table(tmp_path):
     methods = {"learner": {}, "nothing": {"policy": "zero"}}
-    (tmp_path / "beads.yaml").write_text(yaml.safe_dump(BEAD | {"methods": methods, "marks": [2]}))
+    (tmp_path / "beads.yaml").write_text(yaml.safe_dump(BEAD | {"methods": methods, "after_episodes": [2]}))
     for words, rows in (([], 4), (["--methods", "nothing"], 2), (["--seeds", "5"], 2)):
         with pytest.raises(SystemExit) as end:
             main(["study", str(tmp_path / "beads.yaml"), "--out", str(tmp_path / "out"), "--processes", "1", *words])

@@ -7,7 +7,9 @@ from guiderail.tools.experiments.sweep import _success, draw_sweeps
 
 
 def rows(*rates):
-    found = [{"method": "one", "judged_on": "x", "seed": k, "mark": 60, "episodes": 50} for k in range(len(rates))]
+    found = [
+        {"method": "one", "eval_set": "x", "seed": k, "after_episodes": 60, "episodes": 50} for k in range(len(rates))
+    ]
     return pd.DataFrame(found, dtype=object).assign(success_rate=rates)
 
 
@@ -23,5 +25,5 @@ def test_a_sweep_of_one_value_is_drawn(tmp_path):
         {"name": "one", "task": "Bead", "methods": {"one": {"policy": "zero"}}, "seeds": [0], "judged on": [],
          "sweeps": [{"quantity": "x", "at": {1.0: {}}}]}
     )  # fmt: skip
-    found = rows(0.5).assign(judged_on="x 1")
+    found = rows(0.5).assign(eval_set="x 1")
     assert draw_sweeps(study, found, tmp_path / "one.png").is_file()

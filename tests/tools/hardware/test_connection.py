@@ -8,7 +8,7 @@ import pytest
 from guiderail.diagrams.envs.make import resolve
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.tools.cli.main import main
-from guiderail.tools.hardware.connection import Other
+from guiderail.tools.hardware.connection import RobotConnection
 
 MINE = """
 from guiderail.diagrams.tasks.bnc_connector import BncConnector
@@ -27,21 +27,21 @@ def test_a_simulated_robot_imports_what_the_run_does(tmp_path, monkeypatch):
     file.write_text(MINE)
 
     @contextmanager
-    def companion(code):
+    def subprocess_tied_to_parent(code):
         codes.append(code)
         yield
 
-    def serve(url, seconds, patience, task, **more):
+    def serve(url, seconds, command_timeout, task, **more):
         served.append(type(resolve(task, {}).task).__name__)
         return True
 
     def wait(url, robot, task, say):
         serve(url, 0.0, 0.0, task)
 
-    monkeypatch.setattr("guiderail.tools.hardware.connection.companion", companion)
+    monkeypatch.setattr("guiderail.tools.hardware.connection.companion", subprocess_tied_to_parent)
     monkeypatch.setattr("guiderail.tools.hardware.sim_driver.serve_iiwa", serve)
     monkeypatch.setattr("guiderail.tools.hardware.safety_monitor.stand_by", wait)
-    with Other(rehearse=True).standing_in("mine/Connector", "memq://", [str(file)]):
+    with RobotConnection(sim=True).standing_in("mine/Connector", "memq://", [str(file)]):
         pass
     try:
         for run in (

@@ -19,13 +19,13 @@ from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.cli.main import main
 from guiderail.tools.hardware import executor as run_policy
 from guiderail.tools.hardware import preflight as checks
-from guiderail.tools.hardware.connection import Other
-from guiderail.tools.hardware.executor import Operation
+from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.tools.hardware.executor import SkillExecutor
 from guiderail.tools.hardware.sim_driver import START
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 
-OPTIONS = {"station": "hardware", "guidance": "kmp", "uncertainty": "known"}
+OPTIONS = {"station": "hardware", "guidance": "kmp", "fixture_offset": "none"}
 
 
 @pytest.fixture
@@ -42,9 +42,9 @@ def operated(monkeypatch):
             skill = make_skill("BncConnector", policy, **OPTIONS)
         task = resolve("BncConnector", OPTIONS).task
         monkeypatch.setattr(task, "num_steps", num_steps)
-        pace = Together(task.world(), lcm, start, deputy)
+        pace = Together(task.workcell(), lcm, start, deputy)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
-        return Operation(task, skill, pace, is_stopped), pace
+        return SkillExecutor(task, skill, pace, is_stopped), pace
 
     return operated
 
@@ -71,7 +71,7 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
 def test_a_run_that_fails_leaves_what_was_recorded_beside_what_was_there(monkeypatch, tmp_path):
     lcm, asked, imported = DrakeLcm("memq://"), [], []
     task = resolve("BncConnector", {}).task
-    pace = Together(task.world(), lcm, task.start(np.random.default_rng(0)))
+    pace = Together(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
 
     def policy(observation):
         asked.append(observation)
@@ -84,18 +84,18 @@ def test_a_run_that_fails_leaves_what_was_recorded_beside_what_was_there(monkeyp
 
     monkeypatch.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
     monkeypatch.setattr(run_policy.Policy, "load", lambda folder: policy)
-    monkeypatch.setattr(run_policy, "hurry", lambda: True)
-    monkeypatch.setattr(Other, "standing_in", standing_in)
-    monkeypatch.setattr(Other, "paces", lambda other, station: (pace, None))
+    monkeypatch.setattr(run_policy, "set_realtime_priority", lambda: True)
+    monkeypatch.setattr(RobotConnection, "standing_in", standing_in)
+    monkeypatch.setattr(RobotConnection, "paces", lambda other, station: (pace, None))
     monkeypatch.setattr("guiderail.tools.hardware.slow_motion.SETTLE", 0.1)
-    monkeypatch.setattr(Other, "timing", lambda other, station, clock: {})
-    options = {"guidance": "kmp", "uncertainty": "known"}
+    monkeypatch.setattr(RobotConnection, "timing", lambda other, station, clock: {})
+    options = {"guidance": "kmp", "fixture_offset": "none"}
     RunFolder(tmp_path).write_config(configure("BncConnector", options, imports=["json"], episodes=1))
     there = tmp_path / "hardware" / "episode-000004.json"  # of five recordings, somebody took four away
     there.parent.mkdir()
     there.write_text("{}")
     with pytest.raises(PolicyError):
-        run_policy.run_policy(tmp_path, Other(), yes=True, say=lambda words: None)
+        run_policy.run_policy(tmp_path, RobotConnection(), yes=True, say=lambda words: None)
     assert imported == ["json"]
     assert there.read_text() == "{}"
     found = json.loads((tmp_path / "hardware" / "episode-000005.json").read_text())
@@ -136,7 +136,7 @@ def test_a_person_stops_it(operated):
     operation, pace = operated(is_stopped=lambda: bool(pressed))
     pace.happens[200] = lambda: pressed.append(1)
     outcome = operation.run(print)
-    assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.ASKED, 1, 0)
+    assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.USER_STOP, 1, 0)
 
 
 def test_too_much_force_ends_it(operated):
@@ -156,21 +156,21 @@ def test_a_robot_far_from_the_start_is_not_moved(operated):
 
 def test_no_task_without_a_start_and_no_simulated_station(monkeypatch):
     with pytest.raises(InputError, match="is a simulation"):
-        run_policy.on_a_robot("BncConnector", {}, "rails")
+        run_policy.on_a_robot("BncConnector", {}, "gantry")
     environment = resolve("BncConnector", {"station": "arm", "robot": "panda"}).values
     assert "end_effector" not in run_policy.on_a_robot("BncConnector", environment, "hardware")
 
 
 def test_what_a_person_gave_wrong_ends_with_2(capsys, tmp_path):
     with pytest.raises(SystemExit) as end:
-        main(["run", str(tmp_path), "--rehearse"])
+        main(["run", str(tmp_path), "--sim"])
     assert end.value.code == 2
     assert "not a run" in capsys.readouterr().err
 
 
 def test_another_policy_acts_in_episodes_alone(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["run", "runs/none", "--policy", "rule"])
+        main(["run", "runs/none", "--policy", "scripted"])
     assert end.value.code == 2
     assert "give --episodes" in capsys.readouterr().err
 
@@ -192,7 +192,7 @@ def test_nobody_confirms_for_a_person(monkeypatch):
 def test_a_check_that_fails_is_never_confirmed():
     said = []
     with pytest.raises(InputError, match="stays where it is: load"):
-        checks.read_out([checks.Check("load", "9 N", False)], said.append, again=list, is_confirmed=True)
+        checks.confirm_checks([checks.Check("load", "9 N", False)], said.append, again=list, is_confirmed=True)
     assert said == ["NOT  load        9 N"]
 
 
@@ -203,7 +203,7 @@ def test_what_is_confirmed_is_checked_again_before_the_arm_moves(operated, monke
         checks, "confirm", lambda question: pace.robot.set_pose(pace.simulator.get_mutable_context(), aside)
     )
     with pytest.raises(InputError, match="stays where it is: start"):
-        checks.read_out(operation.checks(), print, again=operation.checks_again, is_confirmed=False)
+        checks.confirm_checks(operation.checks(), print, again=operation.checks_again, is_confirmed=False)
 
 
 def test_the_force_that_is_read_out_is_the_largest_that_there_is(operated):
@@ -222,7 +222,7 @@ def test_a_place_where_nothing_can_be_recorded_is_refused_before_anything_is_hea
     RunFolder(tmp_path / "run").write_config(configure("BncConnector", {"guidance": "kmp"}, episodes=1))
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
-        run_policy.run_policy(tmp_path / "run", Other(), yes=True, out=tmp_path / "file" / "out")
+        run_policy.run_policy(tmp_path / "run", RobotConnection(), yes=True, out=tmp_path / "file" / "out")
 
 
 def test_an_arm_whose_driver_does_not_stop_it_needs_a_deputy(operated):
@@ -241,14 +241,14 @@ def test_an_arm_whose_driver_does_not_stop_it_needs_a_deputy(operated):
 )
 def test_refuses_another_end_that_makes_no_sense(wrong, words):
     with pytest.raises(InputError, match=words):
-        Other(**wrong)
+        RobotConnection(**wrong)
 
 
 def test_the_stations_of_an_operation_have_the_same_limits():
     slow = StatusLimits((1.0,) * 7, max_age=0.1)
     other = {"period": 0.002, "wrench_time_constant": 0.05, "lcm_url": "memq://x", "status_limits": slow}
-    station = HardwareStation(resolve("BncConnector", {}).task.world(), DrakeLcm("memq://"), robot="panda", **other)
-    alike = station.alike(resolve("BncConnector", {}).task.world())
+    station = HardwareStation(resolve("BncConnector", {}).task.workcell(), DrakeLcm("memq://"), robot="panda", **other)
+    alike = station.alike(resolve("BncConnector", {}).task.workcell())
     assert (alike.limits, alike.impedance, alike.driver) == (station.limits, station.impedance, station.driver)
     assert alike.lcm is station.lcm
     assert (alike.period, alike.lcm_url, alike.status_limits) == (0.002, "memq://x", slow)

@@ -6,19 +6,19 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.envs.config import validated
 from guiderail.diagrams.envs.make import resolve
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa
-from guiderail.tools.hardware.part_randomization import Places, put
+from guiderail.tools.hardware.part_randomization import PartRandomizer, put
 
 SEED = 30
 
 
 def test_the_same_seed_puts_them_where_a_simulations_resets_do():
-    task = resolve("BncConnector", {"uncertainty": "calibration"}).task
+    task = resolve("BncConnector", {"fixture_offset": "per_run"}).task
     lcm = DrakeLcm("memq://")
-    robot = SimulatedIiwa(task.world(), lcm)
+    robot = SimulatedIiwa(task.workcell(), lcm)
     context = robot.CreateDefaultContext()
     put(lcm, IIWA_DRIVER, task, robot, context)
-    places, rng = Places(task, lcm, IIWA_DRIVER, SEED), np.random.default_rng(7)
-    simulated = resolve("BncConnector", {"uncertainty": "calibration"}).task
+    places, rng = PartRandomizer(task, lcm, IIWA_DRIVER, SEED), np.random.default_rng(7)
+    simulated = resolve("BncConnector", {"fixture_offset": "per_run"}).task
     simulated.offsets.draw(np.random.default_rng(SEED), validated(simulated.Reset, {}, "a reset"))
     others, jacks = np.random.default_rng(7), []
     plant = robot.plant

@@ -7,7 +7,7 @@ from guiderail.diagrams.hardware.station import SimulatedIiwa
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
-from guiderail.tools.hardware.connection import Other
+from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.scenario import load_scenario
 
 SHIPPED = Path(__file__).parents[3] / "examples" / "connector.scenario.yaml"
@@ -28,21 +28,24 @@ def written(tmp_path):
 
 def test_one_word_switches_between_a_simulated_robot_and_a_real_one(written):
     simulated, real = (
-        Other.in_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
+        RobotConnection.in_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
     )
-    assert (simulated.rehearse, real.rehearse) == (True, False)
+    assert (simulated.sim, real.sim) == (True, False)
     assert (simulated.robot, real.robot) == ("iiwa14", "iiwa14")
     assert real.environment("hardware")["lcm_url"] == "udpm://239.255.76.67:7668?ttl=0"
     # A rehearsal never speaks where a driver may listen.
     assert simulated.environment("hardware")["lcm_url"] != real.environment("hardware")["lcm_url"]
     with pytest.raises(InputError, match="a bus of its own"):
-        Other(rehearse=True, lcm_url="udpm://239.255.76.67:7667")
-    assert Other.in_scenario(None, robot="panda").robot == "panda"
-    assert Other.in_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot == "panda"
+        RobotConnection(sim=True, lcm_url="udpm://239.255.76.67:7667")
+    assert RobotConnection.in_scenario(None, robot="panda").robot == "panda"
+    assert (
+        RobotConnection.in_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot
+        == "panda"
+    )
 
 
 def test_the_shipped_one_is_a_rehearsal():
-    assert Other.in_scenario(SHIPPED).rehearse
+    assert RobotConnection.in_scenario(SHIPPED).sim
 
 
 @pytest.mark.parametrize(
@@ -73,9 +76,9 @@ def test_refuses_in_a_sentence(written, text, words):
 def test_another_robot_or_bus_than_the_files_is_refused(written, given, words):
     file = written(f"station: hardware\n{BUS}{DRIVER}")
     with pytest.raises(InputError, match=words):
-        Other.in_scenario(file, **given)
-    same = Other.in_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
-    assert same == Other.in_scenario(file)
+        RobotConnection.in_scenario(file, **given)
+    same = RobotConnection.in_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
+    assert same == RobotConnection.in_scenario(file)
 
 
 def test_a_robot_is_the_scenarios_unless_another_one_is_named(written, capsys):

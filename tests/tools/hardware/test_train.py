@@ -10,19 +10,19 @@ import pytest
 from injections.together import Together
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.envs.assemble import assemble
+from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.make import make_guidance, make_station, resolve
 from guiderail.diagrams.hardware.station import IIWA_DRIVER
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
-from guiderail.systems.torque_safety_limiter import Phase
+from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_ledger
-from guiderail.tools.hardware.connection import Other
+from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.evaluate import evaluate_on_robot
 from guiderail.tools.hardware.robot_env import RobotEnv
-from guiderail.tools.hardware.session import AtRobot, at_robot
+from guiderail.tools.hardware.session import RobotSession, robot_session
 from guiderail.tools.hardware.sim_driver import START
 from guiderail.tools.hardware.slow_motion import CRAWL
 from guiderail.tools.hardware.train import _learn, train_on_robot
@@ -30,7 +30,7 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 from guiderail.tools.teleop.teleoperator import Keys
 
-OPTIONS = {"station": "hardware", "guidance": "kgrl", "uncertainty": "known", "reward": "shaped", "hold": 5}
+OPTIONS = {"station": "hardware", "guidance": "kgrl", "fixture_offset": "none", "reward": "shaped", "action_repeat": 5}
 
 
 def make(patch, start, **options):
@@ -40,11 +40,13 @@ def make(patch, start, **options):
     with patch.context() as bus:
         bus.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
         station = make_station(resolved)
-    task = assemble(resolved.task, station, make_guidance(resolved, station))
-    pace, keys, asked = Together(resolved.task.world(), lcm, start), Keys(), []
-    begin = resolved.task.start(np.random.default_rng(0))
-    elsewhere = station.alike(resolved.task.world())
-    env = RobotEnv(task, station, elsewhere, begin, pace, hold=5, keys=keys, go_on=asked.append, say=lambda words: None)
+    task = build_task_diagram(resolved.task, station, make_guidance(resolved, station))
+    pace, keys, asked = Together(resolved.task.workcell(), lcm, start), Keys(), []
+    begin = resolved.task.start_pose(np.random.default_rng(0))
+    elsewhere = station.alike(resolved.task.workcell())
+    env = RobotEnv(
+        task, station, elsewhere, begin, pace, action_repeat=5, keys=keys, go_on=asked.append, say=lambda words: None
+    )
     env.pace, env.keys, env.asked, env.begin = pace, keys, asked, begin
     return env
 
@@ -75,7 +77,7 @@ def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
         row = rollout(env, still, index=index)
         assert (row["termination"], row["steps"], env.asked) == ("time_limit", 10, [])
         np.testing.assert_allclose(env.trace.measured[0][:3], env.begin[:3], atol=2e-3)
-        assert (env.trace.signals["holding"] == 0.0).all()
+        assert (env.trace.signals["command_timed_out"] == 0.0).all()
         env.idle()
     with pytest.raises(InputError, match="takes no options"):
         env.reset(options={"offset": (0.0, 0.0)})
@@ -91,30 +93,30 @@ def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_pat
     @contextmanager
     def there(config, other, *, yes, say):
         assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
-        yield AtRobot(env, dict)
+        yield RobotSession(env, dict)
 
-    monkeypatch.setattr("guiderail.tools.hardware.evaluate.at_robot", there)
+    monkeypatch.setattr("guiderail.tools.hardware.evaluate.robot_session", there)
     learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
     RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
     env.keys.wants_pause = True
-    found = evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
+    found = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", acting=lambda env: still)
     assert (found["episodes"], found["success_rate"]) == (2, 0.0)
     assert (env.asked, env.keys.wants_pause) == (["somebody asked for it"], False)  # after the first, and once
     rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
     assert rows["termination"].tolist() == ["time_limit"] * 2
     with pytest.raises(InputError, match="already exists"):
-        evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still)
+        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", acting=lambda env: still)
     with pytest.raises(InputError, match="at least one"):
-        evaluate_on_robot(tmp_path, Other(), 0)
+        evaluate_on_robot(tmp_path, RobotConnection(), 0)
     # Two at once, neither of which has a row yet: nobody replaces the other's.
     elsewhere = tmp_path / "elsewhere"
     with RunFolder(elsewhere).locked(), pytest.raises(InputError, match="another process"):
-        evaluate_on_robot(tmp_path, Other(), 2, policy="zero", acting=lambda env: still, out=elsewhere)
+        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", acting=lambda env: still, out=elsewhere)
     assert not list(elsewhere.glob("*.csv"))
 
 
 def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, tmp_path, forkserver):
-    small = {"units": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_every": 1}
+    small = {"net_arch": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_freq": 1}
     given = {"algorithm": "sac", "episodes": 5, "settings": small}
     config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **given)
     folder, idle, before = RunFolder(tmp_path), env.idle, []
@@ -132,7 +134,7 @@ def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, t
     assert folder.episodes()["termination"].tolist() == ["time_limit"] * 2
     assert len(read_ledger(folder.ledger)) == 20
     assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
-    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.ASKED  # at rest
+    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.USER_STOP  # at rest
 
 
 def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
@@ -167,8 +169,8 @@ def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decisi
     row = rollout(env, act)
     assert (row["termination"], row["steps"]) == ("stopped", 8)
     for column, key, signal in (
-        ("worst_violation", "constraint_violation", "commanded_violation"),
-        ("worst_measured_violation", "measured_violation", "measured_violation"),
+        ("max_commanded_violation", "constraint_violation", "commanded_violation"),
+        ("max_measured_violation", "measured_violation", "measured_violation"),
     ):
         seen = env.trace.signals[signal]
         assert row[column] == seen.max() > seen[:5].max()
@@ -178,21 +180,21 @@ def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decisi
 
 @pytest.fixture
 def ready(monkeypatch):
-    """An arm that waits for `at_robot`, which is told to begin; and what a person is asked."""
+    """An arm that waits for `robot_session`, which is told to begin; and what a person is asked."""
     lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
-    pace, asked = Together(resolved.task.world(), lcm, START), []
+    pace, asked = Together(resolved.task.workcell(), lcm, START), []
 
     @contextmanager
     def nobody(other, *where):
         yield
 
     monkeypatch.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
-    monkeypatch.setattr(Other, "standing_in", nobody)
-    monkeypatch.setattr(Other, "paces", lambda other, station: (pace, None))
-    monkeypatch.setattr("guiderail.tools.hardware.session.hurry", lambda: True)
+    monkeypatch.setattr(RobotConnection, "standing_in", nobody)
+    monkeypatch.setattr(RobotConnection, "paces", lambda other, station: (pace, None))
+    monkeypatch.setattr("guiderail.tools.hardware.session.set_realtime_priority", lambda: True)
     monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", asked.append)
     config = configure("BncConnector", OPTIONS, seed=0, episodes=1)
-    return pace, asked, lambda: at_robot(config, Other(), yes=False, say=lambda words: None)
+    return pace, asked, lambda: robot_session(config, RobotConnection(), yes=False, say=lambda words: None)
 
 
 @pytest.mark.parametrize("name", ["start", "deputy", "commands"])
@@ -252,7 +254,7 @@ def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch
     env.step(np.zeros(2))
     env.reset()
     assert env.asked == ["somebody asked for it"]
-    assert env._acting.get_phase_output_port().Eval(env._mine)[0] == Phase.RUNNING
+    assert env._acting.get_phase_output_port().Eval(env._mine)[0] == ArmState.RUNNING
 
 
 def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypatch):
@@ -287,7 +289,7 @@ def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought
     with pytest.raises(KeyboardInterrupt):
         env.step(np.ones(2))
     env.rest()
-    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.ASKED
+    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.USER_STOP
     plant = env.pace.robot.plant
     velocities = plant.GetVelocities(plant.GetMyContextFromRoot(env.pace.simulator.get_context()))
     assert np.abs(velocities).max() < 0.01
@@ -332,7 +334,7 @@ def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, mon
 def test_refuses_what_a_robot_cannot_tell(task, options, words, tmp_path):
     with pytest.raises(InputError, match=words):
         train_on_robot(
-            task, tmp_path / "run", Other(rehearse=True), environment={"station": "hardware"} | options, given={}
+            task, tmp_path / "run", RobotConnection(sim=True), environment={"station": "hardware"} | options, given={}
         )
 
 
@@ -341,7 +343,7 @@ def test_refuses_what_nobody_can_show_it(tmp_path):
         train_on_robot(
             "BncConnector",
             tmp_path / "run",
-            Other(rehearse=True),
+            RobotConnection(sim=True),
             environment={"station": "hardware", "guidance": "kgrl"},
             given={},
             settings={"demonstration_episodes": 1},

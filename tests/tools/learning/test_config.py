@@ -7,16 +7,19 @@ from guiderail.tools.learning.config import resolve_preset
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("entropy", "inf"), ("entropy", "auto_nan"), ("entropy", "-1"), ("units", "1000000,1000000"), ("units", ""),
+        ("ent_coef", "inf"), ("ent_coef", "auto_nan"), ("ent_coef", "-1"), ("net_arch", "1000000,1000000"), ("net_arch", ""),
         ("batch_size", "1e20"), ("batch_size", True), ("buffer_size", "9" * 5000), ("layer_norm", "7"),
-        ("learning_rate", "inf"), ("discount", True), ("gradient_steps", 10**12), ("units", ",".join(["8"] * 50)),
+        ("learning_rate", "inf"), ("gamma", True), ("gradient_steps", 10**12), ("net_arch", ",".join(["8"] * 50)),
     ],
 )  # fmt: skip
 def test_what_no_machine_has_and_what_is_no_number_is_refused_in_a_short_sentence(setting, value):
     with pytest.raises(InputError, match=f"learner's {setting} cannot be") as error:
-        resolve_preset("robust", "tqc", {setting: value})
+        resolve_preset("tqc_contact", "tqc", {setting: value})
     assert len(str(error.value)) < 300
 
 
 def test_large_networks_are_no_mistake():
-    assert resolve_preset("robust", "tqc", {"units": "4096,4096", "batch_size": "8192"}).units == (4096, 4096)
+    assert resolve_preset("tqc_contact", "tqc", {"net_arch": "4096,4096", "batch_size": "8192"}).net_arch == (
+        4096,
+        4096,
+    )

@@ -24,7 +24,7 @@ def whole(module_config, tmp_path_factory):
 def module_config():
     from guiderail.tools.learning.train import configure
 
-    settings = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
+    settings = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
     return configure("Bead", {}, settings=settings, episodes=6, seed=5)
 
 

@@ -7,7 +7,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.models.primitives.reference import through
-from guiderail.tools.learning.interventions import APART, WORTH, Corrections, Person
+from guiderail.tools.learning.interventions import APART, WORTH, Supervisor, ViaPointCorrections
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
@@ -23,7 +23,7 @@ class Still(Learner):
     def act(self, observation):
         return np.zeros(self.env.action_space.shape, np.float32)
 
-    def see(self, decision):
+    def on_step(self, decision):
         self.seen.append(decision)
 
     def policy(self, description):
@@ -58,7 +58,7 @@ def still():
     del LEARNERS._entries["still"]
 
 
-class Scripted(Person):
+class Scripted(Supervisor):
     """Pushes in some episodes from one control step to another, and says a word at one."""
 
     def __init__(self, pushes, words=None):
@@ -79,7 +79,7 @@ class Scripted(Person):
 
 def passage(episodes, **environment):
     return configure(
-        "NarrowPassage", {"guidance": "kgrl", "hold": 2, **environment}, algorithm="still", episodes=episodes,
+        "NarrowPassage", {"guidance": "kgrl", "action_repeat": 2, **environment}, algorithm="still", episodes=episodes,
         with_person=True, ledger=False,
     )  # fmt: skip
 
@@ -96,11 +96,11 @@ def test_a_push_is_a_transition_and_becomes_via_points_that_the_next_episode_pas
     assert found.with_person
     points = np.reshape(found.environment["via_points"], (-1, 3))
     np.testing.assert_array_equal(points[:, 0], [11, 17, 19])
-    corrections = Corrections("NarrowPassage", {"guidance": "kgrl"})
+    corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
     shown = corrections._reference.means[points[:, 0].astype(int)]
     wanted = shown + np.array([0.5, 3.0]) * corrections.reach
     assert (np.abs(points[:, 1:] - wanted).min(axis=0) < 1e-9).all()  # but for where the constraints stop it
-    assert max(row["worst_violation"] for row in rows) <= 1e-9
+    assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
 
 
 def test_via_points_are_passed_and_forgotten_far_from_them():
@@ -117,7 +117,7 @@ def test_via_points_are_passed_and_forgotten_far_from_them():
 
 
 def test_whoever_has_not_let_go_at_the_end_means_the_rest_and_newer_pushes_replace_older_ones():
-    corrections = Corrections("NarrowPassage", {"guidance": "kgrl"})
+    corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
     last = corrections._reference.num_steps - 1
     kept = np.reshape(corrections.with_pushes({20: np.array([0.1, 0.0])}, still_pushing=True), (-1, 3))
     assert (kept[0, 0], kept[-1, 0]) == (20, last)
@@ -157,13 +157,19 @@ def test_a_run_that_was_stopped_goes_on_with_what_was_corrected(tmp_path):
 
 def test_guidance_without_demonstrations_can_not_be_corrected():
     with pytest.raises(InputError, match="does without"):
-        Corrections("Pouring", {})
+        ViaPointCorrections("Pouring", {})
 
 
 def test_five_millimetres_astray_a_person_rescues_it_with_a_push_or_two(tmp_path):
     """The connector's demonstrations led 5 mm beside the jack; a person who sees that pushes until it goes in."""
-    environment = {"guidance": "kgrl", "uncertainty": "known", "bound": 6e-3, "hold": 10, "explored": (0, 1)}
-    shown = Corrections("BncConnector", environment)
+    environment = {
+        "guidance": "kgrl",
+        "fixture_offset": "none",
+        "bound": 6e-3,
+        "action_repeat": 10,
+        "action_dims": (0, 1),
+    }
+    shown = ViaPointCorrections("BncConnector", environment)
     steps = np.arange(0, shown._reference.num_steps, APART)
     astray = np.column_stack([steps, shown._reference.means[steps]])
     astray[:, 1] += 5e-3
@@ -173,4 +179,4 @@ def test_five_millimetres_astray_a_person_rescues_it_with_a_push_or_two(tmp_path
     rows = train(RunFolder(tmp_path / "run"), config, person=Scripted({1: (0, 10**6, push)}))
     assert [row["success"] for row in rows] == [0, 0, 1]
     assert sum(row["interventions"] for row in rows) <= 5
-    assert max(row["worst_violation"] for row in rows) <= 1e-9
+    assert max(row["max_commanded_violation"] for row in rows) <= 1e-9

@@ -10,31 +10,31 @@ from stable_baselines3 import TD3
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, arguments_of, register_learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, policy_of
 
 
-class Spaces(gymnasium.Env):
+class SpacesOnlyEnv(gymnasium.Env):
     observation_space = spaces.Box(-1, 1, (3,))
     action_space = spaces.Box(-1, 1, (2,))
 
 
-SETTINGS = {"units": "8", "batch_size": 4, "learning_starts": 6, "train_every": 4, "gradient_steps": 2}
+SETTINGS = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
 
 
 @pytest.fixture
 def preset():
-    return resolve_preset("robust", "tqc", SETTINGS)
+    return resolve_preset("tqc_contact", "tqc", SETTINGS)
 
 
-def make(preset, hold=1, seed=0):
-    return LEARNERS.get(preset.algorithm)(preset, Spaces(), hold=hold, seed=seed, decisions=50)
+def make(preset, action_repeat=1, seed=0):
+    return LEARNERS.get(preset.algorithm)(preset, SpacesOnlyEnv(), action_repeat=action_repeat, seed=seed, decisions=50)
 
 
 def decision(observation, action, reward, following, terminated=False, truncated=False):
-    return Decision(observation, action, reward, following, terminated, truncated, {})
+    return Transition(observation, action, reward, following, terminated, truncated, {})
 
 
 def live(learner, decisions, seed=0):
@@ -52,39 +52,39 @@ def weights(learner):
 
 def test_presets_are_the_tables_of_the_thesis():
     simulation, robot = PRESETS["table_4_1_simulation"], PRESETS["table_4_1_robot"]
-    for table, tau, discount, entropy in ((simulation, 0.02, 0.99, "auto"), (robot, 0.01, 0.995, "auto_0.1")):
-        assert (table.learning_rate, table.train_every, table.gradient_steps) == (1e-3, 8, 8)
-        assert (table.soft_update, table.discount, table.entropy) == (tau, discount, entropy)
+    for table, tau, gamma, entropy in ((simulation, 0.02, 0.99, "auto"), (robot, 0.01, 0.995, "auto_0.1")):
+        assert (table.learning_rate, table.train_freq, table.gradient_steps) == (1e-3, 8, 8)
+        assert (table.tau, table.gamma, table.entropy) == (tau, gamma, entropy)
         assert (table.batch_size, table.buffer_size, table.units) == (256, 10**6, (256, 256))
-    for name, rate, discount in (("table_3_2_iiwa", 8e-4, 0.95), ("table_3_2_sara", 1e-3, 0.98)):
+    for name, rate, gamma in (("table_3_2_iiwa", 8e-4, 0.95), ("table_3_2_sara", 1e-3, 0.98)):
         table = PRESETS[name]
-        assert (table.learning_rate, table.discount, table.soft_update) == (rate, discount, 0.02)
-        assert (table.train_every, table.gradient_steps, table.learning_starts) == (8, 8, 1000)
+        assert (table.learning_rate, table.gamma, table.tau) == (rate, gamma, 0.02)
+        assert (table.train_freq, table.gradient_steps, table.learning_starts) == (8, 8, 1000)
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tqc"])
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_makes_a_learner_of_every_algorithm(name, algorithm):
-    learner = make(replace(resolve_preset(name, algorithm), units=(4,)))
+    learner = make(replace(resolve_preset(name, algorithm), net_arch=(4,)))
     assert learner.act(np.zeros(3, np.float32)).shape == (2,)
 
 
 def test_a_longer_hold_discounts_a_decision_more(preset):
-    assert make(preset, hold=5).model.gamma == pytest.approx(make(preset).model.gamma ** 5)
+    assert make(preset, action_repeat=5).model.gamma == pytest.approx(make(preset).model.gamma ** 5)
 
 
 def test_the_pouring_tables_discount_a_decision_whatever_its_hold():
-    table = replace(resolve_preset("table_3_2_sara", "sac"), units=(4,))
-    assert make(table, hold=10).model.gamma == make(table, hold=1).model.gamma == 0.98
+    table = replace(resolve_preset("table_3_2_sara", "sac"), net_arch=(4,))
+    assert make(table, action_repeat=10).model.gamma == make(table, action_repeat=1).model.gamma == 0.98
 
 
 def test_training_follows_the_count_of_decisions(preset):
     learner = make(preset)
-    untrained = weights(learner)
+    make_baseline = weights(learner)
     live(learner, 7)
-    np.testing.assert_array_equal(weights(learner), untrained)
+    np.testing.assert_array_equal(weights(learner), make_baseline)
     live(learner, 1)
-    assert not np.array_equal(weights(learner), untrained)
+    assert not np.array_equal(weights(learner), make_baseline)
     assert learner.model._n_updates == 2
     live(learner, 12)
     assert learner.model._n_updates == 8
@@ -98,7 +98,7 @@ def test_the_averaged_actor_lags_behind_the_learning_one(preset):
     moved = np.linalg.norm(averaged - start)
     assert 0 < moved < np.linalg.norm(weights(learner) - start)
     assert learner.actor() is learner.averaged
-    plain = make(replace(preset, averaging=0.0))
+    plain = make(replace(preset, actor_ema=0.0))
     assert plain.actor() is plain.model.actor
 
 
@@ -114,8 +114,10 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
 
 def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
     half_turn = Symmetry.of_signs((-1.0, -1.0, 1.0), (-1.0, 1.0))
-    learner = TqcLearner(preset, Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
-    plain = TqcLearner(replace(preset, symmetry=False), Spaces(), hold=1, seed=0, decisions=50, symmetry=half_turn)
+    learner = TqcLearner(preset, SpacesOnlyEnv(), action_repeat=1, seed=0, decisions=50, symmetry=half_turn)
+    plain = TqcLearner(
+        replace(preset, symmetry=False), SpacesOnlyEnv(), action_repeat=1, seed=0, decisions=50, symmetry=half_turn
+    )
     for one in (learner, plain):
         one.remember(decision(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True))
     buffer = learner.model.replay_buffer
@@ -130,7 +132,7 @@ def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
 
 
 def test_returns_of_several_steps_stop_where_an_episode_does(preset):
-    learner = make(replace(preset, n_steps=3, discount=0.5))
+    learner = make(replace(preset, n_steps=3, gamma=0.5))
     zero = np.zeros(3, np.float32)
     for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
         learner.remember(decision(zero, np.zeros(2), reward, zero, terminated))
@@ -156,20 +158,20 @@ def test_a_restored_learner_goes_on_as_the_first_would_have(preset):
 def test_a_checkpoint_of_another_network_does_not_fit(preset):
     arrays, values = make(preset).state()
     with pytest.raises((KeyError, RuntimeError, ValueError)):
-        make(replace(preset, units=(16,))).restore(arrays, values)
+        make(replace(preset, net_arch=(16,))).restore(arrays, values)
 
 
-@pytest.mark.parametrize("settings", [{"discount": 1.5}, {"units": ""}, {"entropy": "much"}, {"batch_size": 2.5}])
+@pytest.mark.parametrize("settings", [{"gamma": 1.5}, {"net_arch": ""}, {"ent_coef": "much"}, {"batch_size": 2.5}])
 def test_refuses_what_no_learner_can_use(settings):
     with pytest.raises(InputError):
-        resolve_preset("robust", "tqc", settings)
+        resolve_preset("tqc_contact", "tqc", settings)
 
 
 def acted(learner, episodes, decisions=4):
     """The actions of so many episodes at one and the same observation, (episodes, decisions, 2)."""
     actions = []
     for _ in range(episodes):
-        learner.begin()
+        learner.on_episode_start()
         actions.append([learner.act(np.ones(3, np.float32)) for _ in range(decisions)])
     return np.array(actions)
 
@@ -182,10 +184,10 @@ def test_constant_episodes_keep_to_one_action_each(preset):
 
 
 def test_greedy_episodes_do_what_the_policy_would(preset):
-    learner = make(replace(preset, constant_episodes=0, greedy_share=0.5))
+    learner = make(replace(preset, constant_episodes=0, greedy_episode_fraction=0.5))
     live(learner, 20)
-    explored, greedy = acted(learner, 2)
-    assert len(np.unique(explored, axis=0)) == 4
+    action_dims, greedy = acted(learner, 2)
+    assert len(np.unique(action_dims, axis=0)) == 4
     assert (greedy == greedy[0]).all()
     policy = policy_of(learner.actor(), {"observation_shape": [3]})
     np.testing.assert_allclose(greedy[0], policy(np.ones(3, np.float32)), atol=1e-6)
@@ -193,19 +195,21 @@ def test_greedy_episodes_do_what_the_policy_would(preset):
 
 def test_so_many_episodes_are_greedy_as_asked_for(preset):
     for share in (0.0, 0.25, 0.75, 1.0):
-        learner = make(replace(preset, constant_episodes=0, greedy_share=share))
+        learner = make(replace(preset, constant_episodes=0, greedy_episode_fraction=share))
         live(learner, 20)
         greedy = [len(np.unique(actions, axis=0)) == 1 for actions in acted(learner, 8)]
         assert sum(greedy) == 8 * share
 
 
 def test_no_episode_is_greedy_before_learning_has_begun(preset):
-    learner = make(replace(preset, constant_episodes=0, learning_starts=12, greedy_share=1.0, selection_window=3))
+    learner = make(
+        replace(preset, constant_episodes=0, learning_starts=12, greedy_episode_fraction=1.0, selection_window=3)
+    )
     for begun in (False, False, True, True):  # an episode has eight decisions: the second is still an exploring one
-        learner.begin()
+        learner.on_episode_start()
         assert learner.has_begun() is begun
         live(learner, 8)
-        learner.end({"success": 1})
+        learner.on_episode_end({"success": 1})
     assert learner.state()[1]["greedy_successes"] == 2
 
 
@@ -218,7 +222,7 @@ def test_temporally_extended_actions_last_for_a_while_now_and_then(preset):
     runs = [len(run) for run in "".join("r" if r else " " for r in repeated).split()]
     assert max(runs) == settled.ez_greedy_longest - 1  # an action that lasts n decisions comes again n − 1 times
     assert 0.2 < repeated.mean() < 0.5  # 0.2 begin and last 3 decisions on average: two of eight and a bit
-    greedy = make(replace(settled, greedy_share=1.0))
+    greedy = make(replace(settled, greedy_episode_fraction=1.0))
     live(greedy, 20)
     actions = acted(greedy, 1, decisions=50)[0]
     assert (actions == actions[0]).all()
@@ -226,24 +230,24 @@ def test_temporally_extended_actions_last_for_a_while_now_and_then(preset):
 
 def test_extended_actions_end_once_greedy_episodes_succeed_and_come_back_when_they_fail(preset):
     settled = replace(
-        preset, constant_episodes=0, learning_starts=1, greedy_share=0.5, ez_greedy=1.0, ez_greedy_until=2
+        preset, constant_episodes=0, learning_starts=1, greedy_episode_fraction=0.5, ez_greedy=1.0, ez_greedy_until=2
     )
     learner = make(settled)
     live(learner, 20)
     for success, extended in ((None, True), (True, True), (True, False), (True, False), (False, True)):
         if success is not None:
-            learner.end({"success": int(success)})  # the greedy episode
+            learner.on_episode_end({"success": int(success)})  # the greedy episode
         again = make(settled, seed=9)
         again.restore(*learner.state())
         for one in (again, learner):
             exploring = acted(one, 1, decisions=30)[0]
             assert bool((np.diff(exploring, axis=0) == 0.0).all(axis=1).any()) is extended
-        learner.end({"success": 0})  # an exploring episode counts for nothing
-        learner.begin()
+        learner.on_episode_end({"success": 0})  # an exploring episode counts for nothing
+        learner.on_episode_start()
 
 
 def test_a_restored_learner_is_in_the_same_episode(preset):
-    first = make(replace(preset, constant_episodes=2, greedy_share=0.5))
+    first = make(replace(preset, constant_episodes=2, greedy_episode_fraction=0.5))
     live(first, 20)
     acted(first, 3)
     arrays, values = first.state()
@@ -255,7 +259,9 @@ def test_a_restored_learner_is_in_the_same_episode(preset):
 
 
 def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
-    first = make(replace(preset, constant_episodes=0, greedy_share=1.0, selection_window=3, learning_starts=1))
+    first = make(
+        replace(preset, constant_episodes=0, greedy_episode_fraction=1.0, selection_window=3, learning_starts=1)
+    )
     greedy = []
     for episode, success in enumerate([True, True, True, False]):
         first.begin()
@@ -274,7 +280,7 @@ def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
     "settings",
     [
         {"constant_episodes": -1},
-        {"greedy_share": 1.5},
+        {"greedy_episode_fraction": 1.5},
         {"selection_window": -1},
         {"ez_greedy": 1.5},
         {"ez_greedy_longest": 0},
@@ -283,12 +289,12 @@ def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
 )
 def test_episodes_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError):
-        resolve_preset("robust", "tqc", settings)
+        resolve_preset("tqc_contact", "tqc", settings)
 
 
 def test_a_setting_by_its_older_name_is_told_its_name():
-    with pytest.raises(InputError, match="'practise' is called 'greedy_share'"):
-        resolve_preset("robust", "tqc", {"practise": 0.5})
+    with pytest.raises(InputError, match="'practise' is called 'greedy_episode_fraction'"):
+        resolve_preset("tqc_contact", "tqc", {"practise": 0.5})
 
 
 def test_an_algorithm_more_is_one_class(monkeypatch):
@@ -302,7 +308,7 @@ def test_an_algorithm_more_is_one_class(monkeypatch):
         def explore(self, observation):
             return np.clip(super().explore(observation) + 0.1 * self.random.standard_normal(2), -1, 1)
 
-    learner = make(resolve_preset("robust", "td3", SETTINGS))
+    learner = make(resolve_preset("tqc_contact", "td3", SETTINGS))
     live(learner, 24)
     arrays, values = learner.state()
     again = make(learner.preset, seed=9)
@@ -324,23 +330,23 @@ def test_a_network_that_a_policy_cannot_hold_is_refused(preset):
 def test_where_the_simulation_failed_nothing_followed(preset):
     """No decision is remembered of it, and what came before is the episode's last, without being its end."""
     learner, seen = make(preset), np.zeros(3, np.float32)
-    failed = Decision(seen, np.zeros(2), 0.0, seen, False, True, {"simulation_failure": "it diverged"})
+    failed = Transition(seen, np.zeros(2), 0.0, seen, False, True, {"simulation_failure": "it diverged"})
     for following in ((failed,), (decision(seen, np.zeros(2), 1.0, seen), failed)):
-        learner.begin()
+        learner.on_episode_start()
         for one in following:
-            learner.see(one)
+            learner.on_step(one)
     buffer = learner.model.replay_buffer
     assert (buffer.size(), learner.decisions) == (1, 1)
     assert (buffer.dones[0], buffer.timeouts[0]) == (1, 1)
 
 
 def test_where_a_person_pushed_nothing_is_said_of_the_policy(preset):
-    learner = make(replace(preset, greedy_share=1.0, constant_episodes=0, learning_starts=1))
+    learner = make(replace(preset, greedy_episode_fraction=1.0, constant_episodes=0, learning_starts=1))
     live(learner, 2)
     for interventions, row in ((0, 1), (2, 1), (0, 2)):
-        learner.begin()
+        learner.on_episode_start()
         assert learner._greedy
-        learner.end({"success": 1, "interventions": interventions})
+        learner.on_episode_end({"success": 1, "interventions": interventions})
         assert learner._greedy_successes == row
     assert len(learner.selection._open) == 2
 
@@ -350,6 +356,6 @@ def test_what_a_person_pushed_has_no_other_sides():
     learner = SimpleNamespace(symmetry="near")
     for pushed, environment, sides in ((False, {}, "all"), (True, {}, None), (False, {"via_points": (1.0, 2.0)}, None)):
         config = SimpleNamespace(
-            episodes=1, hold=1, seed=0, learner=learner, with_person=pushed, environment=environment
+            episodes=1, action_repeat=1, seed=0, learner=learner, with_person=pushed, environment=environment
         )
         assert arguments_of(config, task)["symmetry"] == sides

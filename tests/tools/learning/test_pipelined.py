@@ -6,11 +6,11 @@ import pyarrow as pa
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.evaluation.step_log import read_ledger
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.pipelined import Student, _written
+from guiderail.tools.learning.pipelined import PipelinedLearner, _written
 
 
 def made(**more):
@@ -18,11 +18,11 @@ def made(**more):
     space = gymnasium.Env()
     space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
     space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    small = {"units": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_every": 1}
-    preset = resolve_preset("robust", "sac", small)
-    named = {"hold": 1, "seed": 0, "decisions": 100, "symmetry": None}
+    small = {"net_arch": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_freq": 1}
+    preset = resolve_preset("tqc_contact", "sac", small)
+    named = {"action_repeat": 1, "seed": 0, "decisions": 100, "symmetry": None}
     acting = LEARNERS.get("sac")(preset, space, **named)
-    return Student(acting, ((preset, space), named), waits=True, **more), acting
+    return PipelinedLearner(acting, ((preset, space), named), waits=True, **more), acting
 
 
 def test_a_ledger_is_whole_or_not_there(tmp_path, monkeypatch):
@@ -55,10 +55,10 @@ def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(f
         student.begin()
         for _ in range(6):
             observation, action = rng.uniform(-1, 1, 3).astype(np.float32), student.act(np.zeros(3, np.float32))
-            student.see(Decision(observation, action, 0.0, observation, False, False, {}))
+            student.see(Transition(observation, action, 0.0, observation, False, False, {}))
         assert (student.known, student.late) == (known, 0)
         student.end({"termination": termination, **last})
-        student.hand_over()
+        student.submit_episode()
     student.finish()
     assert (student.known, acting.decisions, acting.episodes) == (4, 24, 4)
     assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])

@@ -12,7 +12,7 @@ from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import policy_of
 
 
-class Spaces(gymnasium.Env):
+class SpacesOnlyEnv(gymnasium.Env):
     """Nothing but the two spaces that a learner asks for."""
 
     def __init__(self, observation_space, action_space):
@@ -29,11 +29,11 @@ IMAGE = spaces.Box(0, 255, (22, 29, 3), np.uint8)
 )
 def learner(request):
     algorithm, observation_space, layer_norm = request.param
-    env = Spaces(observation_space, spaces.Box(np.array([-1, -2]), np.array([1, 3]), dtype=np.float32))
+    env = SpacesOnlyEnv(observation_space, spaces.Box(np.array([-1, -2]), np.array([1, 3]), dtype=np.float32))
     return LEARNERS.get(algorithm)(
-        resolve_preset("robust", algorithm, {"units": "32,16", "layer_norm": layer_norm}),
+        resolve_preset("tqc_contact", algorithm, {"net_arch": "32,16", "layer_norm": layer_norm}),
         env,
-        hold=1,
+        action_repeat=1,
         seed=3,
         decisions=10,
     )

@@ -23,16 +23,16 @@ def test_everything_that_decides_a_run_is_in_its_configuration(bead_config, tmp_
 
 def test_a_setting_that_a_run_is_older_than_is_off_whatever_its_preset_says_now(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    folder.create(replace(bead_config, preset="clamp", learner=PRESETS["clamp"]))
+    folder.create(replace(bead_config, preset="sac_gridclamp", learner=PRESETS["sac_gridclamp"]))
     file = tmp_path / "run" / "config.yaml"
     lines = [line for line in file.read_text().splitlines() if "ez_greedy_until" not in line]
     file.write_text("\n".join(lines))
-    assert folder.config().learner == replace(PRESETS["clamp"], ez_greedy_until=0)
+    assert folder.config().learner == replace(PRESETS["sac_gridclamp"], ez_greedy_until=0)
 
 
 OLD_NAMES = {
     "constant_episodes": "steady_episodes",
-    "greedy_share": "practise",
+    "greedy_episode_fraction": "practise",
     "ez_greedy": "bursts",
     "ez_greedy_longest": "longest_burst",
     "ez_greedy_until": "bursts_until",
@@ -42,14 +42,14 @@ OLD_NAMES = {
 
 def test_a_run_with_the_older_names_of_its_settings_is_read(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    folder.create(replace(bead_config, preset="clamp", learner=PRESETS["clamp"]))
+    folder.create(replace(bead_config, preset="sac_gridclamp", learner=PRESETS["sac_gridclamp"]))
     file = tmp_path / "run" / "config.yaml"
     text = file.read_text()
     for new, old in OLD_NAMES.items():
         assert f"  {new}: " in text
         text = text.replace(f"  {new}: ", f"  {old}: ")
     file.write_text(text)
-    assert folder.config().learner == PRESETS["clamp"]
+    assert folder.config().learner == PRESETS["sac_gridclamp"]
 
 
 def test_an_option_that_a_run_is_older_than_does_not_make_it_another(bead_config, tmp_path):
@@ -58,7 +58,7 @@ def test_an_option_that_a_run_is_older_than_does_not_make_it_another(bead_config
     folder.create(replace(bead_config, environment=older))
     folder.refuse_another(bead_config)
     with pytest.raises(InputError, match="another environment"):
-        folder.refuse_another(replace(bead_config, environment=bead_config.environment | {"hold": 2}))
+        folder.refuse_another(replace(bead_config, environment=bead_config.environment | {"action_repeat": 2}))
 
 
 def test_a_configuration_that_no_learner_can_use_is_refused(bead_config, tmp_path):

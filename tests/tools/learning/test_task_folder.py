@@ -75,7 +75,7 @@ def test_what_was_judged_of_another_task_is_not_taken_for_this_one(folder, tmp_p
     job = Job(Study.model_validate(said), "zero", 0, tmp_path)
 
     def files():
-        kept = kept_file(tmp_path, "white", config, config.environment, episodes=2)
+        kept = kept_file(tmp_path, "uniform_random", config, config.environment, episodes=2)
         return kept, _digest(job), _digest(job, job.study.judgements[0])
 
     before = files()

@@ -33,7 +33,7 @@ bead.register()
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import train
 from guiderail.tools.learning.configure import configure
-settings = dict(units="16", batch_size=16, learning_starts=10, gradient_steps=4)
+settings = dict(net_arch="16", batch_size=16, learning_starts=10, gradient_steps=4)
 train(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
       report=lambda row: print(row["episode"], flush=True))
 """
@@ -337,7 +337,7 @@ def test_one_thread_does_the_sums():
 
 @pytest.mark.parametrize(
     ("task", "preset", "algorithm"),
-    [("GridClamp", "clamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "robust", "tqc")],
+    [("GridClamp", "sac_gridclamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "tqc_contact", "tqc")],
 )
 def test_a_task_is_learned_as_it_was_measured_unless_told_otherwise(task, preset, algorithm):
     config = configure(task, {}, **with_defaults(task, {"seed": 3}))
@@ -347,7 +347,7 @@ def test_a_task_is_learned_as_it_was_measured_unless_told_otherwise(task, preset
 def test_a_learner_that_was_asked_for_is_taken_whole():
     given = with_defaults("GridClamp", {"algorithm": "tqc"})
     assert given == {"algorithm": "tqc"}
-    assert configure("GridClamp", {"guidance": "none"}, **given).preset == "robust"
+    assert configure("GridClamp", {"guidance": "none"}, **given).preset == "tqc_contact"
 
 
 @pytest.mark.parametrize("pipelined", [False, True])
@@ -371,7 +371,7 @@ def test_more_than_fits_into_memory_is_refused_before_a_run_begins(bead_config, 
 
 
 def test_a_run_goes_on_by_the_words_that_began_it_and_says_of_other_versions(tmp_path, capsys):
-    words = {"environment": {"guidance": "kgrl", "explored": "0,1"}, "settings": {"units": "8"}}
+    words = {"environment": {"guidance": "kgrl", "action_dims": "0,1"}, "settings": {"net_arch": "8"}}
     out = tmp_path / "run"
     run("NarrowPassage", out, episodes=1, **words)
     folder = RunFolder(out)
@@ -403,11 +403,11 @@ def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monke
     out = tmp_path / "run"
     run("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
     config = RunFolder(out).config()
-    before = kept_file(out, "white", config, config.environment, episodes=2)
+    before = kept_file(out, "uniform_random", config, config.environment, episodes=2)
     file.write_text(file.read_text() + "# now it is another one\n")
     with pytest.raises(InputError, match="are not those that the run"):
         run(None, out, environment={}, episodes=2, resume=True)
-    assert kept_file(out, "white", config, config.environment, episodes=2) != before
+    assert kept_file(out, "uniform_random", config, config.environment, episodes=2) != before
     gymnasium.registry.pop(environment_id("changes/Passage"), None)
 
 
@@ -415,9 +415,9 @@ def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, for
     monkeypatch.setitem(LEARNERS._entries, "sac_of_mine", None)  # no other test has this one
     kinds = "off_policy.SacLearner", "learner.register_learner"
     file = one_more(tmp_path, "guiderail.tools.learning", *kinds, "sac_of_mine")
-    settings = {"units": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
+    settings = {"net_arch": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
     done = run(
-        "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "hold": 20}, algorithm="sac_of_mine",
+        "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "action_repeat": 20}, algorithm="sac_of_mine",
         settings=settings, episodes=2, imports=[str(file)],
     )  # fmt: skip
     assert done["episodes"] == 2
@@ -425,7 +425,7 @@ def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, for
 
 def test_a_demonstrated_episode_is_marked(bead_config, tmp_path):
     rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=always_left)
-    assert [row["demonstrated"] for row in rows[:3]] == [1, 1, 0]
+    assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
 
 
 def test_a_folder_that_cannot_be_one_is_refused(tmp_path):

@@ -24,7 +24,7 @@ from oracles.parts import PARTS
 COMMAND = [sys.executable, "-c", "from guiderail.tools.cli.main import main; main()"]
 COLUMNS = (
     "part", "real-time factor", "deepest [mm]", "allowed [mm]", "aligned", "1.5 mm off", "demonstrations alone",
-    "white",
+    "uniform_random",
     "held out", "converged after", "episodes", "minutes",
 )  # fmt: skip
 
@@ -76,7 +76,9 @@ def learned(name: str, out: Path, log: Path, episodes: int, seed: int) -> dict:
 
 def judged(name: str, out: Path, log: Path, episodes: int) -> dict:
     """Held-out places that training never drew."""
-    said = guiderail(log, "evaluate", out / "runs" / name, "--episodes", episodes, "--beside", "white", "--json")
+    said = guiderail(
+        log, "evaluate", out / "runs" / name, "--episodes", episodes, "--baselines", "uniform_random", "--json"
+    )
     return json.loads(said.strip().splitlines()[-1])
 
 
@@ -94,13 +96,13 @@ def all_of(name: str, out: Path, episodes: int, seed: int, held_out: int) -> lis
     found = finished(kept / f"{name}-judged.json", lambda: judged(name, out, log, held_out))
     minutes = measured["minutes"] + trained["training_minutes"] + found["minutes"]
     whose = ("demonstration_success_rate", "white_success_rate", "success_rate")
-    alone, white, success = (f"{found[which] * found['episodes']:.0f}" for which in whose)
+    alone, uniform_random, success = (f"{found[which] * found['episodes']:.0f}" for which in whose)
     return [
         *row,
         alone,
-        white,
+        uniform_random,
         f"{success} of {found['episodes']}",
-        found["converged_after"],
+        found["episodes_to_convergence"],
         trained["episodes"],
         f"{minutes:.1f}",
     ]

@@ -103,9 +103,9 @@ def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(replay, "EPISODES", 1)
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
-    call("evaluate", tmp_path / "run", "--episodes", 1, "--beside", "none", "--json")
+    call("evaluate", tmp_path / "run", "--episodes", 1, "--baselines", "none", "--json")
     found = json.loads(capsys.readouterr().out)
-    assert found["worst_violation"] <= 1e-9
+    assert found["max_commanded_violation"] <= 1e-9
     assert (tmp_path / "run/replay.html").is_file()
 
 

@@ -48,7 +48,7 @@ class Page:
             await self.call("Input.dispatchKeyEvent", type=kind, code=code, key=key)
 
 
-class Person:
+class Supervisor:
     """Who sits before the page, looks at where the robot is, and presses keys one after the other."""
 
     def __init__(self, page, session, seed):
@@ -147,7 +147,7 @@ async def person(url, session, connected, picture):
         await page.press("KeyM")  # slow motion: keys take their time
         for number in range(COUNT):
             kept = len(session.kept)
-            whoever = Person(page, session, number)
+            whoever = Supervisor(page, session, number)
             await whoever.page.press("Backspace")  # from the start, as nothing was shown yet
             await asyncio.sleep(0.5)
             await whoever.demonstrate(known(session), picture if number == 0 else None)

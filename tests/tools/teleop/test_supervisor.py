@@ -8,7 +8,7 @@ from pydrake.geometry import Meshcat
 
 from guiderail.tools.environments import make_environment
 from guiderail.tools.teleop import supervisor as page_person
-from guiderail.tools.teleop.supervisor import FARTHEST, KEYS, LET_GO, SAYS, PagePerson
+from guiderail.tools.teleop.supervisor import FARTHEST, KEYS, LET_GO, SAYS, MeshcatSupervisor
 
 
 class Page:
@@ -36,7 +36,7 @@ class Page:
 
 @pytest.fixture
 def env():
-    env = make_environment("NarrowPassage", {"guidance": "kgrl", "hold": 10})
+    env = make_environment("NarrowPassage", {"guidance": "kgrl", "action_repeat": 10})
     yield env
     env.close()
 
@@ -50,7 +50,7 @@ def watched(person, env):
 
 def test_sliders_push_until_they_are_let_go(env):
     page = Page()
-    person = watched(PagePerson(print, page), env)
+    person = watched(MeshcatSupervisor(print, page), env)
     assert person.push(None) is None
     page.sliders["push 2"] = -2.5
     np.testing.assert_array_equal(person.push(None), [0.0, -2.5])
@@ -61,7 +61,7 @@ def test_sliders_push_until_they_are_let_go(env):
 
 def test_a_click_is_one_word(env):
     page = Page()
-    person = watched(PagePerson(print, page), env)
+    person = watched(MeshcatSupervisor(print, page), env)
     assert person.says() is None
     for name, (_, word) in SAYS.items():
         page.clicks[name] += 2
@@ -71,7 +71,7 @@ def test_a_click_is_one_word(env):
 
 def test_of_what_is_said_between_two_episodes_a_stop_alone_counts(env, monkeypatch):
     page = Page()
-    person = PagePerson(print, page)
+    person = MeshcatSupervisor(print, page)
     monkeypatch.setattr(page_person, "look_at", lambda page, declaration: None)
     monkeypatch.setattr(page_person, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
     for name, (_, word) in SAYS.items():
@@ -87,7 +87,7 @@ def test_no_key_has_two_meanings():
 
 
 def test_an_episode_is_shown_on_a_real_page(env):
-    person = PagePerson(print)
+    person = MeshcatSupervisor(print)
     assert isinstance(person.meshcat, Meshcat)
     env.reset(seed=0)
     person.begin(env)

@@ -259,7 +259,7 @@ def test_whoever_rests_does_not_demonstrate_resting(session):
 
 def test_the_page_opens_before_the_part(session):
     eye, target = session.meshcat.lines["camera"]
-    assert np.linalg.norm(target - session.task.world().X_WT.translation()) < 0.05
+    assert np.linalg.norm(target - session.task.workcell().X_WT.translation()) < 0.05
     assert np.linalg.norm(eye - target) < 0.3
 
 

@@ -10,14 +10,14 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 from guiderail.tools.environments import check_environment, make_environment
-from guiderail.tools.evaluation.baselines import NullPolicy, always, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, always, uniform_random
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.visualization import motion
-from guiderail.tools.visualization.episode_spec import Shown
+from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.motion import DRAWN, Motion, violation_unit
 from guiderail.tools.visualization.replay import report_beside, write_page
 
-ENVIRONMENT = {"guidance": "kgrl", "hold": 10}
+ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
 BALL = f"{DRAWN}/robot/ball"
 
 
@@ -36,7 +36,7 @@ def page(tmp_path_factory):
     (study / "run").mkdir()
     file = study / "run" / "replay.html"
     arguments = check_environment("NarrowPassage", ENVIRONMENT)
-    shown = Shown("NarrowPassage", arguments, _to_the_right, "to the right", "constant", run=file.parent)
+    shown = EpisodeSpec("NarrowPassage", arguments, _to_the_right, "to the right", "constant", run=file.parent)
     row = write_page(file, shown, episodes=2)
     return file.read_text(encoding="utf-8"), row
 
@@ -68,7 +68,7 @@ def test_before_is_the_demonstration_alone_from_the_same_start(page):
 def test_who_pushes_at_the_constraint_is_seen_to_reach_it_and_no_more(page):
     text, row = page
     (episode, _) = data(text)["sides"][1]["episodes"]
-    assert max(episode["commanded"]) == pytest.approx(row["worst_violation"], abs=1e-9)
+    assert max(episode["commanded"]) == pytest.approx(row["max_commanded_violation"], abs=1e-9)
     assert max(episode["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
     assert data(text)["violation"] == {"unit": "mm", "scale": 1000.0}
 
@@ -94,7 +94,7 @@ def test_a_report_is_linked_where_there_is_one(page, tmp_path):
 
 def test_no_peak_of_force_is_lost_where_an_episode_is_longer_than_a_page_is_wide(monkeypatch):
     monkeypatch.setattr(motion, "POINTS", 7)
-    env = make_environment("NarrowPassage", {"guidance": "residual", "hold": 10}, render_mode="human")
+    env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 10}, render_mode="human")
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)
     watching = Motion(env)
@@ -103,7 +103,7 @@ def test_no_peak_of_force_is_lost_where_an_episode_is_longer_than_a_page_is_wide
     assert len(shown["times"]) <= 8
     assert shown["times"][-1] == pytest.approx(len(trace) * trace.period)
     assert max(shown["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
-    assert max(shown["commanded"]) == pytest.approx(row["worst_violation"], rel=1e-4)
+    assert max(shown["commanded"]) == pytest.approx(row["max_commanded_violation"], rel=1e-4)
     np.testing.assert_allclose(poses(shown["frames"][BALL])[-1, :2], trace.measured[-1], atol=1e-6)
     env.close()
 
@@ -122,7 +122,9 @@ def test_a_violation_has_the_unit_of_what_is_bounded(constraints, outputs, unit)
 
 
 def test_a_page_without_an_episode_is_refused(tmp_path):
-    shown = Shown("NarrowPassage", {}, lambda env: NullPolicy(white, env), "white", "white")
+    shown = EpisodeSpec(
+        "NarrowPassage", {}, lambda env: BaselinePolicy(uniform_random, env), "uniform_random", "uniform_random"
+    )
     with pytest.raises(InputError, match="at least one episode"):
         write_page(tmp_path / "replay.html", shown, episodes=0)
 
@@ -130,7 +132,7 @@ def test_a_page_without_an_episode_is_refused(tmp_path):
 @pytest.mark.parametrize("name", ["policy.safetensors", "."])
 def test_a_page_that_would_replace_what_is_none_is_refused_before_an_episode_is_run(name, tmp_path):
     (tmp_path / "policy.safetensors").write_text("weights")
-    shown = Shown("NarrowPassage", {}, lambda env: pytest.fail("it goes on"), "white", "white")
+    shown = EpisodeSpec("NarrowPassage", {}, lambda env: pytest.fail("it goes on"), "uniform_random", "uniform_random")
     with pytest.raises(InputError, match="a page is"):
         write_page(tmp_path / name, shown)
     assert (tmp_path / "policy.safetensors").read_text() == "weights"

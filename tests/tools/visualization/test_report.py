@@ -11,10 +11,10 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import NullPolicy, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.evaluation.step_log import Ledger, read_ledger
+from guiderail.tools.evaluation.step_log import StepLog, read_ledger
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import train
@@ -23,7 +23,7 @@ from guiderail.tools.visualization.curves import plot_run
 from guiderail.tools.visualization.report import write_report
 from guiderail.tools.visualization.report_data import command, gather
 
-SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
+SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,8 @@ def studied(tmp_path_factory):
             train(RunFolder(folder / f"{guidance}-{seed}"), config)
     rows = [("learner", "learned", seed, 3, 10, rate) for seed, rate in ((1, 0.9), (2, 0.7))]
     rows.append(("nothing", "zero", 1, 0, 10, 0.1))
-    table = pd.DataFrame(rows, columns=["method", "policy", "seed", "mark", "episodes", "success_rate"])
-    write_table(folder / "beads", table.assign(judged_on="held out"))
+    table = pd.DataFrame(rows, columns=["method", "policy", "seed", "after_episodes", "episodes", "success_rate"])
+    write_table(folder / "beads", table.assign(eval_set="held out"))
     return folder
 
 
@@ -76,7 +76,7 @@ def test_runs_are_named_by_what_they_differ_in(studied):
 def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
     run = studied / "skgrl-1"
     judged = gather([run], episodes=2).held_out
-    assert set(judged["policy"]) == {"learned", "demonstration", "white", "constant"}
+    assert set(judged["policy"]) == {"learned", "demonstration", "uniform_random", "constant"}
     assert judged["episodes"].eq(2).all()
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     gather([run], episodes=2)
@@ -85,13 +85,17 @@ def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
 
 def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_path):
     run = shutil.copytree(studied / "skgrl-2", tmp_path / "run")
-    others = {"white": partial(NullPolicy, white)}
+    others = {"uniform_random": partial(BaselinePolicy, uniform_random)}
     evaluate(run, episodes=4, environment={"wall": -0.5}, beside=others)
     evaluate(run, episodes=4, seed=7, beside=others)
     assert len(gather([run]).held_out) == 0
     evaluate(run, episodes=2, beside=others)
     judged = gather([run]).held_out
-    assert judged[["policy", "episodes"]].to_numpy().tolist() == [["demonstration", 2], ["white", 2], ["learned", 2]]
+    assert judged[["policy", "episodes"]].to_numpy().tolist() == [
+        ["demonstration", 2],
+        ["uniform_random", 2],
+        ["learned", 2],
+    ]
 
 
 def test_rows_of_a_part_of_a_study_are_counted_once_and_its_command_says_so(studied, tmp_path):
@@ -134,10 +138,10 @@ def test_a_run_without_a_column_has_no_figure_of_it(studied, tmp_path):
     table = pd.read_csv(run / "episodes.csv")
     table.drop(columns="mean_squared_force").to_csv(run / "episodes.csv", index=False)
     assert "success rate over" in write_report([run], tmp_path / "page.html").read_text()
-    table.drop(columns="worst_violation").to_csv(run / "episodes.csv", index=False)
-    with pytest.raises(InputError, match="no worst_violation; train anew"):
+    table.drop(columns="max_commanded_violation").to_csv(run / "episodes.csv", index=False)
+    with pytest.raises(InputError, match="no max_commanded_violation; train anew"):
         write_report([run], tmp_path / "page.html")
-    with pytest.raises(InputError, match="no worst_violation; train anew"):
+    with pytest.raises(InputError, match="no max_commanded_violation; train anew"):
         plot_run(run)
     table.assign(fault="NONE").to_csv(run / "episodes.csv", index=False)  # a column of words, as a robot's run has
     assert plot_run(run).is_file()
@@ -147,7 +151,7 @@ def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):
     config = configure("NarrowPassage", {"guidance": "residual"}, episodes=1)
     folder, env = RunFolder(tmp_path / "run"), make_environment("NarrowPassage", config.environment)
     folder.create(config)
-    folder.write_episodes([rollout(env, lambda _: np.array([1.0, 0.0]), Ledger(env, folder.ledger), seed=0)])
+    folder.write_episodes([rollout(env, lambda _: np.array([1.0, 0.0]), StepLog(env, folder.ledger), seed=0)])
     env.close()
     (run,) = gather([tmp_path / "run"]).runs
     ledger, row = read_ledger(tmp_path / "run" / "ledger"), run.episodes.iloc[0]
@@ -155,7 +159,7 @@ def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):
     assert run.safety["steps"] == len(ledger) == row["steps"]
     assert run.safety["collision_steps"] > 0
     assert run.safety["poses_outside"] == (ledger["measured_violation"] > 1e-9).sum()
-    assert run.safety["worst_command"] == row["worst_violation"]
+    assert run.safety["worst_command"] == row["max_commanded_violation"]
     assert run.safety["collision_steps"] == row["collision_steps"]
     (tmp_path / "run" / "ledger" / "episode-000000.parquet").unlink()
     with pytest.raises(InputError, match="holds no ledger"):

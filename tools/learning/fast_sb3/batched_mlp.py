@@ -53,18 +53,20 @@ def _split(flat: torch.Tensor, inputs: int, outputs: int) -> tuple[torch.Tensor,
 
 
 @dataclass
-class Pass:
+class ForwardCache:
     """What a forward pass leaves for the backward one: by layer, its input, and what the normalization knows."""
 
     inputs: list[torch.Tensor]
     normalized: list[tuple[torch.Tensor, ...]]
 
-    def first(self, rows: int) -> "Pass":
+    def first(self, rows: int) -> "ForwardCache":
         """Of the first rows of the batch only."""
-        return Pass([x[:, :rows] for x in self.inputs], [tuple(x[:, :rows] for x in kept) for kept in self.normalized])
+        return ForwardCache(
+            [x[:, :rows] for x in self.inputs], [tuple(x[:, :rows] for x in kept) for kept in self.normalized]
+        )
 
 
-class Perceptrons:
+class BatchedMLP:
     """Hidden layers that are rectified, and one that is not; the number of networks may differ from layer to layer."""
 
     def __init__(self, layers: Sequence[Linear], layer_norm: bool):
@@ -77,9 +79,9 @@ class Perceptrons:
         self._layers = list(layers)
         self._layer_norm = layer_norm
 
-    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, Pass]:
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ForwardCache]:
         """(n or 1, batch, inputs) to (n, batch, outputs)."""
-        done = Pass([x], [])
+        done = ForwardCache([x], [])
         for layer in self._layers[:-1]:
             x = layer.forward(x)
             if self._layer_norm:
@@ -90,20 +92,20 @@ class Perceptrons:
             done.inputs.append(x)
         return self._layers[-1].forward(x), done
 
-    def backward(self, done: Pass, d: torch.Tensor) -> None:
+    def backward(self, done: ForwardCache, d: torch.Tensor) -> None:
         """Writes the gradient of all weights, given that of the output, (n, batch, outputs)."""
         for index in reversed(range(1, len(self._layers))):
             self._layers[index].backward(done.inputs[index], d)
             d = self._through(index, done, d)
         self._layers[0].backward(done.inputs[0], d)
 
-    def input_gradient(self, done: Pass, d: torch.Tensor, columns: slice) -> torch.Tensor:
+    def input_gradient(self, done: ForwardCache, d: torch.Tensor, columns: slice) -> torch.Tensor:
         """That of so many columns of the input, (n or 1, batch, columns); no weight's gradient is touched."""
         for index in reversed(range(1, len(self._layers))):
             d = self._through(index, done, d)
         return self._layers[0].input_gradient(d, len(done.inputs[0]) == 1, columns)
 
-    def _through(self, index: int, done: Pass, d: torch.Tensor) -> torch.Tensor:
+    def _through(self, index: int, done: ForwardCache, d: torch.Tensor) -> torch.Tensor:
         """From behind a layer to behind the one before it."""
         x = done.inputs[index]
         d = torch.ops.aten.threshold_backward(self._layers[index].input_gradient(d, len(x) == 1), x, 0)

@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN
 
-from guiderail.tools.learning.fast_sb3.batched_mlp import Linear, Perceptrons
+from guiderail.tools.learning.fast_sb3.batched_mlp import BatchedMLP, Linear
 from guiderail.tools.learning.fast_sb3.flat_adam import FlatAdam, flatten
 
 _SQUASHED = 1e-6  # Stable-Baselines3 adds it to a tanh's slope before it takes the logarithm
@@ -54,7 +54,7 @@ class Ensemble(_Algorithm):
         self._stack()
 
     def _stack(self) -> None:
-        """The networks as `Perceptrons` on the same numbers."""
+        """The networks as `BatchedMLP` on the same numbers."""
         actor, critic = self.policy.actor, self.policy.critic
         layer_norm = getattr(actor.activation_fn, "kind", None) == "normalized_relu"
         if not layer_norm and actor.activation_fn is not torch.nn.ReLU:
@@ -67,7 +67,7 @@ class Ensemble(_Algorithm):
         shared = sum(_count(*pair) for pair in pairwise(trunk))
         values, gradient = actor.optimizer.values, actor.optimizer.gradient
         # The mean and the logarithm of the standard deviation are two networks on one trunk.
-        self._actor = Perceptrons(
+        self._actor = BatchedMLP(
             _layers(values[:shared].view(1, -1), gradient[:shared].view(1, -1), trunk)
             + _layers(values[shared:].view(2, -1), gradient[shared:].view(2, -1), head),
             layer_norm,
@@ -75,13 +75,13 @@ class Ensemble(_Algorithm):
         outputs = critic.q_networks[0][-1].out_features
         sizes = [self._features + self._actions, *actor.net_arch, outputs]
         networks = len(critic.q_networks)
-        self._critic = Perceptrons(
+        self._critic = BatchedMLP(
             _layers(critic.optimizer.values.view(networks, -1), critic.optimizer.gradient.view(networks, -1), sizes),
             layer_norm,
         )
         self._target_values = flatten(self.policy.critic_target.parameters())
         unused = torch.empty_like(self._target_values)
-        self._target = Perceptrons(
+        self._target = BatchedMLP(
             _layers(self._target_values.view(networks, -1), unused.view(networks, -1), sizes), layer_norm
         )
 

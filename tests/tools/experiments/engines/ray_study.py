@@ -30,12 +30,12 @@ STUDY = {
     "name": "eight",
     "task": "NarrowPassage",
     "env": {"guidance": "kgrl"},
-    "learner": {"preset": "quick", "episodes": 3},
+    "learner": {"preset": "tqc_fast", "episodes": 3},
     "methods": {"kgrl": {}},
     "seeds": list(range(8)),
     "judged on": [{"episodes": 2}],
 }
-SETTINGS = {"units": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
+SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
 BEAD = {
     **{"name": "eight", "task": "Bead", "methods": {"bead": {}}, "seeds": list(range(8))},
     **{"learner": {"settings": SETTINGS, "episodes": 40}, "judged on": [{"episodes": 2}]},

@@ -9,7 +9,7 @@ from sb3_contrib.common.utils import quantile_huber_loss
 from stable_baselines3 import SAC
 from torch.nn.utils import parameters_to_vector
 
-from guiderail.tools.evaluation.rollout import Decision
+from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.fast_sb3.ensemble import Ensemble
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
@@ -37,16 +37,16 @@ class PlainTqc(OffPolicyLearner):
 PAIRS = [(PlainSac, SacLearner), (PlainTqc, TqcLearner)]
 
 
-def make(kind, preset="robust", env=Vector, **settings):
-    settings = {"units": "32,24", "batch_size": BATCH, "symmetry": False, "learning_rate": 1e-4} | settings
-    learner = kind(resolve_preset(preset, "tqc", settings), env(), hold=10, seed=0, decisions=300)
+def make(kind, preset="tqc_contact", env=Vector, **settings):
+    settings = {"net_arch": "32,24", "batch_size": BATCH, "symmetry": False, "learning_rate": 1e-4} | settings
+    learner = kind(resolve_preset(preset, "tqc", settings), env(), action_repeat=10, seed=0, decisions=300)
     random, space = np.random.default_rng(0), env.observation_space
     for index in range(200):
         seen, then = random.uniform(0, 2, (2, *space.shape)).astype(space.dtype)
         if len(space.shape) == 3:
             seen, then = (np.moveaxis(image, 0, -1) for image in (seen, then))
         action, reward = random.uniform(-1, 1, 2).astype(np.float32), float(3 * random.normal())
-        learner.remember(Decision(seen, action, reward, then, index % 50 == 49, False, {}))
+        learner.remember(Transition(seen, action, reward, then, index % 50 == 49, False, {}))
     return learner
 
 
@@ -76,7 +76,7 @@ def same(plain, ensemble, tolerance):
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
 @pytest.mark.parametrize(
     ("preset", "settings"),
-    [("robust", {}), ("quick", {"n_steps": 3}), ("quick", {"entropy": "0.2", "units": "16"})],
+    [("tqc_contact", {}), ("tqc_fast", {"n_steps": 3}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})],
 )
 def test_it_is_the_gradient_step_of_stable_baselines3(plain, ensemble, preset, settings):
     expected, found = make(plain, preset, **settings), make(ensemble, preset, **settings)
