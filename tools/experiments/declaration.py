@@ -40,11 +40,9 @@ EvaluatedFile = Annotated[str, _filled_in(name="held_out", mark=60, episodes=100
 
 
 class _Strict(BaseModel):
-    """Unknown keys are refused; `first_seed` is written `first seed`."""
+    """Base of the declarations: unknown keys are refused."""
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, populate_by_name=True, alias_generator=lambda name: name.replace("_", " ")
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class LearnerChoice(_Strict):
@@ -248,7 +246,7 @@ def _sentence(error: ValidationError) -> str:
         kinds: tuple[type[BaseModel], ...] = (
             Study, Method, LearnerChoice, EvalSet, Sweep, Ratio, Certifiable, *PROGRAMS.values()
         )  # fmt: skip
-        known = {str(field.alias) for kind in kinds for field in kind.model_fields.values()}
+        known = {name for kind in kinds for name in kind.model_fields}
         return f"{where} is nothing that a study has: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
