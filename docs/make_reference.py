@@ -404,8 +404,8 @@ def _range(row: Mapping[str, Any]) -> str:
     return ", ".join(among + bounds)
 
 
-SKILL_WORDS = {
-    "name": "of the skill, in messages and pictures",
+TEMPLATE_WORDS = {
+    "name": "of the template, in messages and pictures",
     "inputs": "how many numbers a person or a policy gives, 1 to 6, each in [−1, 1]",
     "frames": "names of the objects that it is about; a task says where they are; `world` and `tool` are always there",
     "parameters": "names with numbers that a task can replace; any number below may be arithmetic on them",
@@ -440,9 +440,9 @@ def shipped_templates() -> str:
     """The files of guiderail's own templates, as they are."""
     from importlib import resources
 
-    folder = resources.files("guiderail.models.templates")
+    folder = Path(str(resources.files("guiderail.models") / "objects"))
     page = ""
-    for file in sorted((one for one in folder.iterdir() if one.name.endswith(".yaml")), key=lambda one: one.name):
+    for file in sorted(folder.glob("*/*.yaml"), key=lambda one: one.name):
         name = file.name.removesuffix(".yaml")
         page += f"### The template {name}\n\n`load_template({name!r})`:\n\n"
         page += f"```yaml\n{file.read_text(encoding='utf-8').rstrip()}\n```\n\n"
@@ -454,14 +454,16 @@ def templates() -> str:
     from guiderail.models.templates import schema as loader
     from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
 
-    if set(SKILL_WORDS) != loader.SKILL_FIELDS:
-        raise ValueError(f"a skill's fields changed: {set(SKILL_WORDS) ^ loader.SKILL_FIELDS} have no words here")
+    if set(TEMPLATE_WORDS) != loader.TEMPLATE_FIELDS:
+        raise ValueError(
+            f"the fields of a template changed: {set(TEMPLATE_WORDS) ^ loader.TEMPLATE_FIELDS} have no words here"
+        )
     page = (
         "# Template files\n\nA shared control template is a YAML file; `load_template(path)` reads it and "
         "`guiderail check FILE` says what is wrong with it, in a sentence. "
         "[Write a template](../tutorials/write_a_template.md) makes one.\n\n"
     )
-    page += table(["field", "what it is"], [(code(n), cell(w)) for n, w in SKILL_WORDS.items()])
+    page += table(["field", "what it is"], [(code(n), cell(w)) for n, w in TEMPLATE_WORDS.items()])
     page += "## A state\n\n" + table(["field", "what it is"], [(code(n), cell(w)) for n, w in STATE_WORDS.items()])
     page += (
         f"At most {loader.MOST_STATES} states, {loader.MOST_PARTS} entries in a list, and {loader.LARGEST_NUMBER:g} "
@@ -674,7 +676,7 @@ def wiring() -> str:
     import numpy as np
     from pydrake.math import RigidTransform
 
-    from guiderail.diagrams.guidance import GUIDANCE, PrimitiveConfig, PriorKnowledge, Template, build_guidance
+    from guiderail.diagrams.guidance import GUIDANCE, PlacedTemplate, PrimitiveConfig, PriorKnowledge, build_guidance
     from guiderail.models.control.keep_out import KeepOut
     from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
     from guiderail.models.templates import load_template
@@ -685,7 +687,7 @@ def wiring() -> str:
     walls = KeepOut([[5.0, 5.0]], [[6.0, 6.0]], box, margin=0.0)
     skill = PrimitiveConfig(reference, box, period, horizon=4, keep_out=walls)
     shown = PriorKnowledge(period, demonstrations=skill, pose_size=2)
-    template = PriorKnowledge(period, template=Template(load_template("grid_clamp"), {"hole": RigidTransform()}))
+    template = PriorKnowledge(period, template=PlacedTemplate(load_template("grid_clamp"), {"hole": RigidTransform()}))
     page = (
         "# Guidance as it is wired\n\nRead from the diagrams that `build_guidance` makes, here of demonstrations in a "
         "plane and of the grid clamp's template. A diagram's own ports have no system before the dot. "

@@ -11,8 +11,8 @@ from guiderail.diagrams.guidance.sct import SctGuidance
 from guiderail.models.common.poses import transform_to_pose
 
 PERIOD = 0.02
-skill = load_template("pouring", mug_radius_m=0.05)  # a wider mug than the file's own
-guidance = SctGuidance(skill, {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}, PERIOD)
+template = load_template("pouring", mug_radius_m=0.05)  # a wider mug than the file's own
+guidance = SctGuidance(template, {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}, PERIOD)
 
 builder = DiagramBuilder()
 builder.AddNamedSystem("guidance", guidance)
@@ -27,6 +27,6 @@ simulator = Simulator(diagram)
 context = guidance.GetMyContextFromRoot(simulator.get_context())
 for seconds in (0.5, 1.0, 2.0):
     simulator.AdvanceTo(seconds)
-    state = skill.states[int(guidance.GetOutputPort("state").Eval(context)[0])].name
+    state = template.states[int(guidance.GetOutputPort("state").Eval(context)[0])].name
     height = guidance.get_desired_pose_output_port().Eval(context)[2] - 0.3
     print(f"after {seconds} s it is in {state}, {100 * height:.1f} cm above the mug")

@@ -20,7 +20,7 @@ from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
-from guiderail.systems.support.skill_frames import SkillFrames
+from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class ActiveConstraintProjector(LeafSystem):
@@ -50,22 +50,22 @@ class ActiveConstraintProjector(LeafSystem):
         - measured_violation
 
     All poses are (6,), [x y z Rz Ry Rx] in metres and radians; the other ports are (1,). ``state`` is the number of the
-    skill's state. Violations are the larger of metres and radians from the projection, 0 inside.
+    template's state. Violations are the larger of metres and radians from the projection, 0 inside.
 
     Attributes:
-        frames: the poses of the skill's objects, which a reset can set.
+        frames: the poses of the template's objects, which a reset can set.
     """
 
     def __init__(
         self,
-        skill: SharedControlTemplate,
+        template: SharedControlTemplate,
         frames: Mapping[str, RigidTransform],
         period: float,
         max_tracking_error: float = np.inf,
     ):
         """
         Args:
-            skill: the template.
+            template: the template.
             frames: the poses of its objects by name, in the frame that poses are given in.
             period: between two control steps [s], positive.
             max_tracking_error: distance of the robot from its command beyond which that waits [m], positive.
@@ -78,8 +78,8 @@ class ActiveConstraintProjector(LeafSystem):
         check_period(period)
         if not max_tracking_error > 0.0:
             raise InputError(f"the greatest tracking error must be positive, not {max_tracking_error} m")
-        self._skill, self._period, self._max_tracking_error = skill, period, max_tracking_error
-        self.frames = SkillFrames(self, skill, frames)
+        self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
+        self.frames = TemplateFrames(self, template, frames)
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
@@ -125,7 +125,7 @@ class ActiveConstraintProjector(LeafSystem):
         return self._pose_port
 
     def get_state_input_port(self) -> InputPort:
-        """The number of the skill's state, (1,)."""
+        """The number of the template's state, (1,)."""
         return self._state_port
 
     def get_desired_pose_output_port(self) -> OutputPort:
@@ -150,7 +150,7 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _violation(self, context: Context, pose: np.ndarray) -> float:
         state = int(self._state_port.Eval(context)[0])
-        return self._skill.violation(state, pose_to_transform(pose), self.frames.eval(context))
+        return self._template.violation(state, pose_to_transform(pose), self.frames.eval(context))
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """The command (6,), and 1 if it waits, else 0."""
@@ -171,7 +171,7 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _constrained(self, context: Context, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
         """What the constraints and one period make of a request, (6,)."""
-        command = self._skill.command(
+        command = self._template.command(
             int(self._state_port.Eval(context)[0]),
             pose_to_transform(last),
             pose_to_transform(requested),
@@ -198,11 +198,11 @@ class ActiveConstraintProjector(LeafSystem):
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         measured = self._pose_port.Eval(context)
         if not np.isfinite(measured).all():
-            raise InputError(f"a skill begins where the robot is: its measured pose must be finite, not {measured}")
+            raise InputError(f"a template begins where the robot is: its measured pose must be finite, not {measured}")
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
         # Not the state port's value: that is decided at this same instant.
-        state = self._skill.state_at(X_WE, frames)
-        command = self._skill.command(state, X_WE, X_WE, frames, self._period)
+        state = self._template.state_at(X_WE, frames)
+        command = self._template.command(state, X_WE, X_WE, frames, self._period)
         discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))
         return EventStatus.Succeeded()
 

@@ -9,7 +9,7 @@ from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSyste
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.sampling import check_period
-from guiderail.systems.support.skill_frames import SkillFrames
+from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class SctInputMapping(LeafSystem):
@@ -31,16 +31,16 @@ class SctInputMapping(LeafSystem):
         - requested_pose
 
     ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians;
-    ``state`` is (1,), the number of the skill's state.
+    ``state`` is (1,), the number of the template's state.
 
     Attributes:
-        frames: the poses of the skill's objects, which a reset can set.
+        frames: the poses of the template's objects, which a reset can set.
     """
 
-    def __init__(self, skill: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
+    def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         """
         Args:
-            skill: the template.
+            template: the template.
             frames: the poses of its objects by name, in the frame that poses are given in.
             period: for which an input is held [s], positive.
 
@@ -49,10 +49,10 @@ class SctInputMapping(LeafSystem):
         """
         super().__init__()
         check_period(period)
-        self._skill = skill
+        self._template = template
         self._period = period
-        self.frames = SkillFrames(self, skill, frames)
-        self._action_port = self.DeclareVectorInputPort("action", skill.inputs)
+        self.frames = TemplateFrames(self, template, frames)
+        self._action_port = self.DeclareVectorInputPort("action", template.inputs)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
         self._requested_pose_port = self.DeclareVectorOutputPort(
@@ -76,7 +76,7 @@ class SctInputMapping(LeafSystem):
         return self._pose_port
 
     def get_state_input_port(self) -> InputPort:
-        """The number of the skill's state, (1,)."""
+        """The number of the template's state, (1,)."""
         return self._state_port
 
     def get_requested_pose_output_port(self) -> OutputPort:
@@ -89,11 +89,11 @@ class SctInputMapping(LeafSystem):
             output.SetFromVector(np.full(6, np.nan))
             return
         X_WE = pose_to_transform(self._pose_port.Eval(context))
-        displacement = self._skill.map(
+        displacement = self._template.map(
             int(self._state_port.Eval(context)[0]),
             action,
             X_WE,
             self.frames.eval(context),
             self._period,
         )
-        output.SetFromVector(transform_to_pose(self._skill.displace(X_WE, displacement)))
+        output.SetFromVector(transform_to_pose(self._template.displace(X_WE, displacement)))

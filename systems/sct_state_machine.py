@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.sampling import check_period
-from guiderail.systems.support.skill_frames import SkillFrames
+from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class SctStateMachine(LeafSystem):
@@ -46,13 +46,13 @@ class SctStateMachine(LeafSystem):
     equation 3.2.
 
     Attributes:
-        frames: the poses of the skill's objects, which a reset can set.
+        frames: the poses of the template's objects, which a reset can set.
     """
 
-    def __init__(self, skill: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
+    def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         """
         Args:
-            skill: the template.
+            template: the template.
             frames: the poses of its objects by name, in the frame that poses are given in.
             period: between two control steps [s], positive.
 
@@ -61,11 +61,11 @@ class SctStateMachine(LeafSystem):
         """
         super().__init__()
         check_period(period)
-        self._skill, self._period = skill, period
-        self.frames = SkillFrames(self, skill, frames)
+        self._template, self._period = template, period
+        self.frames = TemplateFrames(self, template, frames)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._initial_pose_port = self.DeclareVectorInputPort("initial_pose", 6)
-        self._state = self.DeclareDiscreteState([float(skill.initial_state)])
+        self._state = self.DeclareDiscreteState([float(template.initial_state)])
         self._state_port = self.DeclareStateOutputPort("state", self._state)
         prerequisites = {self._pose_port.ticket(), self.discrete_state_ticket(self._state), self.frames.ticket}
         self._transition_distance_port = self.DeclareVectorOutputPort(
@@ -86,7 +86,7 @@ class SctStateMachine(LeafSystem):
         return self._initial_pose_port
 
     def get_state_output_port(self) -> OutputPort:
-        """The number of the skill's state, (1,)."""
+        """The number of the template's state, (1,)."""
         return self._state_port
 
     def get_transition_distance_output_port(self) -> OutputPort:
@@ -102,19 +102,19 @@ class SctStateMachine(LeafSystem):
         return state, pose_to_transform(self._pose_port.Eval(context)), self.frames.eval(context)
 
     def _calc_transition_distance(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._skill.distance(*self._state_pose_frames(context)))
+        output.SetAtIndex(0, self._template.distance(*self._state_pose_frames(context)))
 
     def _calc_progress(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._skill.progress(*self._state_pose_frames(context)))
+        output.SetAtIndex(0, self._template.progress(*self._state_pose_frames(context)))
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         X_WE = pose_to_transform(self._initial_pose_port.Eval(context))
-        discrete_state.set_value([float(self._skill.state_at(X_WE, self.frames.eval(context)))])
+        discrete_state.set_value([float(self._template.state_at(X_WE, self.frames.eval(context)))])
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
         if context.get_time() > 0:
-            state = self._skill.next_state(*self._state_pose_frames(context), self._period)
+            state = self._template.next_state(*self._state_pose_frames(context), self._period)
             discrete_state.set_value([float(state)])
         return EventStatus.Succeeded()

@@ -1,9 +1,9 @@
 from .function import FunctionGuidance as FunctionGuidance
 from .guidance import Guidance as Guidance
 from .primitive_config import PrimitiveConfig as PrimitiveConfig
+from .prior import PlacedTemplate as PlacedTemplate
 from .prior import PriorKnowledge as PriorKnowledge
 from .prior import ScriptedApproach as ScriptedApproach
-from .prior import Template as Template
 from .registry import GUIDANCE as GUIDANCE
 from .registry import GuidanceKind as GuidanceKind
 from .registry import build_guidance as build_guidance

@@ -16,23 +16,23 @@ from guiderail.models.templates import SharedControlTemplate
 
 
 @dataclass(frozen=True)
-class Template:
-    """A shared control template in its surroundings.
+class PlacedTemplate:
+    """A shared control template and the poses of its objects in a scene.
 
     Attributes:
-        skill: the template.
-        frames: the poses X_TF of its objects by name, in the frame that the station's poses are given in.
-        active_constraints: whether they hold; None leaves it to the kind of guidance.
-        leash: [m] how far the robot may be from its command before that waits.
+        template: the template.
+        frames: poses X_TF of the template's objects by name, in the frame of the station's poses.
+        active_constraints: whether the active constraints are enforced; None: the kind of guidance decides.
+        max_tracking_error: distance [m] between the robot and its command beyond which the command waits.
     """
 
-    skill: SharedControlTemplate
+    template: SharedControlTemplate
     frames: Mapping[str, RigidTransform]
     active_constraints: bool | None = None
     max_tracking_error: float = np.inf
 
     def constrained(self, by_default: bool) -> bool:
-        """Whether the active constraints hold for a kind of guidance that says so `by_default`."""
+        """Return `active_constraints`, or the guidance's own `by_default` if it is None."""
         return by_default if self.active_constraints is None else self.active_constraints
 
 
@@ -58,7 +58,7 @@ class PriorKnowledge:
     Attributes:
         period: s, seconds between control steps.
         demonstrations: with constraints, walls to keep out of, and how a policy may move between them.
-        template: in its surroundings.
+        template: shared control template and the poses of its objects.
         approach: a scripted one.
         options: of the kind of guidance itself, by name, where it declares some.
         pose_size: O of the station.
@@ -67,7 +67,7 @@ class PriorKnowledge:
 
     period: float
     demonstrations: PrimitiveConfig | None = None
-    template: Template | None = None
+    template: PlacedTemplate | None = None
     approach: ScriptedApproach | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     pose_size: int = POSE_SIZE

@@ -20,7 +20,7 @@ from guiderail.systems.safety_filter import SafetyFilter
 class ResidualDescent(Guidance):
     """Residual learning without demonstrations: p̂_t = p_t + Δp_t, where p_t comes straight down.
 
-    ``action`` is (3,); what is commanded also keeps the skill's greatest speeds. Exports ``measured_violation`` too.
+    ``action`` is (3,); the command also respects the template's greatest speeds. Exports ``measured_violation`` too.
     """
 
     def __init__(self, known: PriorKnowledge):
@@ -32,8 +32,8 @@ class ResidualDescent(Guidance):
         super().__init__()
         assert known.template is not None
         assert known.approach is not None
-        template, approach, period = known.template, known.approach, known.period
-        skill = template.skill if template.constrained(True) else template.skill.without_active_constraints()
+        placed, approach, period = known.template, known.approach, known.period
+        template = placed.template if placed.constrained(True) else placed.template.without_active_constraints()
         builder = DiagramBuilder()
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, 3))
         times = [0.0, (approach.heights[0] - approach.heights[1]) / approach.speed]
@@ -44,7 +44,7 @@ class ResidualDescent(Guidance):
         held = builder.AddNamedSystem("descent_hold", ZeroOrderHold(period, POSE_SIZE))
         spread = builder.AddNamedSystem("spread", MatrixGain(D=np.eye(POSE_SIZE, 3)))
         residual = builder.AddNamedSystem("residual", Residual(np.array([approach.reach] * 3 + [0.0] * 3)))
-        constraints = ActiveConstraintFilter(skill, template.frames, period)
+        constraints = ActiveConstraintFilter(template, placed.frames, period)
         builder.AddNamedSystem("active_constraints", constraints)
         wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
         builder.Connect(line.get_output_port(), held.get_input_port())

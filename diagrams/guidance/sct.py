@@ -20,7 +20,7 @@ from guiderail.systems.sct_state_machine import SctStateMachine
 
 
 class ActiveConstraintFilter(Diagram):
-    """The active constraints and the state machine of a skill, behind anything that requests a pose.
+    """The active constraints and the state machine of a template, behind anything that requests a pose.
 
     .. pydrake_system::
 
@@ -41,23 +41,23 @@ class ActiveConstraintFilter(Diagram):
 
     def __init__(
         self,
-        skill: SharedControlTemplate,
+        template: SharedControlTemplate,
         frames: Mapping[str, RigidTransform],
         period: float,
         max_tracking_error: float = np.inf,
     ):
         """
         Args:
-            skill: the template.
+            template: the template.
             frames: the poses X_WF of its objects by name; W is the frame that all poses are given in.
             period: seconds between control steps.
-            leash: [m] how far the robot may be from its command before that waits.
+            max_tracking_error: distance [m] between the robot and its command beyond which the command waits.
         """
         super().__init__()
         builder = DiagramBuilder()
-        self._projector = ActiveConstraintProjector(skill, frames, period, max_tracking_error)
+        self._projector = ActiveConstraintProjector(template, frames, period, max_tracking_error)
         builder.AddNamedSystem("projector", self._projector)
-        self._machine = SctStateMachine(skill, frames, period)
+        self._machine = SctStateMachine(template, frames, period)
         builder.AddNamedSystem("state_machine", self._machine)
         # The state follows the command, not the measured pose: so the command is always inside the constraints of the
         # state that it is made for, and a transition doesn't depend on how well the robot tracks.
@@ -98,7 +98,7 @@ class SctGuidance(Guidance):
 
     def __init__(
         self,
-        skill: SharedControlTemplate,
+        template: SharedControlTemplate,
         frames: Mapping[str, RigidTransform],
         period: float,
         *,
@@ -108,20 +108,20 @@ class SctGuidance(Guidance):
     ):
         """
         Args:
-            skill: the template.
+            template: the template.
             frames: the poses X_WF of its objects by name; W is the frame that all poses are given in.
             period: seconds between control steps.
-            input_mapping: a skill whose initial state maps the inputs, instead of the template's own mappings: so its
-                active constraints are a safety filter behind, for one, a plain end-effector velocity.
+            input_mapping: a second template whose initial state maps the inputs in place of the first one's mappings.
+                The active constraints are then a safety filter, for example for a plain end-effector velocity.
             active_constraints: False leaves the constraints out, and what was requested is commanded.
-            leash: [m] how far the robot may be from its command before that waits.
+            max_tracking_error: distance [m] between the robot and its command beyond which the command waits.
         """
         super().__init__()
         builder = DiagramBuilder()
-        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, (input_mapping or skill).inputs))
-        self._mapping = SctInputMapping(input_mapping or skill, frames, period)
+        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, (input_mapping or template).inputs))
+        self._mapping = SctInputMapping(input_mapping or template, frames, period)
         builder.AddNamedSystem("input_mapping", self._mapping)
-        constrained = skill if active_constraints else skill.without_active_constraints()
+        constrained = template if active_constraints else template.without_active_constraints()
         self._filter = ActiveConstraintFilter(constrained, frames, period, max_tracking_error)
         builder.AddNamedSystem("active_constraints", self._filter)
         if input_mapping is None:
@@ -155,14 +155,14 @@ def _through_template(
     known: PriorKnowledge, input_mapping: SharedControlTemplate | None, constrained: bool
 ) -> SctGuidance:
     assert known.template is not None
-    template = known.template
+    placed = known.template
     return SctGuidance(
-        template.skill,
-        template.frames,
+        placed.template,
+        placed.frames,
         known.period,
         input_mapping=input_mapping,
         active_constraints=constrained,
-        max_tracking_error=template.max_tracking_error if constrained else np.inf,
+        max_tracking_error=placed.max_tracking_error if constrained else np.inf,
     )
 
 

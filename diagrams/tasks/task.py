@@ -16,7 +16,7 @@ from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.task_diagram import Symmetry
-from guiderail.diagrams.guidance.prior import ScriptedApproach, Template
+from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Station
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
@@ -164,7 +164,7 @@ class Task(ABC):
         """Walls that safe residual learning stops before."""
         raise NotImplementedError
 
-    def template(self) -> Template:
+    def template(self) -> PlacedTemplate:
         """A shared control template."""
         raise NotImplementedError
 

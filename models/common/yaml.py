@@ -1,4 +1,4 @@
-"""YAML that a person wrote: skills, run configurations and studies.
+"""YAML that a person wrote: templates, run configurations and studies.
 
 It is read as YAML 1.2's core schema has it, of numbers, texts, lists and mappings alone: `yes` is a text, `1e-3` a
 number, and `010` is a text rather than eight. Whatever a text holds, reading it takes a bounded time and memory.
@@ -13,7 +13,7 @@ import yaml
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import read_bytes
 
-LARGEST_TEXT = 100_000  # [bytes] a skill has five thousand
+LARGEST_TEXT = 100_000  # [bytes] a template has five thousand
 MOST_NODES = 10_000  # with every alias counted as what it stands for
 DEEPEST = 30  # lists and mappings inside each other
 

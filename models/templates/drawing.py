@@ -1,4 +1,4 @@
-"""A skill's state machine, drawn: as Graphviz text for those who have it, as a picture for everyone."""
+"""A template's state machine, drawn: as Graphviz text for those who have it, as a picture for everyone."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +17,10 @@ def state_lines(state: TemplateState) -> list[str]:
     return [*mappings, *constraints, f"d: {type(state.transition_distance).__name__}"]
 
 
-def edges(skill: SharedControlTemplate) -> list[tuple[str, str, str]]:
+def edges(template: SharedControlTemplate) -> list[tuple[str, str, str]]:
     """(from, to, condition) of every transition, the ways back included."""
     arrows = []
-    for state in skill.states:
+    for state in template.states:
         unit = state.transition_distance.unit
         scale = 1.0 if unit == "m" else 57.29577951308232
         for transition in state.transitions:
@@ -31,14 +31,14 @@ def edges(skill: SharedControlTemplate) -> list[tuple[str, str, str]]:
     return arrows
 
 
-def to_dot(skill: SharedControlTemplate) -> str:
+def to_dot(template: SharedControlTemplate) -> str:
     """The state machine in Graphviz's language."""
-    lines = [f"digraph {_quoted(skill.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
-    for number, state in enumerate(skill.states):
+    lines = [f"digraph {_quoted(template.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
+    for number, state in enumerate(template.states):
         label = "\n".join([state.name.upper(), *state_lines(state)])
-        emphasis = ", penwidth=2" if number == skill.initial_state else ""
+        emphasis = ", penwidth=2" if number == template.initial_state else ""
         lines.append(f"  {_quoted(state.name)} [label={_quoted(label)}{emphasis}];")
-    lines += [f"  {_quoted(start)} -> {_quoted(end)} [label={_quoted(said)}];" for start, end, said in edges(skill)]
+    lines += [f"  {_quoted(start)} -> {_quoted(end)} [label={_quoted(said)}];" for start, end, said in edges(template)]
     return "\n".join([*lines, "}"]) + "\n"
 
 
@@ -48,43 +48,43 @@ def _quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def draw(skill: SharedControlTemplate, path: str | Path) -> None:
+def draw(template: SharedControlTemplate, path: str | Path) -> None:
     """Writes the state machine to a file: .dot or .gv as text, .png, .svg or .pdf as a picture."""
     path = Path(path)
     if path.suffix in (".dot", ".gv"):
-        path.write_text(to_dot(skill), encoding="utf-8")
+        path.write_text(to_dot(template), encoding="utf-8")
         return
     if path.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(f"A state machine can't be drawn as {path.suffix or 'that'}; use .png, .svg, .pdf or .dot.")
-    drawn(skill).savefig(path, dpi=120)
+    drawn(template).savefig(path, dpi=120)
 
 
-def drawn(skill: SharedControlTemplate) -> "Figure":
+def drawn(template: SharedControlTemplate) -> "Figure":
     """The state machine as a Matplotlib figure, which a notebook shows."""
     from matplotlib.figure import Figure
 
     width, gap = 1.8, 1.7
-    tallest = max(len(state_lines(state)) for state in skill.states)
-    size = (len(skill.states) * (width + gap) + 0.4, 0.2 * tallest + 1.0)
+    tallest = max(len(state_lines(state)) for state in template.states)
+    size = (len(template.states) * (width + gap) + 0.4, 0.2 * tallest + 1.0)
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.add_subplot()
     axes.set_axis_off()
-    axes.set_xlim(-width / 2 - 0.2, (len(skill.states) - 1) * (width + gap) + width / 2 + 0.2)
+    axes.set_xlim(-width / 2 - 0.2, (len(template.states) - 1) * (width + gap) + width / 2 + 0.2)
     axes.set_ylim(-1.4, 1.4)
     plain: Any = {"parse_math": False}  # a name with a dollar is a name
-    where = {state.name: i * (width + gap) for i, state in enumerate(skill.states)}
-    for number, state in enumerate(skill.states):
+    where = {state.name: i * (width + gap) for i, state in enumerate(template.states)}
+    for number, state in enumerate(template.states):
         box = {
             "boxstyle": "round,pad=0.5",
             "facecolor": "#eef3f8",
             "edgecolor": "#33506b",
-            "linewidth": 2.2 if number == skill.initial_state else 1.0,
+            "linewidth": 2.2 if number == template.initial_state else 1.0,
         }
         text = "\n".join([state.name.upper(), *state_lines(state)])
         axes.text(
             where[state.name], 0.0, text, ha="center", va="center", fontsize=8, linespacing=1.4, bbox=box, **plain
         )
-    for start, end, condition in edges(skill):
+    for start, end, condition in edges(template):
         forward = where[end] > where[start]
         side = 1.0 if forward else -1.0
         y = 0.25 * side
@@ -106,5 +106,5 @@ def drawn(skill: SharedControlTemplate) -> "Figure":
             fontsize=8,
             color="#33506b",
         )
-    axes.set_title(f"{skill.name}: {skill.inputs} inputs", fontsize=10, **plain)
+    axes.set_title(f"{template.name}: {template.inputs} inputs", fontsize=10, **plain)
     return figure

@@ -1,6 +1,6 @@
 """The kinds of input mapping, active constraint and transition distance: one class and one registration each.
 
-A kind is a frozen dataclass whose fields are exactly what a skill file may say about it, units in their names. It
+A kind is a frozen dataclass whose fields are exactly what a template file may say about it, units in their names. It
 registers itself under the word that the file uses:
 
     @register(ACTIVE_CONSTRAINTS, "half_space")
@@ -25,7 +25,7 @@ Kind = TypeVar("Kind", bound=type)
 
 
 def register(registry: dict[str, type], name: str) -> Callable[[Kind], Kind]:
-    """Makes a dataclass available to skill files under `name`; a name is given once."""
+    """Makes a dataclass available to template files under `name`; a name is given once."""
 
     def add(kind: Kind) -> Kind:
         if name in registry:

@@ -21,7 +21,7 @@ class InputMapping(ABC):
 
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
-        """ΔH during one period, from all of the skill's inputs, each in [−1, 1]."""
+        """ΔH during one period, from all of the template's inputs, each in [−1, 1]."""
 
     @property
     @abstractmethod

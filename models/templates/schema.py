@@ -1,4 +1,4 @@
-"""Reads a skill from a YAML file, and says in one sentence what is wrong with one."""
+"""Reads a template from a YAML file, and says in one sentence what is wrong with one."""
 
 import ast
 import math
@@ -39,8 +39,8 @@ OPERATORS: dict[type, Callable[..., float]] = {
 MOST_STATES = 30
 MOST_PARTS = 30  # mappings, constraints or transitions of one state
 LONGEST_EXPRESSION = 200  # characters
-LARGEST_NUMBER = 1e6  # in any unit of a skill: metres, degrees, radians, seconds
-SKILL_FIELDS = {
+LARGEST_NUMBER = 1e6  # in any unit of a template: metres, degrees, radians, seconds
+TEMPLATE_FIELDS = {
     "name",
     "inputs",
     "frames",
@@ -53,28 +53,28 @@ SKILL_FIELDS = {
 
 
 def load_template(source: str | Path, **parameters: float) -> SharedControlTemplate:
-    """Reads a skill.
+    """Reads a template.
 
     Args:
-        source: a file that ends in .yaml or .yml, or the name of one of guiderail's own skills: `pouring`,
+        source: a file that ends in .yaml or .yml, or the name of one of guiderail's own templates: `pouring`,
             `pouring_aimed`, `grid_clamp` or `end_effector_velocity`.
         **parameters: sizes of the objects at hand, in place of the file's own values under `parameters`.
 
     Raises:
-        InputError: if the file cannot be read, or what it says is not a skill.
+        InputError: if the file cannot be read, or what it says is not a template.
     """
     path = Path(source)
     if path.suffix not in (".yaml", ".yml"):
         files = _shipped_files()
         if str(source) not in files:
-            raise InputError(f"There is no skill {brief(str(source))}; {did_you_mean(str(source), files)}")
+            raise InputError(f"There is no template {brief(str(source))}; {did_you_mean(str(source), files)}")
         path = files[str(source)]
-        return _skill(_shipped(path), path.name, parameters)
-    return _skill(load_yaml(path, "skill"), path.name, parameters)
+        return _template(_shipped(path), path.name, parameters)
+    return _template(load_yaml(path, "template"), path.name, parameters)
 
 
 def shipped_templates() -> list[str]:
-    """The names of guiderail's own skills."""
+    """The names of guiderail's own templates."""
     return sorted(_shipped_files())
 
 
@@ -86,16 +86,16 @@ def _shipped_files() -> dict[str, Path]:
 @lru_cache
 def _shipped(path: Path) -> Any:
     """What one of guiderail's own files says: environments are checked and made many times in a study."""
-    return load_yaml(path, "skill")
+    return load_yaml(path, "template")
 
 
-def parse_template(text: str, where: str = "skill", **parameters: float) -> SharedControlTemplate:
+def parse_template(text: str, where: str = "template", **parameters: float) -> SharedControlTemplate:
     """Like load_template, from the YAML text itself; `where` names it in messages."""
-    return _skill(parse_yaml(text, where), where, parameters)
+    return _template(parse_yaml(text, where), where, parameters)
 
 
-def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> SharedControlTemplate:
-    data = _mapping(data, where, SKILL_FIELDS, required=SKILL_FIELDS - {"frames", "parameters", "initial_state"})
+def _template(data: Any, where: str, parameters: Mapping[str, float]) -> SharedControlTemplate:
+    data = _mapping(data, where, TEMPLATE_FIELDS, required=TEMPLATE_FIELDS - {"frames", "parameters", "initial_state"})
     number = _Numbers(_parameters(data.get("parameters", {}), parameters, where))
 
     frames = data.get("frames", [])
@@ -111,7 +111,7 @@ def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> SharedCont
     if not isinstance(states, dict) or not states:
         raise InputError(f"{where}: states must be a mapping from names to states, with at least one.")
     if len(states) > MOST_STATES:
-        raise InputError(f"{where}: {len(states)} states are more than {MOST_STATES}; make two skills of it.")
+        raise InputError(f"{where}: {len(states)} states are more than {MOST_STATES}; make two templates of it.")
     for name in states:
         if not _is_name(name):
             raise InputError(f"{where}: {brief(name)} can't name a state; take a short word.")
@@ -128,7 +128,7 @@ def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> SharedCont
         if not speed > 0:
             raise InputError(f"{where}: {key} must be positive, not {speed}.")
     built = tuple(_state(name, state, f"{where}, state {name}", number) for name, state in states.items())
-    skill = SharedControlTemplate(
+    template = SharedControlTemplate(
         name=data["name"],
         inputs=inputs,
         frames=tuple(frames),
@@ -137,8 +137,8 @@ def _skill(data: Any, where: str, parameters: Mapping[str, float]) -> SharedCont
         parameters=dict(number.names),
         **speeds,
     )
-    _check_names(skill, where)
-    return skill
+    _check_names(template, where)
+    return template
 
 
 class _Numbers:
@@ -298,10 +298,10 @@ def _transition(data: Any, unit: str, si: float, where: str, number: _Numbers) -
     return Transition(data["to"], si * number(data[below], f"{where}, {below}"), margin)
 
 
-def _check_names(skill: SharedControlTemplate, where: str) -> None:
+def _check_names(template: SharedControlTemplate, where: str) -> None:
     """Refuses states, frames and inputs that are named but not there."""
-    states = [state.name for state in skill.states]
-    for state in skill.states:
+    states = [state.name for state in template.states]
+    for state in template.states:
         place = f"{where}, state {state.name}"
         for transition in state.transitions:
             if transition.to not in states:
@@ -309,10 +309,10 @@ def _check_names(skill: SharedControlTemplate, where: str) -> None:
                     f"{place}: there is no state {brief(transition.to)}; {did_you_mean(transition.to, states)}"
                 )
         for frame in sorted(state.frame_names):
-            if frame not in skill.frames:
-                known = (*skill.frames, WORLD)
+            if frame not in template.frames:
+                known = (*template.frames, WORLD)
                 raise InputError(f"{place}: there is no frame {brief(frame)}; {did_you_mean(frame, known)}")
         for mapping in state.input_mapping:
             for used in mapping.used_inputs:
-                if not 0 <= used < skill.inputs:
-                    raise InputError(f"{place}: there is no input {used}; they are 0 to {skill.inputs - 1}.")
+                if not 0 <= used < template.inputs:
+                    raise InputError(f"{place}: there is no input {used}; they are 0 to {template.inputs - 1}.")

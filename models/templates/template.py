@@ -73,7 +73,7 @@ class SharedControlTemplate:
     takes `frames`, it is their poses X_WF by name.
 
     Attributes:
-        name: of the skill.
+        name: of the template.
         inputs: how many numbers, each in [−1, 1], a person or a policy gives.
         frames: the names of the objects' frames.
         states: at least one, numbered from 0.
@@ -103,7 +103,7 @@ class SharedControlTemplate:
         raise InputError(f"{self.name} has no state {state!r}; {did_you_mean(state, [s.name for s in self.states])}")
 
     def without_active_constraints(self) -> "SharedControlTemplate":
-        """The same skill with its input mappings, states and distances, and nothing that holds anyone back."""
+        """The same template with its input mappings, states and distances, and nothing that holds anyone back."""
         return replace(self, states=tuple(replace(state, active_constraints=()) for state in self.states))
 
     def map(
@@ -137,7 +137,7 @@ class SharedControlTemplate:
         """The pose nearest to a request that the constraints allow and that one period can reach from the last command.
 
         A constraint may ask for more than it seems: an orientation that depends on the position turns quickly where
-        the position is near the object. Where the projected request is too far away for the skill's greatest speeds,
+        the position is near the object. Where the projected request is too far away for the template's greatest speeds,
         it is the displacement that is scaled down, so that the orientation never lags behind the position; likewise
         where one constraint undoes another. From a last command that is inside, a command is always inside. One that
         is outside (an episode begins there, or an object has moved) is led inside at the greatest speed.

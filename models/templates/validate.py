@@ -1,6 +1,6 @@
-"""What `guiderail check SKILL.yaml` asks of a skill, beyond what loading it refuses.
+"""What `guiderail check TEMPLATE.yaml` asks of a template, beyond what loading it refuses.
 
-The checks sample: they place the skill's objects and the end effector at random near each other and look at what the
+The checks sample: they place the template's objects and the end effector at random near each other and look at what the
 laws do. A mistake that shows in one pose of a few hundred is found, a rarer one may not be.
 """
 
@@ -33,27 +33,29 @@ class Finding:
     message: str
 
 
-def validate(skill: SharedControlTemplate, seed: int = 0) -> list[Finding]:
+def validate(template: SharedControlTemplate, seed: int = 0) -> list[Finding]:
     """Everything that was found, errors first."""
     rng = np.random.default_rng(seed)
-    scenes = [_scene(skill, rng) for _ in range(SAMPLES)]
+    scenes = [_scene(template, rng) for _ in range(SAMPLES)]
     findings = [
-        *_unused(skill),
-        *_unreachable(skill),
-        *_constraints(skill, scenes),
-        *_transitions(skill, scenes, rng),
-        *_jumps(skill, scenes),
+        *_unused(template),
+        *_unreachable(template),
+        *_constraints(template, scenes),
+        *_transitions(template, scenes, rng),
+        *_jumps(template, scenes),
     ]
     return sorted(findings, key=lambda finding: not finding.is_error)
 
 
-def _scene(skill: SharedControlTemplate, rng: np.random.Generator) -> tuple[RigidTransform, dict[str, RigidTransform]]:
+def _scene(
+    template: SharedControlTemplate, rng: np.random.Generator
+) -> tuple[RigidTransform, dict[str, RigidTransform]]:
     """An end effector at random near upright objects that stand at random."""
     frames = {}
-    for name in skill.frames:
+    for name in template.frames:
         yaw = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
         frames[name] = RigidTransform(yaw, rng.uniform(-0.3, 0.3, 3))
-    X_WF = frames[skill.frames[rng.integers(len(frames))]] if frames else RigidTransform()
+    X_WF = frames[template.frames[rng.integers(len(frames))]] if frames else RigidTransform()
     # As many poses near as far: constraints are closest to each other near an object.
     p_FE = rng.normal(size=3)
     p_FE *= REACH * rng.uniform() / np.linalg.norm(p_FE)
@@ -61,30 +63,30 @@ def _scene(skill: SharedControlTemplate, rng: np.random.Generator) -> tuple[Rigi
     return RigidTransform(X_WF.rotation() @ R_FE, X_WF @ p_FE), frames
 
 
-def _unused(skill: SharedControlTemplate) -> Iterator[Finding]:
-    used = {i for state in skill.states for mapping in state.input_mapping for i in mapping.used_inputs}
-    for i in sorted(set(range(skill.inputs)) - used):
+def _unused(template: SharedControlTemplate) -> Iterator[Finding]:
+    used = {i for state in template.states for mapping in state.input_mapping for i in mapping.used_inputs}
+    for i in sorted(set(range(template.inputs)) - used):
         yield Finding(False, f"input {i} moves nothing in any state; lower `inputs` or map it")
-    named = {frame for state in skill.states for frame in state.frame_names}
-    for frame in sorted(set(skill.frames) - named):
+    named = {frame for state in template.states for frame in state.frame_names}
+    for frame in sorted(set(template.frames) - named):
         yield Finding(False, f"the frame {frame} is never used; leave it out")
 
 
-def _unreachable(skill: SharedControlTemplate) -> Iterator[Finding]:
-    reached, waiting = set(), [skill.initial_state]
+def _unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
+    reached, waiting = set(), [template.initial_state]
     while waiting:
         number = waiting.pop()
         if number not in reached:
             reached.add(number)
-            waiting += [skill.index(transition.to) for transition in skill.states[number].transitions]
-    for number, state in enumerate(skill.states):
+            waiting += [template.index(transition.to) for transition in template.states[number].transitions]
+    for number, state in enumerate(template.states):
         if number not in reached:
             yield Finding(True, f"no transition leads to the state {state.name}; add one, or leave the state out")
 
 
-def _constraints(skill: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+def _constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
     """Each constraint idempotent; their sequence too, and inside every one of them."""
-    for number, state in enumerate(skill.states):
+    for number, state in enumerate(template.states):
         for i, constraint in enumerate(state.active_constraints):
             name = f"{state.name}: active constraint {i + 1} ({type(constraint).__name__})"
             worst = max(constraint.violation(constraint.project(X, frames), frames) for X, frames in scenes)
@@ -93,9 +95,9 @@ def _constraints(skill: SharedControlTemplate, scenes: Scenes) -> Iterator[Findi
         outside = np.zeros(len(state.active_constraints))
         again = 0.0
         for X, frames in scenes:
-            X_WP = skill.project(number, X, frames)
+            X_WP = template.project(number, X, frames)
             outside += [c.violation(X_WP, frames) > TOLERANCE for c in state.active_constraints]
-            again = max(again, _difference(skill.project(number, X_WP, frames), X_WP))
+            again = max(again, _difference(template.project(number, X_WP, frames), X_WP))
         for i in np.flatnonzero(outside).tolist():
             kind = type(state.active_constraints[i]).__name__
             if outside[i] == len(scenes):
@@ -118,37 +120,37 @@ def _difference(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
     )
 
 
-def _transitions(skill: SharedControlTemplate, scenes: Scenes, rng: np.random.Generator) -> Iterator[Finding]:
+def _transitions(template: SharedControlTemplate, scenes: Scenes, rng: np.random.Generator) -> Iterator[Finding]:
     """Some inputs, from some pose inside a state's constraints, bring its distance below every threshold."""
-    for number, state in enumerate(skill.states):
+    for number, state in enumerate(template.states):
         goals = [(f"the transition to {t.to}", t.below) for t in state.transitions]
         goals = goals or [("the end", state.ends_at + TOLERANCE)]
         lowest = min(threshold for _, threshold in goals)
         starts = sorted(
-            ((skill.project(number, X, frames), frames) for X, frames in scenes),
-            key=lambda start: skill.distance(number, *start),
+            ((template.project(number, X, frames), frames) for X, frames in scenes),
+            key=lambda start: template.distance(number, *start),
         )
         # From the nearest pose, and from where a phase begins: either proves that the distance can get there.
         best = np.inf
         for X, frames in [starts[0], *starts[len(starts) // 2 :: len(starts) // 8]]:
-            best = min(best, _greedy(skill, number, X, frames, lowest)[0])
+            best = min(best, _greedy(template, number, X, frames, lowest)[0])
             if best < lowest:
                 break
         for goal, threshold in goals:
             if best > threshold:
-                inside = skill.distance(number, *starts[0])
+                inside = template.distance(number, *starts[0])
                 why = (
                     "no input leads there" if inside <= threshold else "the active constraints keep it away from there"
                 )
                 yield Finding(
                     True, f"{state.name}: {goal} never fires: {why} (nearest {best:.3g}, threshold {threshold:.3g})"
                 )
-        if all(skill.distance(number, X, frames) < lowest for X, frames in starts):
+        if all(template.distance(number, X, frames) < lowest for X, frames in starts):
             yield Finding(False, f"{state.name}: every pose is below the threshold; the state is left at once")
 
 
 def _greedy(
-    skill: SharedControlTemplate,
+    template: SharedControlTemplate,
     number: int,
     X_WE: RigidTransform,
     frames: Frames,
@@ -156,14 +158,14 @@ def _greedy(
     period: float = GREEDY_PERIOD,
 ) -> tuple[float, RigidTransform]:
     """The least distance that the single input that lowers it most, chosen anew at every step, reaches, and where."""
-    candidates = [sign * row for row in np.eye(skill.inputs) for sign in (1.0, -1.0)]
-    best = skill.distance(number, X_WE, frames)
+    candidates = [sign * row for row in np.eye(template.inputs) for sign in (1.0, -1.0)]
+    best = template.distance(number, X_WE, frames)
     for _ in range(GREEDY_STEPS):
         options = []
         for inputs in candidates:
-            request = skill.displace(X_WE, skill.map(number, inputs, X_WE, frames, period))
-            X = skill.command(number, X_WE, request, frames, period).X_WE
-            options.append((skill.distance(number, X, frames), X))
+            request = template.displace(X_WE, template.map(number, inputs, X_WE, frames, period))
+            X = template.command(number, X_WE, request, frames, period).X_WE
+            options.append((template.distance(number, X, frames), X))
         distance, X_WE = min(options, key=lambda option: option[0])
         if distance > best - 1e-6 * period:
             return min(best, distance), X_WE
@@ -173,22 +175,22 @@ def _greedy(
     return best, X_WE
 
 
-def _jumps(skill: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+def _jumps(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
     """Where a transition is due, one control step leads into the next state's constraints; otherwise it waits."""
-    reach = GREEDY_PERIOD * max(skill.max_speed_m_per_s, skill.max_speed_rad_per_s)
-    for number, state in enumerate(skill.states):
-        inside = [(skill.project(number, X, frames), frames) for X, frames in scenes]
+    reach = GREEDY_PERIOD * max(template.max_speed_m_per_s, template.max_speed_rad_per_s)
+    for number, state in enumerate(template.states):
+        inside = [(template.project(number, X, frames), frames) for X, frames in scenes]
         for transition in state.transitions:
-            target, arrived, waiting, worst = skill.index(transition.to), 0, 0, 0.0
-            before = [start for start in inside if skill.distance(number, *start) >= transition.below]
+            target, arrived, waiting, worst = template.index(transition.to), 0, 0, 0.0
+            before = [start for start in inside if template.distance(number, *start) >= transition.below]
             for X, frames in before[:ARRIVALS]:
                 # Slowly where it comes near, or it would arrive farther beyond the threshold than a control step leads.
-                _, X_WE = _greedy(skill, number, X, frames, transition.below + reach)
-                distance, X_WE = _greedy(skill, number, X_WE, frames, transition.below, CONTROL_PERIOD)
+                _, X_WE = _greedy(template, number, X, frames, transition.below + reach)
+                distance, X_WE = _greedy(template, number, X_WE, frames, transition.below, CONTROL_PERIOD)
                 if distance < transition.below:
                     arrived += 1
-                    waiting += not skill.can_enter(target, X_WE, frames, CONTROL_PERIOD)
-                    worst = max(worst, skill.violation(target, X_WE, frames))
+                    waiting += not template.can_enter(target, X_WE, frames, CONTROL_PERIOD)
+                    worst = max(worst, template.violation(target, X_WE, frames))
             if waiting:
                 yield Finding(
                     False,

@@ -55,12 +55,12 @@ class RecomputedViolation(EnvCallback):
             return (c - np.einsum("nfo,no->nf", G, poses)).max(axis=1, initial=-np.inf)
         if self._frames is None or "template" not in task.provides():
             return np.full(len(poses), -np.inf)
-        template = task.template()
-        frames = {**template.frames, **self._frames(self.base.drawn)}
+        placed = task.template()
+        frames = {**placed.frames, **self._frames(self.base.drawn)}
         states = self.base.trace.signals["state"][:, 0].astype(int)
         return np.array(
             [
-                template.skill.violation(state, pose_to_transform(pose), frames)
+                placed.template.violation(state, pose_to_transform(pose), frames)
                 for state, pose in zip(states, poses, strict=True)
             ]
         )

@@ -4,21 +4,21 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.options import make_skill
+from guiderail.diagrams.tasks.pouring.options import make_template
 from guiderail.models.templates.drawing import draw, edges, state_lines
 from guiderail.tools.tables import write_table
 
 
 def figure_2_2(out: Path) -> dict[str, Any]:
     """Its states, what inputs do in each, where they end, and the constraints in the order that they apply."""
-    skill = make_skill(PouringConfig())
+    template = make_template(PouringConfig())
     rows = []
-    for state in skill.states:
-        following = [f"{to} where {condition}" for start, to, condition in edges(skill) if start == state.name]
+    for state in template.states:
+        following = [f"{to} where {condition}" for start, to, condition in edges(template) if start == state.name]
         lines = "; ".join(state_lines(state))
         rows.append({"state": state.name, "what it does": lines, "goes on to": "; ".join(following)})
     picture = out / "figure_2_2.png"
     table = write_table(out / "figure_2_2", rows)
-    draw(skill, picture)
-    states = ", ".join(state.name for state in skill.states)
-    return {"picture": str(picture), "table": str(table), "states": states, "inputs": skill.inputs}
+    draw(template, picture)
+    states = ", ".join(state.name for state in template.states)
+    return {"picture": str(picture), "table": str(table), "states": states, "inputs": template.inputs}

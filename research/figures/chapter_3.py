@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.options import make_skill
+from guiderail.diagrams.tasks.pouring.options import make_template
 from guiderail.diagrams.tasks.pouring.rewards import APPROACH, NEAR, NEAR_BONUS, TERMINAL, TILT
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.templates.drawing import draw, state_lines
@@ -125,7 +125,7 @@ def table_3_2(out: Path) -> dict[str, Any]:
 
 def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
     """What is known about pouring, once as a reward and once as a template; and what that comes to while learning."""
-    skill = make_skill(PouringConfig())
+    template = make_template(PouringConfig())
     collision = f"collision {TERMINAL['collision']:g}"
     far = f"{APPROACH:g} a metre gained; turning about any axis -0.25 a radian; {collision}"
     near = (
@@ -136,10 +136,10 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
     rows = [
         {
             "state": state.name,
-            "reward function": near if state is skill.states[-1] else far,
+            "reward function": near if state is template.states[-1] else far,
             "shared control template": "; ".join(state_lines(state)),
         }
-        for state in skill.states
+        for state in template.states
     ]
     came = {
         method: ", ".join(f"{runs[f'{ending}_percent'].mean():.0f} % {ending}" for ending in ENDINGS)
@@ -149,7 +149,7 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
     known = {"reward function": came["rl_shaped"], "shared control template": came["rl_sct_shaped"]}
     rows.append({"state": "what it comes to (SAC)", **known})
     picture = out / "table_3_3.png"
-    draw(skill, picture)
+    draw(template, picture)
     table = write_table(out / "table_3_3", rows)
     return {"picture": str(picture), "table": str(table), **_poured(found), "condition": POURING}
 

@@ -12,9 +12,9 @@ from .diagrams.envs.task_diagram import round_period as round_period
 from .diagrams.guidance.function import FunctionGuidance as FunctionGuidance
 from .diagrams.guidance.guidance import Guidance as Guidance
 from .diagrams.guidance.primitive_config import PrimitiveConfig as PrimitiveConfig
+from .diagrams.guidance.prior import PlacedTemplate as PlacedTemplate
 from .diagrams.guidance.prior import PriorKnowledge as PriorKnowledge
 from .diagrams.guidance.prior import ScriptedApproach as ScriptedApproach
-from .diagrams.guidance.prior import Template as Template
 from .diagrams.guidance.registry import register_guidance as register_guidance
 from .diagrams.stations.registry import register_station as register_station
 from .diagrams.stations.station import Station as Station

@@ -92,13 +92,13 @@ def test_every_field_of_a_template_says_what_it_is(reference):
 
 def test_whatever_a_task_can_declare_and_every_shipped_template_is_there(reference):
     from guiderail.diagrams.tasks.task import Task
-    from guiderail.models import templates as skills
+    from guiderail.models import objects
 
     part = reference["names"].partition("\n### Task\n")[2].partition("\n### ")[0]
     declared = [name for name in Task.__annotations__ if not name.startswith("_")]
     assert len(declared) > 10
     assert not [name for name in declared if f"| `{name}` |" not in part]
-    for file in Path(skills.__file__).parent.glob("*.yaml"):
+    for file in Path(objects.__path__[0]).glob("*/*.yaml"):
         assert file.read_text(encoding="utf-8").rstrip() in reference["templates"], file.name
 
 

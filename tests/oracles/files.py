@@ -36,8 +36,8 @@ def csv_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
     return parts
 
 
-def skill_numbers(text: str) -> dict[tuple[str, ...], float]:
-    """Every number of a skill by its path, with PyYAML's own reader and Python's own arithmetic."""
+def template_numbers(text: str) -> dict[tuple[str, ...], float]:
+    """Every number of a template by its path, with PyYAML's own reader and Python's own arithmetic."""
     data = yaml.safe_load(text)
     parameters = {name: float(_value(value, {})) for name, value in (data.get("parameters") or {}).items()}
     found: dict[tuple[str, ...], float] = {("parameters", name): value for name, value in parameters.items()}

@@ -20,7 +20,7 @@ states:
   above:
     input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5}]
 """
-SKILL = parse_template(
+TEMPLATE = parse_template(
     "name: slab"
     + ABOVE
     + """    active_constraints:
@@ -38,8 +38,8 @@ START = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
 class Rig:
     """The projector with its inputs at hand."""
 
-    def __init__(self, start=START, max_tracking_error=np.inf, skill=SKILL):
-        self.system = ActiveConstraintProjector(skill, FRAMES, PERIOD, max_tracking_error)
+    def __init__(self, start=START, max_tracking_error=np.inf, template=TEMPLATE):
+        self.system = ActiveConstraintProjector(template, FRAMES, PERIOD, max_tracking_error)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.state = self.system.get_state_input_port().FixValue(self.context, [0.0])
@@ -69,14 +69,14 @@ class Rig:
 
 
 def test_ports():
-    system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD)
+    system = ActiveConstraintProjector(TEMPLATE, FRAMES, PERIOD)
     names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
     assert names == ["desired_pose", "last_desired_pose", "fallback", "commanded_violation", "measured_violation"]
     assert [system.get_output_port(i).size() for i in range(5)] == [6, 6, 1, 1, 1]
 
 
 def test_the_last_command_never_feeds_through():
-    system = ActiveConstraintProjector(SKILL, FRAMES, PERIOD)
+    system = ActiveConstraintProjector(TEMPLATE, FRAMES, PERIOD)
     last = system.get_last_desired_pose_output_port().get_index()
     assert not any(system.HasDirectFeedthrough(i, last) for i in range(system.num_input_ports()))
     # The command doesn't follow the measured pose within a step either.
@@ -98,11 +98,11 @@ def test_a_forbidden_request_is_projected_whatever_it_is():
     for _ in range(300):
         rig.step(np.concatenate([rng.normal(size=3), rng.uniform(-np.pi, np.pi, 3)]))
         X_WE = pose_to_transform(rig.desired())
-        assert SKILL.violation(0, X_WE, FRAMES) <= 1e-9
+        assert TEMPLATE.violation(0, X_WE, FRAMES) <= 1e-9
         assert rig.value("commanded_violation") <= 1e-9
 
 
-def test_never_faster_than_the_skill_allows():
+def test_never_faster_than_the_template_allows():
     rig = Rig()
     last = START
     for _ in range(150):
@@ -170,7 +170,7 @@ DOWN = START + [0.0, 0.0, -0.1, 0.0, 0.0, 0.0]
     ("request_", "measured"), [(DOWN, START - [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]), (NOWHERE, START), (DOWN, NOWHERE)]
 )
 def test_constraints_hold_while_it_waits_across_a_transition(request_, measured):
-    rig = Rig(max_tracking_error=0.01, skill=RAISED)
+    rig = Rig(max_tracking_error=0.01, template=RAISED)
     assert RAISED.can_enter(1, pose_to_transform(rig.desired()), FRAMES, PERIOD)
     before, _ = rig.step(START, measured=measured)
     for _ in range(5):
@@ -221,7 +221,7 @@ def test_refuses_to_begin_where_the_robot_is_nowhere():
 def test_refuses_an_object_that_is_nowhere():
     nowhere = {"slab": RigidTransform([0.0, np.nan, 0.0])}
     with pytest.raises(InputError, match="frame slab must be at a finite pose"):
-        ActiveConstraintProjector(SKILL, nowhere, PERIOD)
+        ActiveConstraintProjector(TEMPLATE, nowhere, PERIOD)
     rig = Rig()
     with pytest.raises(InputError, match="frame slab must be at a finite pose"):
         rig.system.frames.set(rig.context, nowhere)
@@ -274,4 +274,4 @@ def test_a_reset_can_move_an_object():
 @pytest.mark.parametrize(("period", "max_tracking_error"), [(0.0, 1.0), (-0.1, 1.0), (0.1, 0.0), (float("nan"), 1.0)])
 def test_refuses_what_makes_no_sense(period, max_tracking_error):
     with pytest.raises(InputError, match="positive"):
-        ActiveConstraintProjector(SKILL, FRAMES, period, max_tracking_error)
+        ActiveConstraintProjector(TEMPLATE, FRAMES, period, max_tracking_error)

@@ -53,7 +53,7 @@ def primitive(history):
 def built():
     """One instance of each system, with every port that it can have."""
     plant, arm = controller_model(BncWorkcell())
-    skill, frames = load_template("pouring"), {"mug_tip": RigidTransform()}
+    template, frames = load_template("pouring"), {"mug_tip": RigidTransform()}
     body, other = arm.tool[0], plant.world_body()
     gains = systems.ImpedanceGains(np.eye(6), np.ones(6), np.zeros(7))
     safety = systems.SafetyLimits((1.0,) * 7, (1.0,) * 7, (1.0,) * 7, decay_time=1.0)
@@ -61,7 +61,7 @@ def built():
     term = systems.RewardTerm("cost", {"u": 2}, lambda u: 0.0)
     browser = SimpleNamespace(AddSlider=lambda *arguments: None)
     instances = [
-        systems.ActiveConstraintProjector(skill, frames, PERIOD),
+        systems.ActiveConstraintProjector(template, frames, PERIOD),
         systems.CartesianImpedanceController(plant, arm.target, arm.tool_centre, gains, period=PERIOD),
         systems.CartesianPositionController(plant, arm.target, arm.tool_centre, posture=np.zeros(7), period=PERIOD),
         systems.CommandDisturbance(2, PERIOD, lost=0.5, late=1),
@@ -91,8 +91,8 @@ def built():
         systems.RewardSystem([term]),
         systems.SafetyFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0), PERIOD),
         systems.SafetyLedger(PERIOD),
-        systems.SctInputMapping(skill, frames, PERIOD),
-        systems.SctStateMachine(skill, frames, PERIOD),
+        systems.SctInputMapping(template, frames, PERIOD),
+        systems.SctStateMachine(template, frames, PERIOD),
         systems.SensorDisturbance(PERIOD, np.ones(2), delay=1),
         systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
         systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),

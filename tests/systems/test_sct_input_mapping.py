@@ -13,13 +13,13 @@ POSE = np.array([0.1, -0.06, 0.06, 0.0, 0.0, -1.2])
 
 
 @pytest.fixture(scope="module")
-def skill():
+def template():
     return load_template("pouring")
 
 
 @pytest.fixture
-def system(skill):
-    return SctInputMapping(skill, FRAMES, PERIOD)
+def system(template):
+    return SctInputMapping(template, FRAMES, PERIOD)
 
 
 def requested(system, action, state, pose=POSE, frames=None):
@@ -39,10 +39,10 @@ def test_ports(system):
 
 
 @pytest.mark.parametrize("state", [0, 1, 2])
-def test_displaces_as_the_law_says(system, skill, state):
+def test_displaces_as_the_law_says(system, template, state):
     action = np.array([0.3, 0.9, -0.4])
     X_WE = pose_to_transform(POSE)
-    expected = skill.displace(X_WE, skill.map(state, action, X_WE, FRAMES, PERIOD))
+    expected = template.displace(X_WE, template.map(state, action, X_WE, FRAMES, PERIOD))
     np.testing.assert_allclose(requested(system, action, state), transform_to_pose(expected), atol=1e-15)
 
 
@@ -60,7 +60,7 @@ def test_a_reset_can_move_an_object(system):
     np.testing.assert_allclose(aside, POSE, atol=1e-12)
 
 
-def test_an_object_that_the_skill_does_not_have_is_refused(system):
+def test_an_object_that_the_template_does_not_have_is_refused(system):
     with pytest.raises(InputError, match="no frame cup, only mug_tip"):
         system.frames.set(system.CreateDefaultContext(), {"cup": RigidTransform()})
 
@@ -71,8 +71,8 @@ def test_what_is_not_finite_stays_visible(system, bad):
 
 
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan")])
-def test_refuses_what_makes_no_sense(skill, period):
+def test_refuses_what_makes_no_sense(template, period):
     with pytest.raises(InputError, match="period"):
-        SctInputMapping(skill, FRAMES, period)
+        SctInputMapping(template, FRAMES, period)
     with pytest.raises(InputError, match="mug_tip"):
-        SctInputMapping(skill, {}, PERIOD)
+        SctInputMapping(template, {}, PERIOD)

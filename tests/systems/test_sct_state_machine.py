@@ -18,13 +18,13 @@ def at(distance):
 
 
 @pytest.fixture(scope="module")
-def skill():
+def template():
     return load_template("pouring")
 
 
 class Rig:
-    def __init__(self, skill, start):
-        self.system = SctStateMachine(skill, FRAMES, PERIOD)
+    def __init__(self, template, start):
+        self.system = SctStateMachine(template, FRAMES, PERIOD)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.system.get_initial_pose_input_port().FixValue(self.context, at(start))
@@ -43,14 +43,14 @@ class Rig:
         return int(self.system.get_state_output_port().Eval(self.context)[0])
 
 
-def test_ports(skill):
-    system = SctStateMachine(skill, FRAMES, PERIOD)
+def test_ports(template):
+    system = SctStateMachine(template, FRAMES, PERIOD)
     names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
     assert names == ["state", "transition_distance", "progress"]
 
 
-def test_the_state_never_feeds_through(skill):
-    system = SctStateMachine(skill, FRAMES, PERIOD)
+def test_the_state_never_feeds_through(template):
+    system = SctStateMachine(template, FRAMES, PERIOD)
     state = system.get_state_output_port().get_index()
     assert not any(system.HasDirectFeedthrough(i, state) for i in range(2))
     progress = system.get_progress_output_port().get_index()
@@ -58,26 +58,26 @@ def test_the_state_never_feeds_through(skill):
 
 
 @pytest.mark.parametrize(("start", "state"), [(0.4, 0), (0.2, 1), (0.05, 2)])
-def test_begins_where_the_initial_pose_is(skill, start, state):
-    assert Rig(skill, start).state() == state
+def test_begins_where_the_initial_pose_is(template, start, state):
+    assert Rig(template, start).state() == state
 
 
-def test_goes_there_and_back_with_hysteresis(skill):
-    rig = Rig(skill.without_active_constraints(), 0.4)
+def test_goes_there_and_back_with_hysteresis(template):
+    rig = Rig(template.without_active_constraints(), 0.4)
     assert [rig.step(d) for d in (0.26, 0.24, 0.26, 0.28, 0.24, 0.10, 0.07, 0.10, 0.40)] == [0, 1, 1, 0, 1, 1, 2, 2, 2]
 
 
-def test_one_transition_an_instant(skill):
-    rig = Rig(skill.without_active_constraints(), 0.4)
+def test_one_transition_an_instant(template):
+    rig = Rig(template.without_active_constraints(), 0.4)
     assert [rig.step(0.05) for _ in range(3)] == [1, 2, 2]
 
 
-def test_waits_until_the_next_states_constraints_are_within_reach(skill):
+def test_waits_until_the_next_states_constraints_are_within_reach(template):
     """An upright thermos near the mug: to pour it must have been tilted, which takes longer than a period."""
-    rig = Rig(skill, 0.2)
+    rig = Rig(template, 0.2)
     X_WE = RigidTransform(at(0.05)[:3])
-    tilted = skill.project(2, X_WE, FRAMES)
-    assert not skill.can_enter(2, X_WE, FRAMES, PERIOD)
+    tilted = template.project(2, X_WE, FRAMES)
+    assert not template.can_enter(2, X_WE, FRAMES, PERIOD)
     assert [rig.step(0.05) for _ in range(3)] == [1, 1, 1]
     rig.pose.GetMutableData().set_value(transform_to_pose(tilted))
     rig.steps += 1
@@ -85,19 +85,19 @@ def test_waits_until_the_next_states_constraints_are_within_reach(skill):
     assert rig.state() == 2
 
 
-def test_distance_and_progress_are_the_skills(skill):
-    rig = Rig(skill, 0.4)
+def test_distance_and_progress_are_the_templates(template):
+    rig = Rig(template, 0.4)
     rig.step(0.24)
     X_WE = RigidTransform(at(0.24)[:3])
     assert rig.system.get_transition_distance_output_port().Eval(rig.context)[0] == pytest.approx(0.24)
     progress = rig.system.get_progress_output_port().Eval(rig.context)[0]
-    assert progress == pytest.approx(skill.progress(1, X_WE, FRAMES))
+    assert progress == pytest.approx(template.progress(1, X_WE, FRAMES))
     # 5 per metre, from 0.40 m on: the same in both states where one hands over to the other.
     assert progress == pytest.approx(5.0 * (0.40 - 0.24))
 
 
-def test_refuses_what_makes_no_sense(skill):
+def test_refuses_what_makes_no_sense(template):
     with pytest.raises(InputError, match="period"):
-        SctStateMachine(skill, FRAMES, 0.0)
+        SctStateMachine(template, FRAMES, 0.0)
     with pytest.raises(InputError, match="mug_tip"):
-        SctStateMachine(skill, {}, PERIOD)
+        SctStateMachine(template, {}, PERIOD)

@@ -274,8 +274,8 @@ def test_a_file_finds_those_beside_it_and_what_fails_in_it_is_said(tmp_path):
     sys.modules.pop("beside_own")
 
 
-def test_a_shipped_skill_is_checked_by_its_name_and_says_where_the_way_back_is(monkeypatch):
-    monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda skill: [])
+def test_check_accepts_the_name_of_a_shipped_template(monkeypatch):
+    monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
     back, none = check(Path("pouring"))["transitions"]
     assert back == "translational → tilt below 0.25 m, back above 0.27 m"
     assert none == "tilt → pour below 0.075 m, no way back"

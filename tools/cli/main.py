@@ -434,18 +434,20 @@ def check(
     file: Annotated[
         Path,
         _arg(
-            "Demonstrations (.npz, .csv or a folder of them), or a skill (.yaml, or the name of a shipped one).", "FILE"
+            "Demonstrations (.npz, .csv or a folder of them), or a template (.yaml, or the name of a shipped one).",
+            "FILE",
         ),
     ],
     draw: Annotated[
-        Path | None, _opt("Draw the demonstrations, or a skill's state machine (.png, .svg, .pdf; a skill also .dot).")
+        Path | None,
+        _opt("Draw the demonstrations, or a template's state machine (.png, .svg, .pdf; a template also .dot)."),
     ] = None,
     fit: Annotated[
         bool, _opt("Choose components, kernel and λ by what reproduces them, and say why.", "--fit")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Check demonstrations or a skill before they are used."""
+    """Check demonstrations or a template before they are used."""
     from guiderail.tools.datasets.validate import check as check_file
 
     _print(check_file(file, draw, fit=fit), as_json)

@@ -1,4 +1,4 @@
-"""`guiderail check`: what a file of demonstrations or a skill holds, before anything is learned from it."""
+"""`guiderail check`: what a file of demonstrations or a template holds, before anything is learned from it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
     )
 
 
-SKILLS = (".yaml", ".yml")
+TEMPLATES = (".yaml", ".yml")
 SI = {"m": "m", "deg": "rad"}  # what a distance is in, by the unit that a file gives it in
 
 
@@ -49,7 +49,7 @@ def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[st
     """Reads a file as what its ending says it is.
 
     Args:
-        file: what is read; or the name of one of guiderail's own skills.
+        file: what is read; or the name of one of guiderail's own templates.
         draw: where demonstrations or a state machine are drawn.
         fit: whether a primitive is fitted to demonstrations, which takes seconds.
 
@@ -61,22 +61,22 @@ def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[st
 
         if str(file) in shipped_templates():
             _refuse_fit(fit)
-            return check_skill(file, draw)
+            return check_template(file, draw)
         raise InputError(
-            f"there is no file {file}: name demonstrations (.npz, .csv, a folder), a skill (.yaml) or one of "
+            f"there is no file {file}: name demonstrations (.npz, .csv, a folder), a template (.yaml) or one of "
             f"{', '.join(shipped_templates())}"
         )
     if file.suffix in ENDINGS or file.is_dir():
         return check_demonstrations(file, draw) | (fitted(file) if fit else {})
-    if file.suffix in SKILLS:
+    if file.suffix in TEMPLATES:
         _refuse_fit(fit)
-        return check_skill(file, draw)
-    raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv, a skill is .yaml")
+        return check_template(file, draw)
+    raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv, a template is .yaml")
 
 
 def _refuse_fit(fit: bool) -> None:
     if fit:
-        raise InputError("--fit is of demonstrations, and this is a skill: leave it out")
+        raise InputError("--fit is of demonstrations, and this is a template: leave it out")
 
 
 def check_demonstrations(file: Path, draw: Path | None = None) -> dict[str, Any]:
@@ -158,34 +158,34 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
     save_figure(figure, picture)
 
 
-def check_skill(file: Path, draw: Path | None = None) -> dict[str, Any]:
-    """What a skill holds, and what is odd about it; reading it is what finds most of its faults.
+def check_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
+    """What a template holds, and what is odd about it; reading it is what finds most of its faults.
 
     Args:
-        file: the skill, or the name of one of guiderail's own.
+        file: the template, or the name of one of guiderail's own.
         draw: where its state machine is drawn: .png, .svg, .pdf or .dot.
 
     Raises:
-        InputError: if the skill cannot be used.
+        InputError: if the template cannot be used.
     """
     from guiderail.models.templates import load_template  # it needs Drake, which demonstrations don't
-    from guiderail.models.templates.drawing import draw as draw_skill
+    from guiderail.models.templates.drawing import draw as draw_template
     from guiderail.models.templates.validate import validate
 
-    skill = load_template(file)
-    findings = validate(skill)
+    template = load_template(file)
+    findings = validate(template)
     errors = [finding.message for finding in findings if finding.is_error]
     if errors:
         raise InputError(f"{file}: " + "; ".join(message.rstrip(".") for message in errors))
     if draw is not None:
-        draw_skill(skill, draw)
+        draw_template(template, draw)
     return {
         "file": str(file),
-        "skill": skill.name,
-        "inputs": skill.inputs,
-        "frames": list(skill.frames),
-        "states": [state.name for state in skill.states],
-        "transitions": [_in_words(s, t) for s in skill.states for t in s.transitions],
+        "template": template.name,
+        "inputs": template.inputs,
+        "frames": list(template.frames),
+        "states": [state.name for state in template.states],
+        "transitions": [_in_words(s, t) for s in template.states for t in s.transitions],
         "remarks": [finding.message for finding in findings if not finding.is_error],
     }
 

@@ -12,7 +12,7 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTRE, POSE_SCALE
 from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure
 from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS
-from guiderail.diagrams.tasks.grid_clamp.task import CENTRE, SCALE, make_skill
+from guiderail.diagrams.tasks.grid_clamp.task import CENTRE, SCALE, make_template
 from guiderail.diagrams.tasks.narrow_passage.task import scripted_slalom
 from guiderail.diagrams.tasks.pouring.scripted import scripted_pour, scripted_pour_aimed, scripted_pour_blind
 from guiderail.models.common.errors import InputError
@@ -52,8 +52,8 @@ PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # [N], [m/s] while it searches
 SNAP_FORCE = 12.0  # [N] that it snaps in with at most
 GENTLE_SNAP_FORCE = 8.5  # [N] the same where ten newtons are too many
 HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0  # [m/s/N] of force, the same, and [1/s] of distance
-SPEED = make_skill().parameters["speed_m_per_s"]  # of a full input
-LIFT = make_skill().parameters["lift"]  # part of it, upwards
+SPEED = make_template().parameters["speed_m_per_s"]  # of a full input
+LIFT = make_template().parameters["lift"]  # part of it, upwards
 STIFFNESS = Impedance().stiffness[0]
 
 

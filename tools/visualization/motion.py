@@ -108,7 +108,7 @@ def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple
 
 def state_names(task: Any) -> Sequence[str]:
     """The states of a task's template, by number; none where it has no template."""
-    return [state.name for state in task.template().skill.states] if "template" in type(task).provides() else []
+    return [state.name for state in task.template().template.states] if "template" in type(task).provides() else []
 
 
 def _pose(X_WF: Any) -> list[float]:

@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.cameras import Camera, look_from_front
 from guiderail.diagrams.envs.config import STANDARD, Number, Numbers, Options
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
-from guiderail.diagrams.guidance.prior import ScriptedApproach, Template
+from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -185,7 +185,7 @@ CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 
 
-def make_skill() -> SharedControlTemplate:
+def make_template() -> SharedControlTemplate:
     """The template of section 3.4.2."""
     return load_template("grid_clamp")
 
@@ -216,14 +216,16 @@ class GridClamp(InsertionTask):
         """A table with holes, a clamp in the tool."""
         return self._workcell
 
-    def template(self) -> Template:
+    def template(self) -> PlacedTemplate:
         """One phase: a cuboid above the hole, upright."""
         active = self.choice.values["active_constraints"]
-        return Template(make_skill(), {"hole": RigidTransform()}, active_constraints=active, max_tracking_error=LEASH)
+        return PlacedTemplate(
+            make_template(), {"hole": RigidTransform()}, active_constraints=active, max_tracking_error=LEASH
+        )
 
     def approach(self) -> ScriptedApproach:
         """Straight down into the hole."""
-        parameters = make_skill().parameters
+        parameters = make_template().parameters
         heights = (max(self.options.start_height), -parameters["push_m"])
         return ScriptedApproach(heights, speed=parameters["speed_m_per_s"], reach=parameters["width_m"] / 2)
 
@@ -262,7 +264,7 @@ class GridClamp(InsertionTask):
 
     def scene(self) -> Scene:
         """The cuboid that commands stay in, as high as the clamp begins."""
-        to_world, parameters = in_frame(self._workcell.X_WT), make_skill().parameters
+        to_world, parameters = in_frame(self._workcell.X_WT), make_template().parameters
         half = 0.5 * parameters["width_m"]
         edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))
         near = viewpoint(*to_world(np.array([[0.045, -0.065, 0.045], [0.0, 0.0, 0.008]])))

@@ -21,12 +21,12 @@ FULL_TILT = 0.8  # [rad/s]
 SPARSE_INPUT_SPEED = 1.7
 
 
-def make_skill(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
+def make_template(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
     """The pouring template for this scene's vessels; `input_speed` times as fast as it is meant."""
     return _load("pouring", config, input_speed)
 
 
-def make_aimed_skill(
+def make_aimed_template(
     config: PouringConfig, input_speed: float, aim_speed: float, pour_speed: float
 ) -> SharedControlTemplate:
     """The template whose Pour can be aimed; `aim_speed` and `pour_speed` are parts of the full speeds in Pour."""
@@ -44,10 +44,10 @@ def _load(name: str, config: PouringConfig, input_speed: float, **others: float)
     )
 
 
-def frames_of(skill: SharedControlTemplate, X_TMug: RigidTransform) -> dict[str, RigidTransform]:
+def frames_of(template: SharedControlTemplate, X_TMug: RigidTransform) -> dict[str, RigidTransform]:
     """The poses of a template's objects for a mug, or for where it is believed to be."""
-    if "behind_mug" in skill.frames:
-        return {"behind_mug": X_TMug @ RigidTransform([0.0, skill.parameters["behind_m"], 0.0])}
+    if "behind_mug" in template.frames:
+        return {"behind_mug": X_TMug @ RigidTransform([0.0, template.parameters["behind_m"], 0.0])}
     return {"mug_tip": X_TMug}
 
 

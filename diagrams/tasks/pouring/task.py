@@ -14,7 +14,7 @@ from guiderail.diagrams.envs.config import STANDARD
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_frame, viewpoint
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.prior import Template
+from guiderail.diagrams.guidance.prior import PlacedTemplate
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, vessel_or_refuse
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream, in_ring
@@ -26,8 +26,8 @@ from guiderail.diagrams.tasks.pouring.options import (
     PouringOptions,
     PouringReset,
     frames_of,
-    make_aimed_skill,
-    make_skill,
+    make_aimed_template,
+    make_template,
 )
 from guiderail.diagrams.tasks.pouring.rewards import reward_terms
 from guiderail.diagrams.tasks.registry import register_task
@@ -124,9 +124,9 @@ class Pouring(Task):
         )
         self.num_steps = round(options.time_limit / self._config.control_period)
         speed = self._input_speed()
-        self._skill = make_skill(self._config, speed)
+        self._template = make_template(self._config, speed)
         if options.aim:
-            self._skill = make_aimed_skill(self._config, speed, options.aim_speed, options.pour_speed)
+            self._template = make_aimed_template(self._config, speed, options.aim_speed, options.pour_speed)
 
     def _input_speed(self) -> float:
         if self.options.input_speed is not None:
@@ -144,11 +144,14 @@ class Pouring(Task):
         self.drawn["mug_error"] = EpisodeConstant(builder, "mug_error", 2)
         return {"mug_error": self.drawn["mug_error"].port}
 
-    def template(self) -> Template:
+    def template(self) -> PlacedTemplate:
         """Of figure 2.2 and table 3.3, or the one that can be aimed."""
         active = self.choice.values["active_constraints"]
-        return Template(
-            self._skill, frames_of(self._skill, RigidTransform()), active_constraints=active, max_tracking_error=LEASH
+        return PlacedTemplate(
+            self._template,
+            frames_of(self._template, RigidTransform()),
+            active_constraints=active,
+            max_tracking_error=LEASH,
         )
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
@@ -190,9 +193,9 @@ class Pouring(Task):
             error = draw_error(episode, self.options, options)
             # Where it is believed to be stays where the arm reaches; it is the mug that stands elsewhere.
             believed, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
-            frames = frames_of(self._skill, believed)
+            frames = frames_of(self._template, believed)
             # Turned as the template wants it, whether or not that guides: all kinds of guidance start alike.
-            X_TP = self._skill.project(self._skill.initial_state, RigidTransform(believed @ p_MP), frames)
+            X_TP = self._template.project(self._template.initial_state, RigidTransform(believed @ p_MP), frames)
             try:
                 station.set_pose(context, transform_to_pose(X_TP))
                 break

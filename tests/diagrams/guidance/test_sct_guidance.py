@@ -53,12 +53,12 @@ class Rig:
 
 
 @pytest.fixture
-def skill():
+def template():
     return load_template("pouring")
 
 
-def test_has_the_ports_of_all_guidance(skill):
-    guidance = SctGuidance(skill, MUG, PERIOD)
+def test_has_the_ports_of_all_guidance(template):
+    guidance = SctGuidance(template, MUG, PERIOD)
     inputs = [guidance.get_input_port(i).get_name() for i in range(guidance.num_input_ports())]
     outputs = [guidance.get_output_port(i).get_name() for i in range(guidance.num_output_ports())]
     assert inputs == ["action", "pose", "wrench"]
@@ -66,14 +66,14 @@ def test_has_the_ports_of_all_guidance(skill):
     check_guidance_ports(guidance, pose_size=6, wrench_size=6)
 
 
-def test_starts_where_the_robot_is_and_stays_there_without_an_input(skill):
-    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+def test_starts_where_the_robot_is_and_stays_there_without_an_input(template):
+    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
     for _ in range(5):
         np.testing.assert_allclose(rig.step(np.zeros(3)), START, atol=1e-9)
 
 
-def test_an_action_counts_from_the_next_instant_on_for_a_whole_period(skill):
-    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+def test_an_action_counts_from_the_next_instant_on_for_a_whole_period(template):
+    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
     first = rig.step(np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(first - START, [0, 0.15 * PERIOD, 0, 0, 0, 0], atol=1e-9)
     for k in range(2, 8):
@@ -81,8 +81,8 @@ def test_an_action_counts_from_the_next_instant_on_for_a_whole_period(skill):
         np.testing.assert_allclose(moved[1], k * 0.15 * PERIOD, atol=1e-9)
 
 
-def test_goes_through_all_states_and_says_how_far_it_is(skill):
-    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+def test_goes_through_all_states_and_says_how_far_it_is(template):
+    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
     states, progress, worst = [], [], 0.0
     for _ in range(600):
         rig.step(np.array([0.0, 0.9, -0.3]))
@@ -92,11 +92,11 @@ def test_goes_through_all_states_and_says_how_far_it_is(skill):
     assert sorted(set(states)) == [0, 1, 2]
     assert worst <= 1e-9
     assert rig.value("transition_distance")[0] == pytest.approx(0.0, abs=0.02)
-    assert progress[-1] == pytest.approx(sum(s.weight * (s.starts_at - s.ends_at) for s in skill.states), abs=0.02)
+    assert progress[-1] == pytest.approx(sum(s.weight * (s.starts_at - s.ends_at) for s in template.states), abs=0.02)
 
 
-def test_a_broken_device_repeats_the_last_safe_command(skill):
-    rig = Rig(SctGuidance(skill, MUG, PERIOD)).initialize()
+def test_a_broken_device_repeats_the_last_safe_command(template):
+    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
     before = rig.step(np.array([0.0, 1.0, 0.0]))
     for _ in range(3):
         np.testing.assert_array_equal(rig.step(np.array([np.nan, 0.0, np.inf])), before)
@@ -105,11 +105,11 @@ def test_a_broken_device_repeats_the_last_safe_command(skill):
     assert rig.value("fallback")[0] == 0.0
 
 
-def test_objects_can_be_moved_at_a_reset(skill):
+def test_objects_can_be_moved_at_a_reset(template):
     """Everything happens relative to the object: the same inputs draw the same path elsewhere."""
     paths = []
     for shift in (np.zeros(3), np.array([0.1, -0.2, 0.05])):
-        guidance = SctGuidance(skill, MUG, PERIOD)
+        guidance = SctGuidance(template, MUG, PERIOD)
         rig = Rig(guidance, START + np.concatenate([shift, np.zeros(3)]))
         guidance.set_frames(rig.context, {"mug_tip": RigidTransform(shift)})
         rig.initialize()
@@ -119,26 +119,26 @@ def test_objects_can_be_moved_at_a_reset(skill):
     np.testing.assert_allclose(paths[0], paths[1], atol=1e-9)
 
 
-def test_without_active_constraints_it_does_what_it_is_asked(skill):
-    rig = Rig(SctGuidance(skill, MUG, PERIOD, active_constraints=False)).initialize()
+def test_without_active_constraints_it_does_what_it_is_asked(template):
+    rig = Rig(SctGuidance(template, MUG, PERIOD, active_constraints=False)).initialize()
     for _ in range(200):
         desired = rig.step(np.array([0.0, 0.0, -1.0]))
     assert desired[2] < 0.12 - 0.25  # through the table
 
 
-def test_a_velocity_is_filtered_like_anything_else(skill):
+def test_a_velocity_is_filtered_like_anything_else(template):
     velocity = load_template("end_effector_velocity")
-    rig = Rig(SctGuidance(skill, MUG, PERIOD, input_mapping=velocity)).initialize()
+    rig = Rig(SctGuidance(template, MUG, PERIOD, input_mapping=velocity)).initialize()
     rng = np.random.default_rng(0)
     for _ in range(200):
         rig.step(rng.choice([-1.0, 1.0], 6))
         assert rig.value("constraint_violation")[0] <= 1e-9
 
 
-def test_the_filter_takes_requests_from_anyone(skill):
+def test_the_filter_takes_requests_from_anyone(template):
     """Behind a source that has nothing to do with a template: a constant pose inside the mug."""
     builder = DiagramBuilder()
-    safe = builder.AddSystem(ActiveConstraintFilter(skill, MUG, PERIOD))
+    safe = builder.AddSystem(ActiveConstraintFilter(template, MUG, PERIOD))
     wish = builder.AddSystem(ConstantVectorSource(np.array([0.0, 0.0, -0.05, 0.0, 0.0, 2.0])))
     robot = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
     builder.Connect(wish.get_output_port(), safe.GetInputPort("requested_pose"))
@@ -156,12 +156,12 @@ def test_the_filter_takes_requests_from_anyone(skill):
     assert np.linalg.norm(desired[:3]) < 0.09  # as near as it is allowed
 
 
-def test_a_persons_device_and_a_policy_differ_in_one_connection(skill):
+def test_a_persons_device_and_a_policy_differ_in_one_connection(template):
     """Figure 3.1: whoever is connected to `action` drives."""
     diagrams = []
     for source in (ConstantVectorSource(np.array([0.0, 1.0, 0.0])), ZeroOrderHold(PERIOD, 3)):
         builder = DiagramBuilder()
-        guidance = builder.AddSystem(SctGuidance(skill, MUG, PERIOD))
+        guidance = builder.AddSystem(SctGuidance(template, MUG, PERIOD))
         device = builder.AddSystem(source)
         builder.Connect(device.get_output_port(), guidance.GetInputPort("action"))
         builder.ExportInput(guidance.GetInputPort("pose"), "pose")

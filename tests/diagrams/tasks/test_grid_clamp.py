@@ -14,7 +14,7 @@ from guiderail.diagrams.tasks.grid_clamp.task import (
     LEASH,
     SCALE,
     GridClampUncertainty,
-    make_skill,
+    make_template,
 )
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
@@ -112,7 +112,7 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
         return held
 
     info, _, _ = play(env, adversary, seed=5)
-    parameters = make_skill().parameters
+    parameters = make_template().parameters
     commanded = env.trace.commanded
     assert np.abs(commanded[:, :2]).max() <= parameters["width_m"] / 2 + 1e-9
     assert commanded[:, 2].min() >= -parameters["push_m"] - 1e-9
@@ -195,7 +195,7 @@ class TestUncertainty:
         fixture_offset, rng = GridClampUncertainty(kind), np.random.default_rng(1)
         draws = [fixture_offset.draw(rng, InsertionReset(new_run=True)) for _ in range(500)]
         worst = max(np.abs(table - grasp).max() for table, grasp in draws)
-        assert worst < make_skill().parameters["width_m"] / 2 - 0.2 * MM
+        assert worst < make_template().parameters["width_m"] / 2 - 0.2 * MM
 
     def test_held_out_keeps_the_run_and_draws_apart(self):
         fixture_offset = GridClampUncertainty("per_run")

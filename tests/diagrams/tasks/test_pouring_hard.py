@@ -5,7 +5,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.options import HARD, MAX_MUG_ERROR, frames_of, make_aimed_skill
+from guiderail.diagrams.tasks.pouring.options import HARD, MAX_MUG_ERROR, frames_of, make_aimed_template
 from guiderail.diagrams.tasks.pouring.scripted import scripted_pour_aimed, scripted_pour_blind
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
@@ -40,32 +40,32 @@ def test_who_looks_pours_and_who_does_not_spills(env):
         assert info["ledger"]["collisions"] == 0.0
 
 
-def guided(skill, frames, actions, X_TP):
+def guided(template, frames, actions, X_TP):
     """The states and commands of an episode without an arm, as pose coordinates carry them from step to step."""
-    state = skill.state_at(X_TP, frames)
+    state = template.state_at(X_TP, frames)
     for action in actions:
-        request = skill.displace(X_TP, skill.map(state, action, X_TP, frames, PERIOD))
-        command = skill.command(state, X_TP, request, frames, PERIOD).X_WE
+        request = template.displace(X_TP, template.map(state, action, X_TP, frames, PERIOD))
+        command = template.command(state, X_TP, request, frames, PERIOD).X_WE
         X_TP = pose_to_transform(transform_to_pose(command))
         yield state, X_TP
-        state = skill.next_state(state, X_TP, frames)
+        state = template.next_state(state, X_TP, frames)
 
 
 @pytest.mark.parametrize("name", ["uniform_random", "random_hold", "bang_bang", "random_corner"])
 def test_no_command_ever_leaves_the_constraints(env, name):
     """Through all three states and along every edge: without the arm, hundreds of control steps take no time."""
-    skill = make_aimed_skill(env.task.declaration.workcell(), 1.0, 1.0, 0.3)
-    frames = frames_of(skill, RigidTransform([0.02, -0.01, 0.0]))
-    start = skill.project(skill.initial_state, RigidTransform([0.02, -0.27, 0.12]), frames)
+    template = make_aimed_template(env.task.declaration.workcell(), 1.0, 1.0, 0.3)
+    frames = frames_of(template, RigidTransform([0.02, -0.01, 0.0]))
+    start = template.project(template.initial_state, RigidTransform([0.02, -0.27, 0.12]), frames)
     worst, reached = 0.0, set()
     for seed in range(2):
         act = BASELINES[name](np.random.default_rng(seed), 3)
         # Half of them lean forwards until they are in Pour, and then do what they want.
         lean = [np.array([0.0, 2.0 * (seed % 2 == 0 and k < 25), 0.0]) for k in range(45)]
         actions = np.repeat([np.clip(act(None) + forwards, -1.0, 1.0) for forwards in lean], 10, axis=0)
-        for state, X_TP in guided(skill, frames, actions, start):
+        for state, X_TP in guided(template, frames, actions, start):
             reached.add(state)
-            worst = max(worst, skill.violation(state, X_TP, frames))
+            worst = max(worst, template.violation(state, X_TP, frames))
     assert worst <= 1e-9
     assert reached == {0, 1, 2}
 
@@ -77,14 +77,14 @@ def test_the_arms_commands_are_inside_as_recomputed_at_every_step(env):
     corners = BaselinePolicy(BASELINES["bang_bang"], stepwise)
     corners.begin()
     task = stepwise.task.declaration
-    skill = make_aimed_skill(task.workcell(), 1.0, 1.0, 0.3)
+    template = make_aimed_template(task.workcell(), 1.0, 1.0, 0.3)
     _, drawn = stepwise.reset(seed=3)
-    frames = frames_of(skill, RigidTransform([*(drawn["mug_position"] + drawn["mug_error"]), 0.0]))
+    frames = frames_of(template, RigidTransform([*(drawn["mug_position"] + drawn["mug_error"]), 0.0]))
     for _ in range(60):
         stepwise.step(corners(None))
         state = int(diagram.GetOutputPort("state").Eval(context)[0])
         desired = pose_to_transform(diagram.GetOutputPort("desired_pose").Eval(context))
-        assert skill.violation(state, desired, frames) <= 1e-9
+        assert template.violation(state, desired, frames) <= 1e-9
 
 
 def test_the_error_is_drawn_anew_in_its_ring_and_seen(env):

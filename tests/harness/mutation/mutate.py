@@ -36,14 +36,14 @@ import yaml
 
 ROOT = Path(__file__).parents[3]
 PRIMITIVES = ["tests/models/primitives"]
-SKILLS = ["tests/models/templates"]
+TEMPLATES = ["tests/models/templates"]
 TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp", "mixture")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "demonstrations")},
-    "models/templates/constraints.py": SKILLS,
-    "models/templates/template.py": SKILLS,
-    "models/templates/geometry.py": SKILLS,
+    "models/templates/constraints.py": TEMPLATES,
+    "models/templates/template.py": TEMPLATES,
+    "models/templates/geometry.py": TEMPLATES,
     "models/control/keep_out.py": [
         "tests/models/control/test_keep_out.py",
         "tests/models/control/test_keep_out_properties.py",

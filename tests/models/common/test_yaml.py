@@ -84,11 +84,11 @@ def test_an_alias_is_what_it_stands_for():
 def test_says_in_one_line_what_is_wrong(text, said):
     tracemalloc.start()
     with pytest.raises(InputError) as refused:
-        parse_yaml(text, "skill.yaml")
+        parse_yaml(text, "template.yaml")
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert said in str(refused.value)
-    assert str(refused.value).startswith("skill.yaml")
+    assert str(refused.value).startswith("template.yaml")
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 300
     assert peak < 30e6

@@ -24,7 +24,7 @@ def state(name="only", constraints=(), to=(), **changes):
     )
 
 
-def skill(*states, speed=0.2, turn=1.0, initial=0):
+def template(*states, speed=0.2, turn=1.0, initial=0):
     return SharedControlTemplate("s", 3, ("f",), states or (state(),), initial, speed, turn)
 
 
@@ -44,7 +44,7 @@ def load(s, A, B):
 @given(SEEDS, st.sampled_from([1e-4, 1e-3, 1e-2, 1.0]))
 def test_without_constraints_it_goes_as_far_as_the_speeds_allow(seed, spread):
     rng = np.random.default_rng(seed)
-    s = skill(speed=rng.uniform(0.01, 1), turn=rng.uniform(0.1, 3))
+    s = template(speed=rng.uniform(0.01, 1), turn=rng.uniform(0.1, 3))
     last, request = pose(rng, 0.3), pose(rng, spread)
     request = RigidTransform(request.rotation() @ last.rotation(), last.translation() + request.translation())
     command = s.command(0, last, request, F, PERIOD)
@@ -72,7 +72,7 @@ def wander(s, seed, height=0.02, climb=(-1e-3, 4e-4), steps=300):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_command_is_inside_where_one_constraint_undoes_another(seed):
-    s = skill(state(constraints=UNDONE[::-1]), speed=0.05)
+    s = template(state(constraints=UNDONE[::-1]), speed=0.05)
     assert s.violation(0, s.project(0, RigidTransform([0.003, 0.0, 0.009]), F), F) > 5e-4
     pairs = list(wander(s, seed, height=0.006, climb=(-4e-4, 1e-3)))
     assert max(s.violation(number, X, F) for number, X in pairs) <= 1e-9
@@ -85,7 +85,7 @@ def test_no_command_leaves_the_constraints_of_a_next_state_that_are_tighter(seed
         state(name, [ac.Cylinder("f", max_radius_m=radius), ac.KeepAbove(-0.006, "f")], to)
         for name, radius, to in (("search", 0.004, (Transition("insert", 0.006, 0.002),)), ("insert", 0.002, ()))
     )
-    s = skill(wide, narrow, speed=0.05)
+    s = template(wide, narrow, speed=0.05)
     pairs = list(wander(s, seed))
     assert max(s.violation(number, X, F) for number, X in pairs) <= 1e-9
     assert {number for number, _ in pairs} == {0, 1}
@@ -99,7 +99,7 @@ def test_inside_constraints_it_stays_inside_and_within_the_speeds(seed):
         ac.Box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2), "f"),
         ac.TiltByDistance("f", (0.0, 0.3), (80.0, -80.0), turns_along=bool(seed % 2)),
     ]
-    s = skill(state(constraints=constraints), speed=rng.uniform(0.05, 1), turn=rng.uniform(0.1, 3))
+    s = template(state(constraints=constraints), speed=rng.uniform(0.05, 1), turn=rng.uniform(0.1, 3))
     last = s.project(0, pose(rng, 0.3), F)
     command = s.command(0, last, pose(rng, 0.3), F, PERIOD)
     assert 0 <= command.fraction <= 1
@@ -110,7 +110,7 @@ def test_inside_constraints_it_stays_inside_and_within_the_speeds(seed):
 @given(SEEDS)
 def test_from_outside_it_is_led_in_at_no_more_than_the_speeds(seed):
     rng = np.random.default_rng(seed)
-    s = skill(state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3, "f"), ac.FixedOrientation(frame="f")]))
+    s = template(state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3, "f"), ac.FixedOrientation(frame="f")]))
     last = pose(rng, 0.5)
     before = s.violation(0, last, F)
     command = s.command(0, last, last, F, PERIOD)
@@ -122,7 +122,7 @@ def test_from_outside_it_is_led_in_at_no_more_than_the_speeds(seed):
 
 
 def test_what_can_be_done_at_once_is_done_whole():
-    s = skill()
+    s = template()
     last, request = RigidTransform(), RigidTransform([0.2 * PERIOD * 0.999, 0, 0])
     command = s.command(0, last, request, F, PERIOD)
     assert command == Command(command.X_WE, 1.0)
@@ -130,7 +130,7 @@ def test_what_can_be_done_at_once_is_done_whole():
 
 
 def test_a_displacement_turns_about_the_origin_of_the_end_effector_and_adds_up():
-    s = skill()
+    s = template()
     X = RigidTransform(RotationMatrix.MakeXRotation(0.4), [1.0, 2.0, 3.0])
     d = RigidTransform(RotationMatrix.MakeZRotation(0.3), [0.1, 0.2, 0.3])
     moved = s.displace(X, d)
@@ -140,7 +140,7 @@ def test_a_displacement_turns_about_the_origin_of_the_end_effector_and_adds_up()
     both = TemplateState(
         "b", (im.Translation((0, 1, 2), 0.5), im.Rotation((0,), 2.0, axes=((0, 0, 1),))), (), td.Height("f"), 1, 0
     )
-    total = skill(both).map(0, np.array([0.5, 9.0, -9.0]), X, F, 0.1)
+    total = template(both).map(0, np.array([0.5, 9.0, -9.0]), X, F, 0.1)
     np.testing.assert_allclose(total.translation(), [0.025, 0.05, -0.05])
     np.testing.assert_allclose(total.rotation().matrix(), RotationMatrix.MakeZRotation(0.1).matrix(), atol=1e-12)
 
@@ -148,11 +148,11 @@ def test_a_displacement_turns_about_the_origin_of_the_end_effector_and_adds_up()
 def test_constraints_apply_in_their_order():
     up, down = ac.HalfSpace((0.0, 0.0, 1.0), 0.5), ac.HalfSpace((0.0, 0.0, -1.0), -0.2)
     for order, height in (((up, down), 0.2), ((down, up), 0.5)):
-        s = skill(state(constraints=order))
+        s = template(state(constraints=order))
         assert s.project(0, RigidTransform(), {}).translation()[2] == pytest.approx(height)
         assert s.violation(0, RigidTransform([0.0, 0.0, 0.3]), {}) == pytest.approx(0.2)
-    assert skill().violation(0, RigidTransform([9.0, 9.0, 9.0]), F) == 0.0
-    free = skill(state(constraints=(up,))).without_active_constraints()
+    assert template().violation(0, RigidTransform([9.0, 9.0, 9.0]), F) == 0.0
+    free = template(state(constraints=(up,))).without_active_constraints()
     assert free.states[0].active_constraints == ()
 
 
@@ -161,7 +161,7 @@ def at(height):
 
 
 def test_the_first_way_that_is_open_is_taken_and_the_way_back_has_hysteresis():
-    s = skill(
+    s = template(
         state("a", to=(Transition("b", 0.5, 0.1), Transition("c", 0.7)), starts_at=1.0, ends_at=0.5),
         state("b", to=(Transition("c", 0.2, 0.05),), starts_at=0.5, ends_at=0.2),
         state("c", starts_at=0.2, ends_at=0.0),
@@ -186,7 +186,7 @@ def test_the_first_way_that_is_open_is_taken_and_the_way_back_has_hysteresis():
 
 
 def test_progress_goes_on_where_the_state_before_ended():
-    s = skill(
+    s = template(
         state("b", to=(Transition("c", 0.2),), starts_at=0.5, ends_at=0.2, weight=2.0),
         state("a", to=(Transition("b", 0.5), Transition("c", 0.1)), starts_at=1.0, ends_at=0.5, weight=3.0),
         state("c", starts_at=0.2, ends_at=0.0, weight=5.0),
@@ -196,7 +196,7 @@ def test_progress_goes_on_where_the_state_before_ended():
     assert s.progress(1, at(0.5), F) == s.progress(0, at(0.5), F) == pytest.approx(1.5)
     assert s.progress(0, at(0.2), F) == s.progress(2, at(0.2), F) == pytest.approx(2.1)
     assert s.progress(2, at(0.0), F) == pytest.approx(3.1)
-    round_ = skill(
+    round_ = template(
         state("a", to=(Transition("b", 0.5),), starts_at=1.0, ends_at=0.5),
         state("b", to=(Transition("a", 0.2),), starts_at=0.5, ends_at=0.2),
     )

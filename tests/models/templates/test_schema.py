@@ -1,4 +1,4 @@
-"""What a skill file may say, and what a person is told when it says something else."""
+"""What a template file may say, and what a person is told when it says something else."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,28 +13,28 @@ from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register
 
-SKILL = (Path(__file__).parent / "reach.yaml").read_text()
+TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
 
 
 def changed(change):
-    data = yaml.safe_load(SKILL)
+    data = yaml.safe_load(TEMPLATE)
     change(data)
     return yaml.safe_dump(data, sort_keys=False)
 
 
 def test_reads_states_in_order_with_units_turned_into_si():
-    skill = parse_template(SKILL)
-    assert [state.name for state in skill.states] == ["far", "near"]
-    assert skill.initial_state == 0
-    assert skill.states[1].starts_at == pytest.approx(np.pi / 2)
-    assert skill.states[0].ends_at == 0.1
+    template = parse_template(TEMPLATE)
+    assert [state.name for state in template.states] == ["far", "near"]
+    assert template.initial_state == 0
+    assert template.states[1].starts_at == pytest.approx(np.pi / 2)
+    assert template.states[0].ends_at == 0.1
 
 
 def test_numbers_may_be_arithmetic_on_the_objects_sizes():
-    cylinder = parse_template(SKILL).states[0].active_constraints[0]
+    cylinder = parse_template(TEMPLATE).states[0].active_constraints[0]
     assert isinstance(cylinder, Cylinder)
     assert (cylinder.min_radius_m, cylinder.max_radius_m) == pytest.approx((0.06, 0.3))
-    larger = parse_template(SKILL, rim_m=0.06).states[0].active_constraints[0]
+    larger = parse_template(TEMPLATE, rim_m=0.06).states[0].active_constraints[0]
     assert isinstance(larger, Cylinder)
     assert (larger.min_radius_m, larger.max_radius_m) == pytest.approx((0.07, 0.36))
 
@@ -56,8 +56,8 @@ def test_a_new_kind_is_one_class_and_one_registration():
                 {"kind": "at_origin", "frame": "cup", "height_m": "2 * rim_m"}
             ]
 
-        skill = parse_template(changed(use))
-        X_WP = skill.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
+        template = parse_template(changed(use))
+        X_WP = template.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
         np.testing.assert_allclose(X_WP.translation(), [1.0, 0.0, 0.1])
         with pytest.raises(ValueError, match="already registered"):
             register(ACTIVE_CONSTRAINTS, "at_origin")(AtOrigin)
@@ -175,25 +175,25 @@ def test_says_what_is_wrong_and_what_to_do(change, said):
 def test_refuses_parameters_that_are_no_numbers():
     for value in (None, [0.04], True, float("nan"), 1e300, 10**400):
         with pytest.raises(InputError, match="rim_m"):
-            parse_template(SKILL, rim_m=value)
-    assert parse_template(SKILL, rim_m=np.float32(0.25)).parameters["rim_m"] == 0.25
+            parse_template(TEMPLATE, rim_m=value)
+    assert parse_template(TEMPLATE, rim_m=np.float32(0.25)).parameters["rim_m"] == 0.25
 
 
 def test_refuses_what_other_readers_would_stumble_over():
     for text in ("inputs: 010", "inputs: 2001-99-99", "inputs: 2\ninputs: 3", "inputs: !!int 2", "inputs: 1:30"):
         with pytest.raises(InputError):
-            parse_template(SKILL.replace("inputs: 2", text, 1))
+            parse_template(TEMPLATE.replace("inputs: 2", text, 1))
     bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
         f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
     )
     with pytest.raises(InputError, match="more than 10000"):
-        parse_template(SKILL + bomb)
+        parse_template(TEMPLATE + bomb)
 
 
 def test_refuses_what_is_not_there(tmp_path):
     with pytest.raises(InputError, match="did you mean pouring"):
         load_template("puoring")
-    with pytest.raises(InputError, match="there is no skill"):
+    with pytest.raises(InputError, match="there is no template"):
         load_template(tmp_path / "missing.yaml")
     with pytest.raises(InputError, match="no parameter"):
         load_template("pouring", mug_size_m=0.1)

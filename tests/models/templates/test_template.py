@@ -1,4 +1,4 @@
-"""The laws of a skill: mapping, displacement, command, transitions and progress."""
+"""The laws of a template: mapping, displacement, command, transitions and progress."""
 
 from dataclasses import replace
 
@@ -26,15 +26,15 @@ def in_mug(p):
     return RigidTransform(MUG["mug_tip"].rotation(), MUG["mug_tip"] @ np.array(p))
 
 
-def run(skill, X_WE, inputs, steps, state=None, observe=None):
+def run(template, X_WE, inputs, steps, state=None, observe=None):
     """The template under `inputs(k, X)`, as the systems run it; returns the last state and command."""
-    state = skill.state_at(X_WE, MUG) if state is None else state
+    state = template.state_at(X_WE, MUG) if state is None else state
     for k in range(steps):
-        request = skill.displace(X_WE, skill.map(state, inputs(k, X_WE), X_WE, MUG, PERIOD))
-        X_last, X_WE = X_WE, skill.command(state, X_WE, request, MUG, PERIOD).X_WE
+        request = template.displace(X_WE, template.map(state, inputs(k, X_WE), X_WE, MUG, PERIOD))
+        X_last, X_WE = X_WE, template.command(state, X_WE, request, MUG, PERIOD).X_WE
         if observe:
             observe(state, X_last, X_WE)
-        state = skill.next_state(state, X_WE, MUG)
+        state = template.next_state(state, X_WE, MUG)
     return state, X_WE
 
 
@@ -205,7 +205,7 @@ def test_the_length_of_an_axis_multiplies_the_speed():
     np.testing.assert_allclose(moved[1].translation(), 2 * moved[0].translation())
 
 
-REACH = 0.125  # [m] of one step of the skills below, and a number that arithmetic keeps to the last bit
+REACH = 0.125  # [m] of one step of the templates below, and a number that arithmetic keeps to the last bit
 
 
 class UpTo(ac.ActiveConstraint):
@@ -250,8 +250,8 @@ def test_a_nanometre_outside_is_inside_and_more_is_not():
 
 @pytest.mark.parametrize("halvings", range(9))
 def test_a_displacement_is_halved_until_it_is_inside_seven_times_at_most(halvings):
-    skill = one(UpTo(0.75 * 0.5 ** (halvings - 1) * 0.0625))
-    command = skill.command(0, RigidTransform(), shifted(0.0625), {}, 1.0)
+    template = one(UpTo(0.75 * 0.5 ** (halvings - 1) * 0.0625))
+    command = template.command(0, RigidTransform(), shifted(0.0625), {}, 1.0)
     fraction = 0.5**halvings if halvings < 8 else 0.0
     assert command.fraction == fraction
     assert command.X_WE.translation()[0] == pytest.approx(0.0625 * fraction, abs=1e-15)
@@ -282,23 +282,23 @@ def test_who_is_led_inside_goes_no_further_than_the_constraints_say():
 
 def test_a_request_out_of_all_proportion_still_slides_along_a_wall():
     """Brought within reach before it is projected, however far away it is: as far along the wall as one step goes."""
-    skill = one(ac.Box((-1.0, -1.0, -1.0), (0.0, 1e9, 1.0), "world"))
+    template = one(ac.Box((-1.0, -1.0, -1.0), (0.0, 1e9, 1.0), "world"))
     for far in (1.0, 1e4, 1e8):
-        command = skill.command(0, RigidTransform(), RigidTransform([far, far, 0.0]), {}, 1.0)
+        command = template.command(0, RigidTransform(), RigidTransform([far, far, 0.0]), {}, 1.0)
         np.testing.assert_allclose(command.X_WE.translation(), [0.0, REACH / np.sqrt(2), 0.0], rtol=1e-7, atol=1e-9)
 
 
-def test_what_is_not_said_of_a_skill():
-    skill = one()
-    assert skill.parameters == {}
-    assert skill.states[0].weight == 1.0
+def test_what_is_not_said_of_a_template():
+    template = one()
+    assert template.parameters == {}
+    assert template.states[0].weight == 1.0
     with pytest.raises(InputError, match=r"one has no state 'onyl'.*did you mean only"):
-        skill.index("onyl")
+        template.index("onyl")
 
 
 def test_the_progress_of_states_that_go_round_ends():
     a, b, c = (
         one_state(name=name, transitions=(Transition(to, 0.5),)) for name, to in (("a", "b"), ("b", "c"), ("c", "b"))
     )
-    skill = SharedControlTemplate("round", 3, (), (a, b, c), 0, REACH, 1.0)
-    assert [skill.progress(number, RigidTransform(), {}) for number in range(3)] == [1.0, 2.0, 3.0]
+    template = SharedControlTemplate("round", 3, (), (a, b, c), 0, REACH, 1.0)
+    assert [template.progress(number, RigidTransform(), {}) for number in range(3)] == [1.0, 2.0, 3.0]

@@ -1,4 +1,4 @@
-"""`guiderail check` finds the mistakes that a skill can make without being unreadable."""
+"""`guiderail check` finds the mistakes that a template can make without being unreadable."""
 
 from pathlib import Path
 
@@ -9,11 +9,11 @@ from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.drawing import draw, to_dot
 from guiderail.models.templates.validate import validate
 
-SKILL = (Path(__file__).parent / "reach.yaml").read_text()
+TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
 
 
 def findings(change=None):
-    data = yaml.safe_load(SKILL)
+    data = yaml.safe_load(TEMPLATE)
     if change:
         change(data)
     return validate(parse_template(yaml.safe_dump(data, sort_keys=False)))
@@ -24,11 +24,11 @@ def errors(change):
 
 
 @pytest.mark.parametrize("name", ["pouring", "pouring_aimed", "grid_clamp", "end_effector_velocity"])
-def test_our_own_skills_have_no_errors(name):
+def test_our_own_templates_have_no_errors(name):
     assert [f.message for f in validate(load_template(name)) if f.is_error] == []
 
 
-def test_a_sound_skill_is_left_alone():
+def test_a_sound_template_is_left_alone():
     assert findings() == []
 
 
@@ -94,22 +94,22 @@ def test_draws_whatever_a_state_is_called(tmp_path, name):
         data["states"][name] = data["states"].pop("near")
         data["states"]["far"]["transitions"][0]["to"] = name
 
-    data = yaml.safe_load(SKILL)
+    data = yaml.safe_load(TEMPLATE)
     change(data)
-    skill = parse_template(yaml.safe_dump(data, sort_keys=False))
-    draw(skill, tmp_path / "a.png")
+    template = parse_template(yaml.safe_dump(data, sort_keys=False))
+    draw(template, tmp_path / "a.png")
     # Quotes and backslashes inside a quoted word are escaped: what is left pairs up.
-    for line in to_dot(skill).splitlines():
+    for line in to_dot(template).splitlines():
         assert line.replace("\\\\", "").replace('\\"', "").count('"') % 2 == 0
 
 
 def test_draws_every_state_and_every_way(tmp_path):
-    skill = load_template("pouring")
-    dot = to_dot(skill)
-    assert all(f'"{state.name}"' in dot for state in skill.states)
+    template = load_template("pouring")
+    dot = to_dot(template)
+    assert all(f'"{state.name}"' in dot for state in template.states)
     assert dot.count("->") == 3  # forward twice, and back from tilt
     for suffix in (".dot", ".png"):
-        draw(skill, tmp_path / f"pouring{suffix}")
+        draw(template, tmp_path / f"pouring{suffix}")
         assert (tmp_path / f"pouring{suffix}").stat().st_size > 100
 
 

@@ -102,7 +102,7 @@ def trained(bead_run):
         (["train", "lab/Own", "--out", "new"], "or --import the file that registers it"),
         (["stress", "lab/Own"], "or --import the file that registers it"),
         (["check", "pourin"], "or one of end_effector_velocity, grid_clamp, pouring"),
-        (["check", "pouring", "--fit"], "this is a skill: leave it out"),
+        (["check", "pouring", "--fit"], "this is a template: leave it out"),
         (["serve-iiwa", "--seconds", "nan"], "seconds must be a positive number, not nan"),
         (["serve-iiwa", "--seconds", "-1"], "seconds must be a positive number, not -1"),
         (["serve-iiwa", "--command-timeout", "0"], "patience must be a positive number, not 0"),

@@ -1,4 +1,4 @@
-"""Skill files, mutated at random: a skill that means exactly what the file says and works, or one sentence."""
+"""Template files, mutated at random: a template that means exactly what the file says and works, or one sentence."""
 
 import copy
 import dataclasses
@@ -19,7 +19,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.yaml import parse_yaml
 from guiderail.models.templates import parse_template
 from guiderail.models.templates.transitions import TransitionDistance
-from oracles.files import skill_numbers
+from oracles.files import template_numbers
 
 TEXTS = [
     (Path(__file__).parents[2] / "models" / "templates" / "reach.yaml").read_text(),
@@ -59,17 +59,17 @@ states:
 TREES = [yaml.safe_load(text) for text in TEXTS]
 
 
-def means_what_it_says(skill, text):
-    """Every number of the skill is the one that an independent reader finds at its place in the file."""
-    found = skill_numbers(text)
+def means_what_it_says(template, text):
+    """Every number of the template is the one that an independent reader finds at its place in the file."""
+    found = template_numbers(text)
     data = parse_yaml(text)
-    for name, value in skill.parameters.items():
+    for name, value in template.parameters.items():
         assert value == found["parameters", name]
-    assert skill.inputs == found["inputs",]
-    assert skill.max_speed_m_per_s == found["max_speed_m_per_s",]
-    assert skill.max_speed_rad_per_s == found["max_speed_rad_per_s",]
-    assert [state.name for state in skill.states] == list(data["states"])
-    for state, entry in zip(skill.states, data["states"].values(), strict=True):
+    assert template.inputs == found["inputs",]
+    assert template.max_speed_m_per_s == found["max_speed_m_per_s",]
+    assert template.max_speed_rad_per_s == found["max_speed_rad_per_s",]
+    assert [state.name for state in template.states] == list(data["states"])
+    for state, entry in zip(template.states, data["states"].values(), strict=True):
         place = ("states", state.name)
         unit = state.transition_distance.unit
         si = math.pi / 180 if unit == "deg" else 1.0
@@ -113,43 +113,43 @@ def same_value(value, said, place, found):
         assert value == found[place]
 
 
-def works(skill):
+def works(template):
     """Every law of every state gives a pose or a number, near the object and far from it."""
     X_WF = {
         name: RigidTransform(RotationMatrix.MakeZRotation(0.3 + i), [0.5, 0.1 * i, 0.1])
-        for i, name in enumerate(skill.frames)
+        for i, name in enumerate(template.frames)
     }
-    inputs = np.linspace(-1.0, 1.5, skill.inputs)
+    inputs = np.linspace(-1.0, 1.5, template.inputs)
     for X_WE in (RigidTransform(RotationMatrix.MakeXRotation(0.4), [0.4, 0.0, 0.3]), RigidTransform()):
-        state = skill.state_at(X_WE, X_WF)
-        assert 0 <= state < len(skill.states)
-        for number in range(len(skill.states)):
-            request = skill.displace(X_WE, skill.map(number, inputs, X_WE, X_WF, 0.01))
-            command = skill.command(number, X_WE, request, X_WF, 0.01)
-            for X in (request, command.X_WE, skill.project(number, X_WE, X_WF)):
+        state = template.state_at(X_WE, X_WF)
+        assert 0 <= state < len(template.states)
+        for number in range(len(template.states)):
+            request = template.displace(X_WE, template.map(number, inputs, X_WE, X_WF, 0.01))
+            command = template.command(number, X_WE, request, X_WF, 0.01)
+            for X in (request, command.X_WE, template.project(number, X_WE, X_WF)):
                 assert np.isfinite(X.GetAsMatrix34()).all()
-            assert math.isfinite(skill.violation(number, X_WE, X_WF))
-            assert math.isfinite(skill.progress(number, X_WE, X_WF))
-            assert 0 <= skill.next_state(number, X_WE, X_WF) < len(skill.states)
-            assert isinstance(skill.states[number].transition_distance, TransitionDistance)
+            assert math.isfinite(template.violation(number, X_WE, X_WF))
+            assert math.isfinite(template.progress(number, X_WE, X_WF))
+            assert 0 <= template.next_state(number, X_WE, X_WF) < len(template.states)
+            assert isinstance(template.states[number].transition_distance, TransitionDistance)
 
 
-def try_skill(target, text):
-    skill = attempt(target, InputError, lambda: parse_template(text))
-    if skill is not None:
-        means_what_it_says(skill, text)
-        works(skill)
+def try_template(target, text):
+    template = attempt(target, InputError, lambda: parse_template(text))
+    if template is not None:
+        means_what_it_says(template, text)
+        works(template)
 
 
 @given(changed_trees(TREES))
 @example(TREES[-1])
-def test_skills_with_entries_changed(tree):
-    try_skill("skill, entries changed", yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
+def test_templates_with_entries_changed(tree):
+    try_template("template, entries changed", yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
 
 
 @given(changed_texts(TEXTS))
-def test_skills_with_characters_changed(text):
-    try_skill("skill, characters changed", text)
+def test_templates_with_characters_changed(text):
+    try_template("template, characters changed", text)
 
 
 TOKENS = st.sampled_from(
@@ -161,7 +161,7 @@ TOKENS = st.sampled_from(
 def test_arithmetic(expression):
     tree = copy.deepcopy(TREES[-1])
     tree["max_speed_m_per_s"] = expression
-    try_skill("skill, arithmetic", yaml.safe_dump(tree, sort_keys=False))
+    try_template("template, arithmetic", yaml.safe_dump(tree, sort_keys=False))
 
 
 # PyYAML writes the text "1e3" without quotes: to YAML 1.2 it is a number.

@@ -1,4 +1,4 @@
-"""The poses of a skill's objects, as parameters that a reset can set."""
+"""The poses of a template's objects, as parameters that a reset can set."""
 
 from collections.abc import Mapping
 
@@ -12,32 +12,32 @@ from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support.caching import declare_cache
 
 
-class SkillFrames:
-    """Declares the frames of a skill as numeric parameters of a LeafSystem, and returns them as poses.
+class TemplateFrames:
+    """Declares the frames of a template as numeric parameters of a LeafSystem, and returns them as poses.
 
     They are parameters and not inputs because they are constant during an episode: a guidance diagram keeps the ports
     that all guidance has, and a reset moves an object by `set`.
     """
 
-    def __init__(self, system: LeafSystem, skill: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
+    def __init__(self, system: LeafSystem, template: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
         """
         Args:
             system: the system that has the parameters; its outputs depend on `ticket`.
-            skill: whose frames they are.
+            template: whose frames they are.
             frames: their default poses, one for each name.
 
         Raises:
-            InputError: if a frame of the skill is missing or not finite.
+            InputError: if a frame of the template is missing or not finite.
         """
-        missing = [name for name in skill.frames if name not in frames]
+        missing = [name for name in template.frames if name not in frames]
         if missing:
-            raise InputError(f"the skill {skill.name} needs the frame {missing[0]}: give its pose")
-        self._names = skill.frames
+            raise InputError(f"the template {template.name} needs the frame {missing[0]}: give its pose")
+        self._names = template.frames
         self._indices = [
-            system.DeclareNumericParameter(BasicVector(_checked_pose(name, frames[name]))) for name in skill.frames
+            system.DeclareNumericParameter(BasicVector(_checked_pose(name, frames[name]))) for name in template.frames
         ]
         self._cache = declare_cache(
-            system, "skill_frames", self._calc, prerequisites_of_calc={system.all_parameters_ticket()}
+            system, "template_frames", self._calc, prerequisites_of_calc={system.all_parameters_ticket()}
         )
 
     @property
@@ -58,11 +58,11 @@ class SkillFrames:
         """Moves frames in the system's context; those that are not named stay where they are.
 
         Raises:
-            InputError: if the skill has no such frame, or a pose is not finite.
+            InputError: if the template has no such frame, or a pose is not finite.
         """
         for name, X_WF in frames.items():
             if name not in self._names:
-                raise InputError(f"the skill has no frame {name}, only {', '.join(self._names)}")
+                raise InputError(f"the template has no frame {name}, only {', '.join(self._names)}")
             index = self._indices[self._names.index(name)]
             context.get_mutable_numeric_parameter(index).SetFromVector(_checked_pose(name, X_WF))
 
