@@ -36,7 +36,7 @@ class StationKind:
 
 STATIONS: Registry[StationKind] = Registry(
     "station",
-    package="guiderail.diagrams.stations",
+    package=("guiderail.diagrams.stations", "guiderail.diagrams.hardware"),
     decorator="register_station",
     entry_points="guiderail.stations",
 )

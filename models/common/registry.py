@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import difflib
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, partial
 from importlib import import_module, metadata
 from importlib.util import find_spec
@@ -29,20 +29,21 @@ class Registry(Generic[Entry]):
         self,
         noun: str,
         *,
-        package: str | None = None,
+        package: str | Sequence[str] = (),
         decorator: str | None = None,
         entry_points: str | None = None,
     ):
         """
         Args:
             noun: what an entry is, for sentences: "task", "robot".
-            package: the import name of a package whose modules register entries.
+            package: import name of the package, or of each package, whose modules register entries.
             decorator: the function by whose calls, with a name as first argument, they do that: it is looked for in
                 their text. Unless given they are all imported when the list is first looked at.
             entry_points: the group of entry points that name further ones.
         """
         self.noun = noun
-        self._package, self._decorator, self._group = package, decorator, entry_points
+        self._packages = (package,) if isinstance(package, str) else tuple(package)
+        self._decorator, self._group = decorator, entry_points
         self._entries: dict[str, Entry] = {}
         self._origins: dict[str, tuple[str, str]] = {}
 
@@ -90,13 +91,10 @@ class Registry(Generic[Entry]):
     @cached_property
     def _modules(self) -> dict[str, str]:
         """The module of each name that the package's own modules register."""
-        if self._package is None:
-            return {}
-        spec = find_spec(self._package)
-        folders = [Path(place) for place in (spec.submodule_search_locations or ())] if spec is not None else []
         files = {
-            ".".join((self._package, *file.relative_to(folder).with_suffix("").parts)): file
-            for folder in folders
+            ".".join((package, *file.relative_to(folder).with_suffix("").parts)): file
+            for package in self._packages
+            for folder in _folders(package)
             for file in sorted(folder.rglob("*.py"))
             if file.stem != "__init__"
         }
@@ -121,6 +119,11 @@ def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str
     lower = {word.lower(): word for word in known}
     near = difflib.get_close_matches(str(name).lower(), lower, n=1)
     return f"did you mean {lower[near[0]]}?" if near else f"choose one of {', '.join(known) or 'none'}{otherwise}"
+
+
+def _folders(package: str) -> list[Path]:
+    spec = find_spec(package)
+    return [Path(folder) for folder in (spec.submodule_search_locations or ())] if spec is not None else []
 
 
 def _registered(source: str, decorator: str) -> Iterator[str]:
