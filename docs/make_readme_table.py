@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.tables import read_table
 
 HERE = Path(__file__).parent
-README, RESULTS = HERE.parent / "README.md", HERE / "results"
+README, RESULTS = HERE.parent / "README.md", HERE.parent / "research" / "results"
 BEGIN, END = "<!-- Written by docs/make_readme_table.py -->", "<!-- End of what it wrote -->"
 COLUMNS = (
     "task", "method", "training episodes (seeds)", "success held out [%], each seed of 100", "converged after",

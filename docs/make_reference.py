@@ -553,11 +553,10 @@ def studies() -> str:
 
     page = (
         "# Study files\n\n`guiderail study FILE --out D` runs methods × seeds × marks × what is judged on. "
-        f"{', '.join(f'`{n}`' for n in declaration.shipped_studies())} come along. A field of two words is written "
-        "with a space: `judged on`. What is unknown is refused.\n\n"
+        "Those of the project are in `research/studies`. Unknown fields are refused.\n\n"
     )
     kinds = (declaration.Study, declaration.Method, declaration.LearnerChoice, declaration.EvalSet, declaration.Sweep)
-    for kind in (*kinds, declaration.Ratio, *declaration.PROGRAMS.values(), declaration.Certifiable):
+    for kind in (*kinds, declaration.Ratio):
         words, kinds_of = field_words(kind), field_types(kind)
         page += f"## {kind.__name__}\n\n{prose(inspect.getdoc(kind) or '')}\n\n"
         rows = []

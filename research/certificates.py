@@ -1,7 +1,10 @@
-"""The study `certificates`: what shipped skills can command at all, beside the worst that an adversary found.
+"""Certificates of shipped skills, with the worst command that an adversary found.
 
-Each skill is certified, checked by the checker that shares nothing with the primitive, and attacked. A bound is as
-tight as the worst found says; both are the largest over all steps, apart for those at which a constraint can be active.
+Each skill is certified, the certificate is checked by a checker that shares no code with the primitive, and the skill
+is attacked. The ratio of a bound to the worst command found shows how tight it is. The table has the largest ratio over
+all steps, separately for steps at which a constraint can be active.
+
+Run it with `python -m research.certificates --out studies`.
 """
 
 from __future__ import annotations
@@ -11,73 +14,138 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from guiderail.models.common.errors import InputError, RunsFailedError
+from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.certify import certify_skill
 from guiderail.tools.evaluation.evaluate import cached
 from guiderail.tools.tables import write_table
+from research.command import Parser, print_result, run_program
 
+SHIPPED = Path(__file__).with_name("certificates.yaml")
 OUTPUTS = ("x", "y", "z", "Rz", "Ry", "Rx")
 
 
-def certificates(out: Path, *, skills: Mapping[str, Mapping[str, Any]], attack: int) -> dict[str, Any]:
-    """Certifies and attacks skills; one that was attacked so in the folder already is not attacked again.
+class CertifiedSkill(BaseModel):
+    """Skill to certify.
 
-    Args:
-        out: the folder; each skill's certificate is in a folder of its own in it.
-        skills: by name, the `task` and the arguments of its environment, `env`.
-        attack: steps of the adversary, on each.
+    Attributes:
+        task: Name of the task.
+        env: Options of its environment.
+    """
 
-    Returns:
-        Where the table is, and how many skills are in it; `failed` says which of them left a bound, or were rejected.
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    task: str
+    env: dict[str, Any] = {}
+
+
+class Declaration(BaseModel):
+    """Content of the YAML file.
+
+    Attributes:
+        skills: Skills to certify, by name; each name is also the name of a folder.
+        attack: Steps of the adversary on each skill.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    skills: dict[Annotated[str, Field(pattern=r"^[\w.-]+$")], CertifiedSkill] = Field(min_length=1)
+    attack: int = Field(default=1_000_000, ge=1, strict=True)
+
+
+def load_declaration(file: Path) -> Declaration:
+    """Read the YAML file that declares which skills are certified.
 
     Raises:
-        InputError: if a skill can't be certified.
+        InputError: If the file is missing or its content is invalid.
+    """
+    if not file.is_file():
+        raise InputError(f"there is no file {file}: name a YAML file with skills and attack")
+    try:
+        return Declaration.model_validate(load_yaml(file, "list of skills"))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ", ".join(map(str, first["loc"])) or "content"
+        raise InputError(f"{file}: {place}: {first['msg'][:1].lower()}{first['msg'][1:]}") from error
+
+
+def certify_skills(out: Path, declaration: Declaration) -> dict[str, Any]:
+    """Certify and attack skills; results that are already in the folder are reused.
+
+    Args:
+        out: Folder of the table `certificates.csv`, and of a folder for each skill's certificate.
+        declaration: Skills and the length of the attack.
+
+    Returns:
+        The table's path and number of skills. `failed` has a sentence for each skill whose certificate is rejected or
+        violated, and is absent if there is none.
+
+    Raises:
+        InputError: If a skill cannot be certified.
     """
     rows = []
-    for name, skill in skills.items():
+    for name, skill in declaration.skills.items():
         folder = out / "certificates" / name
-        digest = hashlib.sha256(json.dumps([skill, attack], sort_keys=True).encode()).hexdigest()[:8]
-        rows.append(cached(folder / f"told-{digest}.csv", partial(_told, skill, folder, attack)))
+        content = json.dumps([skill.model_dump(), declaration.attack], sort_keys=True).encode()
+        file = folder / f"row-{hashlib.sha256(content).hexdigest()[:8]}.csv"
+        rows.append(cached(file, partial(_certify, skill, folder, declaration.attack)))
         rows[-1].insert(0, "skill", name)
     table = pd.concat(rows, ignore_index=True)
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "table": str(write_table(out / "certificates", table.to_dict("records"))),
         "skills": len(table),
     }
-    failed = [words for row in table.to_dict("records") if (words := _failure(row))]
-    return found | ({"failed": failed} if failed else {})
+    failed = [sentence for row in table.to_dict("records") if (sentence := _failure(row))]
+    return result | ({"failed": failed} if failed else {})
 
 
 def _failure(row: Mapping[Any, Any]) -> str:
-    """What does not hold of a skill's certificate; empty where all does."""
+    """Return what is wrong with a skill's certificate; an empty string if nothing is."""
     if row["checker"] != "yes":
-        return f"{row['skill']}: the checker says {row['checker']}"
-    return f"{row['skill']}: an adversary left {row['bounds_left']} bounds" if row["bounds_left"] else ""
+        return f"{row['skill']}: the certificate is rejected by the checker: {row['checker']}"
+    return f"{row['skill']}: an adversary exceeded {row['bounds_left']} bounds" if row["bounds_left"] else ""
 
 
-def _told(skill: Mapping[str, Any], folder: Path, attack: int) -> pd.DataFrame:
-    """One row."""
-    found = certify_skill(skill["task"], skill["env"], out=folder, attack=attack)
-    rows = pd.DataFrame(found["attack"])
-    tight = rows[rows["ratio"].notna()]
-    active = tight["constraint"] == "can be active"
-    told: dict[str, Any] = {
-        "checker": found["checker"],
-        "checker_seconds": found["checker_seconds"],
-        "steps": found["steps"],
-        "steps_constraints_can_touch": found["steps_that_constraints_can_touch"],
-        "attack_steps": found["attack_steps"],
-        "attack_corrected": found["attack_corrected"],
-        "bounds_left": int(rows["left"].sum()),
-        "budget_spent": found.get("budget_spent"),
-        "worst_ratio_free": tight.loc[~active, "ratio"].max(),
-        "worst_ratio_active": tight.loc[active, "ratio"].max(),
-        "median_ratio_active": tight.loc[active, "ratio"].median(),
+def _certify(skill: CertifiedSkill, folder: Path, attack: int) -> pd.DataFrame:
+    """Certify and attack one skill; return its row."""
+    result = certify_skill(skill.task, skill.env, out=folder, attack=attack)
+    bounds = pd.DataFrame(result["attack"])
+    rated = bounds[bounds["ratio"].notna()]
+    active = rated["constraint"] == "can be active"
+    row: dict[str, Any] = {
+        "checker": result["checker"],
+        "checker_seconds": result["checker_seconds"],
+        "steps": result["steps"],
+        "steps_constraints_can_touch": result["steps_that_constraints_can_touch"],
+        "attack_steps": result["attack_steps"],
+        "attack_corrected": result["attack_corrected"],
+        "bounds_left": int(bounds["left"].sum()),
+        "budget_spent": result.get("budget_spent"),
+        "worst_ratio_free": rated.loc[~active, "ratio"].max(),
+        "worst_ratio_active": rated.loc[active, "ratio"].max(),
+        "median_ratio_active": rated.loc[active, "ratio"].median(),
     }
     if active.any():
-        worst = tight[active].nlargest(1, "ratio").iloc[0]
-        told["worst_active"] = f"{worst['quantity']} of {OUTPUTS[int(worst['output'])]}"
-    return pd.DataFrame([told])
+        worst = rated[active].nlargest(1, "ratio").iloc[0]
+        row["worst_active"] = f"{worst['quantity']} of {OUTPUTS[int(worst['output'])]}"
+    return pd.DataFrame([row])
+
+
+def main(arguments: list[str]) -> None:
+    """Run the program."""
+    parser = Parser("certificates", "Certify skills and attack their certificates.", "--out studies")
+    parser.add_argument("file", type=Path, nargs="?", default=SHIPPED, help="YAML file of skills (default: shipped)")
+    parser.add_out(None)
+    parser.add_json()
+    given = parser.parse_args(arguments)
+    result = certify_skills(given.out, load_declaration(given.file))
+    print_result(result, as_json=given.json)
+    if "failed" in result:
+        raise RunsFailedError(result["failed"], None)
+
+
+if __name__ == "__main__":
+    run_program(main)

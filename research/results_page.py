@@ -13,7 +13,7 @@ import pandas as pd
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import import_modules
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.experiments.declaration import LEARNED, Study, load_study, shipped_studies
+from guiderail.tools.experiments.declaration import LEARNED, Study, load_study
 from guiderail.tools.experiments.study import differences_of, each
 from guiderail.tools.experiments.sweep import BREAKS, break_words, curve, draw_sweeps
 from guiderail.tools.files import write_atomically
@@ -21,6 +21,7 @@ from guiderail.tools.tables import cell, read_table, table_text
 from research.figures import FIGURES as MADE
 from research.figures import command_of
 from research.figures.thesis import THESIS
+from research.studies import study_command_line, study_names, study_path
 
 # The figures of the thesis that a study stands beside.
 FIGURES = {
@@ -45,6 +46,13 @@ OF_SMOOTHNESS = (
 )  # fmt: skip
 
 
+PROGRAMS = ("certificates", "smoothness")  # tables that are not a study's
+
+
+def _table_names() -> list[str]:
+    return sorted([*study_names(), *PROGRAMS])
+
+
 def write_results(folders: Sequence[Path], out: Path) -> Path:
     """Takes what studies and figures left into a folder, and writes its README.md anew from all that is there.
 
@@ -58,7 +66,7 @@ def write_results(folders: Sequence[Path], out: Path) -> Path:
         InputError: if a folder holds neither, or there is nothing to write of.
     """
     for folder in folders:
-        finished = [folder / f"{name}.csv" for name in shipped_studies() if (folder / f"{name}.csv").is_file()]
+        finished = [folder / f"{name}.csv" for name in _table_names() if (folder / f"{name}.csv").is_file()]
         figures = [folder / f"{name}.json" for name in MADE.values() if (folder / f"{name}.json").is_file()]
         if not finished and not figures:
             raise InputError(
@@ -69,7 +77,7 @@ def write_results(folders: Sequence[Path], out: Path) -> Path:
             write_atomically(out / file.name, table_text(read_table(file)).encode())
         for file in figures:
             write_atomically(out / file.name, json.dumps(_figure(file), indent=1).encode() + b"\n")
-    tables = {file.stem: read_table(file) for file in sorted(out.glob("*.csv")) if file.stem in shipped_studies()}
+    tables = {file.stem: read_table(file) for file in sorted(out.glob("*.csv")) if file.stem in _table_names()}
     made = {number: _figure(out / f"{name}.json") for number, name in MADE.items() if (out / f"{name}.json").is_file()}
     if not tables and not made:
         raise InputError(f"there is no table of a study and no figure in {out}: name folders of them")
@@ -78,7 +86,7 @@ def write_results(folders: Sequence[Path], out: Path) -> Path:
         "In simulation;\nevery seed by itself; held-out episodes are ones that training never drew.\n"
     )
     for name, rows in tables.items():
-        if isinstance(study := load_study(name), Study) and study.sweeps:
+        if name not in PROGRAMS and (study := load_study(study_path(name))).sweeps:
             draw_sweeps(study, rows, out / f"{name}.svg")
     parts = [head, _figures(made, [*tables]), *(_study(name, rows) for name, rows in tables.items())]
     write_atomically(out / "README.md", "\n".join(parts).encode())
@@ -117,13 +125,14 @@ def _words(key: str) -> str:
 
 def _study(name: str, rows: pd.DataFrame) -> str:
     """The section of a study."""
-    study = load_study(name)
-    lines = [f"## {name}", "", f"`guiderail study {name} --out studies`, and the table `{name}.csv`.", ""]
-    if not isinstance(study, Study):
-        told = rows[list(OF_SMOOTHNESS)] if study.program == "smoothness" else rows
+    command = f"python -m research.{name} --out studies" if name in PROGRAMS else study_command_line(name)
+    lines = [f"## {name}", "", f"`{command}`, and the table `{name}.csv`.", ""]
+    if name in PROGRAMS:
+        told = rows[list(OF_SMOOTHNESS)] if name == "smoothness" else rows
         lines += [f"| {' | '.join(map(_words, told))} |", "|" + "---|" * len(told.columns)]
         lines += [f"| {' | '.join(map(cell, row))} |" for row in told.itertuples(index=False)]
         return "\n".join([*lines, ""])
+    study = load_study(study_path(name))
     lines += [f"- Figure {number}: {THESIS[number]}." for number in FIGURES.get(name, ())]
     lines += _swept(study, rows)
     if len(judged := _judged(study, rows)):

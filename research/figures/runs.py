@@ -14,6 +14,7 @@ from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import colour, draw_runs, label, legend, new_figure, save_figure
+from research.studies import study_path
 
 
 def figure_study(
@@ -35,8 +36,7 @@ def figure_study(
         judged: whether its policies are judged.
         changed: other fields.
     """
-    study = load_study(name)
-    assert isinstance(study, Study)
+    study = load_study(study_path(name))
     first = study.seeds[0]
     known = {m: study.methods.get(m, Method(env={"guidance": m})) for m in methods or study.methods}
     if episodes is not None:

@@ -33,16 +33,17 @@ def test_the_table_is_of_today(maker):
 
 def test_every_study_and_method_that_it_asks_for_is_shipped(maker):
     from guiderail.tools.experiments.declaration import load_study
+    from research.studies import study_path
 
     for row in (row for task in maker.TASKS.values() for row in task):
-        study = load_study(row.study)
+        study = load_study(study_path(row.study))
         assert row.method in study.methods, f"{row.study} has no {row.method}"
         assert row.judged is None or row.judged in [one.name for one in study.eval_set]
         assert row.judged is not None or len(study.eval_set) < 2, f"{row.study} judges on several kinds of episodes"
 
 
 def test_a_study_that_is_not_there_is_left_out(maker, tmp_path):
-    shutil.copy(DOCS / "results" / "connector_hard_nulls.csv", tmp_path)
+    shutil.copy(ROOT / "research" / "results" / "connector_hard_nulls.csv", tmp_path)
     found = rows(maker.table(tmp_path))
     assert {row[0] for row in found} == {"**connector, hard**", ""}
     assert [row[1] for row in found] == list(maker.NULLS)
@@ -50,7 +51,7 @@ def test_a_study_that_is_not_there_is_left_out(maker, tmp_path):
 
 
 HEAD = (
-    "method,seed,mark,eval_set,episodes,success_rate,success_low,success_high,max_commanded_violation,violating_episodes,"
+    "method,seed,after_episodes,eval_set,episodes,success_rate,success_low,success_high,max_commanded_violation,violating_episodes,"
     "peak_force,training_episodes,training_success_rate,training_episodes_to_convergence,training_max_commanded_violation,"
     "training_violating_episodes,training_peak_force\n"
 )
@@ -76,7 +77,7 @@ def test_each_seed_is_told_after_its_last_episode_with_the_worst_that_it_did(mak
 
 def test_what_was_never_judged_is_said_to_be_of_training(maker, tmp_path):
     (tmp_path / "narrow_passage.csv").write_text(
-        "method,seed,mark,eval_set,training_episodes,training_success_rate,training_episodes_to_convergence,"
+        "method,seed,after_episodes,eval_set,training_episodes,training_success_rate,training_episodes_to_convergence,"
         "training_max_commanded_violation,training_violating_episodes,training_peak_force\n"
         "kgrl,0,60,,60,1.0,0,-0.01,0,0.0\nkgrl,1,60,,60,0.5,3,1e-12,0,0.0\nkgrl,2,60,,60,0.25,,0,0,3.0\n"
     )

@@ -1,16 +1,19 @@
+"""Certificates of several skills in one table."""
+
 import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.cli.main import main
-from guiderail.tools.experiments.declaration import load_study
-from research.certificates import certificates
-
-SKILLS = {"passage": {"task": "NarrowPassage", "env": {"guidance": "kgrl"}}}
+from research.certificates import SHIPPED, Declaration, certify_skills, load_declaration, main
+from research.command import run_program
 
 
-def test_a_row_for_each_skill_and_nothing_is_attacked_twice(tmp_path, monkeypatch):
-    found = certificates(tmp_path, skills=SKILLS, attack=2000)
+def declaration(guidance="kgrl"):
+    return Declaration(skills={"passage": {"task": "NarrowPassage", "env": {"guidance": guidance}}}, attack=2000)
+
+
+def test_certificates_are_reused_if_already_computed(tmp_path, monkeypatch):
+    result = certify_skills(tmp_path, declaration())
     rows = pd.read_csv(tmp_path / "certificates.csv")
     assert rows["skill"].tolist() == ["passage"]
     row = rows.iloc[0]
@@ -19,44 +22,56 @@ def test_a_row_for_each_skill_and_nothing_is_attacked_twice(tmp_path, monkeypatc
     assert row["worst_ratio_free"] >= 1.0 - 1e-6
     assert row["attack_steps"] >= 2000
     monkeypatch.setattr("research.certificates.certify_skill", None)
-    assert certificates(tmp_path, skills=SKILLS, attack=2000)["table"] == found["table"]
-    other = {"passage": {"task": "NarrowPassage", "env": {"guidance": "skgrl"}}}
-    with pytest.raises(TypeError):  # another skill of the same name is no finished one
-        certificates(tmp_path, skills=other, attack=2000)
+    assert certify_skills(tmp_path, declaration())["table"] == result["table"]
+    with pytest.raises(TypeError):  # the result of another skill with the same name is not reused
+        certify_skills(tmp_path, declaration("skgrl"))
 
 
-def test_the_program_is_named(tmp_path):
-    for program, words in (("certificate", "did you mean certificates"), ("[1]", "there is no program")):
-        (tmp_path / "study.yaml").write_text(f"name: a\nprogram: {program}\nskills: {{a: {{task: NarrowPassage}}}}\n")
-        with pytest.raises(InputError, match=words):
-            load_study(tmp_path / "study.yaml")
+def test_shipped_declaration_is_valid():
+    assert len(load_declaration(SHIPPED).skills) == 8
 
 
-def found(checker="yes", left=0):
-    """What certifying a skill comes to."""
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("skills: {}", "skills"),
+        ("[1]", "content"),
+        ("skills: {a: {task: NarrowPassage}}\nsteps: 1", "steps"),
+        ("skills: {a: {task: NarrowPassage}}\nattack: 0", "attack"),
+    ],
+)
+def test_declaration_is_refused_when_invalid(text, message, tmp_path):
+    (tmp_path / "skills.yaml").write_text(text)
+    with pytest.raises(InputError, match=message) as refused:
+        load_declaration(tmp_path / "skills.yaml")
+    assert "\n" not in str(refused.value)
+    with pytest.raises(InputError, match="there is no file"):
+        load_declaration(tmp_path / "none.yaml")
+
+
+def certified(checker="yes", left=0):
+    """Result of certifying a skill."""
     row = {"quantity": "pose", "output": 0, "constraint": "never active", "ratio": 1.0, "left": left}
     numbers = dict.fromkeys(("checker_seconds", "steps", "steps_that_constraints_can_touch"), 1)
     return {"checker": checker, "attack": [row], "attack_steps": 1, "attack_corrected": 0, **numbers}
 
 
 @pytest.mark.parametrize(
-    ("came", "words"),
+    ("result", "sentence"),
     [
-        (found(), None),
-        (found(checker="no: step 3: too tight"), "a_skill: the checker says no: step 3: too tight"),
-        (found(left=2), "a_skill: an adversary left 2 bounds"),
+        (certified(), None),
+        (certified(checker="no: step 3: too tight"), "a_skill: the certificate is rejected by the checker: no: step 3"),
+        (certified(left=2), "a_skill: an adversary exceeded 2 bounds"),
     ],
 )
-def test_what_does_not_hold_ends_the_command_as_it_ends_certify(tmp_path, monkeypatch, capsys, came, words):
-    (tmp_path / "study.yaml").write_text(
-        "name: a\nprogram: certificates\nskills: {other: {task: NarrowPassage}, a_skill: {task: NarrowPassage}}\n"
-    )
+def test_program_exits_with_1_when_a_certificate_fails(tmp_path, monkeypatch, capsys, result, sentence):
+    (tmp_path / "skills.yaml").write_text("skills: {other: {task: NarrowPassage}, a_skill: {task: NarrowPassage}}\n")
     monkeypatch.setattr(
         "research.certificates.certify_skill",
-        lambda *_, out, **__: came if out.name == "a_skill" else found(),
+        lambda *_, out, **__: result if out.name == "a_skill" else certified(),
     )
     with pytest.raises(SystemExit) as ended:
-        main(["study", str(tmp_path / "study.yaml"), "--out", str(tmp_path / "out")])
+        run_program(main, [str(tmp_path / "skills.yaml"), "--out", str(tmp_path / "out")])
     assert (tmp_path / "out" / "certificates.csv").is_file()
-    assert ended.value.code == (0 if words is None else 1)
-    assert capsys.readouterr().err == ("" if words is None else f"guiderail: {words}\n")
+    assert ended.value.code == (0 if sentence is None else 1)
+    assert (sentence or "") in capsys.readouterr().err

@@ -8,6 +8,7 @@ from guiderail.diagrams.tasks.pouring.scripted import scripted_pour_aimed, scrip
 from guiderail.diagrams.tasks.pouring.task import POSITION_SCALE
 from guiderail.tools.experiments.declaration import LEARNED, load_study
 from guiderail.tools.experiments.study import Job
+from research.studies import study_path
 
 HARD = ("pouring_hard", "pouring_hard_nulls", "pouring_balls_nulls", "narrow_passage_hard", "narrow_passage_hard_nulls")
 SWEEPS = ("connector_sweep", "grid_clamp_sweep", "pouring_sweep", "narrow_passage_sweep")
@@ -22,7 +23,7 @@ LEARNED_BY = {
 
 @pytest.mark.parametrize("name", [*HARD, *SWEEPS])
 def test_every_method_can_be_made(name, tmp_path):
-    study = load_study(name)
+    study = load_study(study_path(name))
     for method in study.methods:
         job = Job(study, method, study.seeds[0], tmp_path)
         assert job.config(job.after_episodes[-1]).environment["difficulty"] == "hard"
@@ -30,7 +31,7 @@ def test_every_method_can_be_made(name, tmp_path):
 
 @pytest.mark.parametrize("name", LEARNED_BY)
 def test_a_sweep_judges_what_another_study_learned(name, tmp_path):
-    sweep, learned = load_study(name), load_study(LEARNED_BY[name])
+    sweep, learned = load_study(study_path(name)), load_study(study_path(LEARNED_BY[name]))
     shared = [m for m, one in sweep.methods.items() if one.policy == LEARNED]
     assert shared
     for method in shared:
@@ -43,7 +44,7 @@ def test_a_sweep_judges_what_another_study_learned(name, tmp_path):
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_a_sweep_goes_from_easy_to_hard_and(name):
-    for sweep in load_study(name).sweeps:
+    for sweep in load_study(study_path(name)).sweeps:
         values = list(sweep.at)
         assert values in (sorted(values), sorted(values, reverse=True))
 

@@ -2,11 +2,12 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.declaration import load_study, shipped_studies
+from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.tables import read_table, write_table
 from research.figures import reproduce
 from research.figures.thesis import THESIS
 from research.results_page import FIGURES, OF_SMOOTHNESS, write_results
+from research.studies import study_names, study_path
 
 
 @pytest.fixture
@@ -49,7 +50,7 @@ def test_a_sweep_has_a_picture_and_says_where_each_method_breaks(tmp_path):
          "success_rate": rate, "training_episodes": 100 if learned else None, "training_episodes_to_convergence": None,
          "training_max_commanded_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0}
         for method, learned in (("rl_sct", True), ("uniform_random", False))
-        for one, rate in zip(load_study("pouring_sweep").judgements, rates[method], strict=True)
+        for one, rate in zip(load_study(study_path("pouring_sweep")).judgements, rates[method], strict=True)
     ]  # fmt: skip
     write_table(tmp_path / "study" / "pouring_sweep", pd.DataFrame(rows))
     page, picture = write_results([tmp_path / "study"], tmp_path / "results"), tmp_path / "results/pouring_sweep.svg"
@@ -85,7 +86,7 @@ def test_what_is_no_study_is_refused(tmp_path):
 
 
 def test_figures_stand_beside_studies_that_there_are():
-    assert set(FIGURES) <= set(shipped_studies())
+    assert set(FIGURES) <= set(study_names())
     assert {number for numbers in FIGURES.values() for number in numbers} <= set(THESIS)
 
 

@@ -39,7 +39,6 @@ CHOICES: dict[str, Callable[[], list[str]]] = {
     "robots": _known("models.robots.robot", "robot_names"),
     "algorithms": _known("tools.learning.learner", "learner_names"),
     "presets": _known("tools.learning.config", "PRESETS"),
-    "studies": _known("tools.experiments.declaration", "shipped_studies"),
     "engines": _known("tools.experiments.engines.engine", "ENGINES"),
     "pictures": _known("tools.files", "PICTURES"),
     "nulls": _known("tools.evaluation.baselines", "BASELINES"),
@@ -519,9 +518,9 @@ def export(
     _print(export_demonstrations(file, out, to, rate), as_json)
 
 
-@command("study connector --out studies --methods skgrl,kgrl --seeds 30,31")
+@command("study study.yaml --out studies --methods skgrl,kgrl --seeds 30,31")
 def study(
-    file: Annotated[str, _arg("A YAML file, or one of {studies}.", "FILE", "studies")],
+    file: Annotated[Path, _arg("The study's YAML file.", "FILE")],
     out: Annotated[Path, _opt("The folder of the study; what is finished in it is used again.")],
     methods: Annotated[str | None, _opt("Some of its methods, separated by commas.")] = None,
     seeds: Annotated[
@@ -541,16 +540,6 @@ def study(
     from guiderail.tools.experiments import declaration
 
     declared = declaration.load_study(file)
-    if not isinstance(declared, declaration.Study):
-        given = {"methods": methods, "seeds": seeds, "engine": engine, "address": address, "processes": processes}
-        if refused := [f"--{name}" for name, value in given.items() if value is not None]:
-            raise InputError(f"the study {declared.name} trains nothing: leave out {', '.join(refused)}")
-        program = import_module(f"research.{declared.program}")
-        found = getattr(program, declared.program)(out, **declared.model_dump(exclude={"program", "name"}))
-        _print(found, as_json)
-        if "failed" in found:
-            raise RunsFailedError(found["failed"], None)
-        return
     try:
         numbers = None if seeds is None else [int(number) for number in seeds.split(",")]
     except ValueError:
@@ -765,7 +754,7 @@ COLUMN = 19  # characters of a number that others stand beside
 
 
 LISTED: dict[str, Callable[[], Any]] = {
-    **{name: CHOICES[name] for name in ("tasks", "guidance", "stations", "robots", "presets", "studies")},
+    **{name: CHOICES[name] for name in ("tasks", "guidance", "stations", "robots", "presets")},
     "learners": CHOICES["algorithms"],
 }
 

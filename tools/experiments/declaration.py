@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
@@ -17,7 +17,6 @@ from guiderail.tools.evaluation.metrics import STATISTICS
 
 Whole = Annotated[int, Field(strict=True)]  # YAML's `true` would be 1 otherwise
 FolderName = Annotated[str, Field(pattern=r"^[\w.-]+$")]
-SHIPPED = Path(__file__).parents[2] / "research" / "studies"
 LEARNED = "learned"
 
 
@@ -176,64 +175,23 @@ class Study(_Strict):
         return self.model_copy(update={"methods": chosen, "seeds": tuple(self.seeds if seeds is None else seeds)})
 
 
-class Smoothness(_Strict):
-    """The benchmark of smoothness, which is a program of its own."""
+def load_study(file: Path | str) -> Study:
+    """Read a study's YAML file.
 
-    program: Literal["smoothness"]  # what makes it this kind of study
-    name: FolderName  # of the tables
-    episodes: Whole = Field(default=4, ge=1)  # of each way to explore
-    action_scale: float = Field(default=1.0, gt=0.0)  # κ of all of them
-    outputs: Literal["all", "xy"] = "all"  # which of them are explored
-    seed: Whole = Field(default=0, ge=0)  # of the actions
-
-
-class Certifiable(_Strict):
-    """A skill whose guidance follows a law that is certified."""
-
-    task: str  # its name
-    env: dict[str, Any] = {}  # options of its environment
-
-
-class Certificates(_Strict):
-    """Certificates of skills, and an attack on each: a program of its own."""
-
-    program: Literal["certificates"]  # what makes it this kind of study
-    name: FolderName  # of the table
-    skills: dict[FolderName, Certifiable] = Field(min_length=1)  # by name
-    attack: Whole = Field(default=1_000_000, ge=1)  # steps of the adversary, on each
-
-
-Program = Smoothness | Certificates
-PROGRAMS: dict[str, type[Program]] = {"smoothness": Smoothness, "certificates": Certificates}
-
-
-def shipped_studies() -> list[str]:
-    """The names of the studies that come along."""
-    return sorted(path.stem for path in SHIPPED.glob("*.yaml"))
-
-
-def load_study(file: Path | str) -> Study | Program:
-    """The study of a YAML file, or one that comes along by its name.
+    Args:
+        file: Path of the file.
 
     Raises:
-        InputError: if there is no such file, or it is no study.
+        InputError: If there is no such file, or its content is not a valid study.
     """
     path = Path(file)
-    if not path.suffix:
-        path = SHIPPED / f"{file}.yaml"
-        if not path.is_file():
-            raise InputError(f"there is no study {str(file)!r}: {did_you_mean(file, shipped_studies())}")
     if not path.is_file():
-        raise InputError(f"there is no file {path}: name a study's YAML file, or one of {', '.join(shipped_studies())}")
+        raise InputError(f"there is no file {path}: name a study's YAML file")
     data = load_yaml(path, "study")
     if not isinstance(data, dict):
         raise InputError(f"{path} is no study: it needs at least name, task, methods and seeds")
-    program = data.get("program")
-    if program is not None and (not isinstance(program, str) or program not in PROGRAMS):
-        raise InputError(f"{path}: there is no program {brief(program)}: {did_you_mean(program, PROGRAMS)}")
-    kind = Study if program is None else PROGRAMS[program]
     try:
-        return kind.model_validate(data)
+        return Study.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{path}: {_sentence(error)}") from error
 
@@ -243,9 +201,7 @@ def _sentence(error: ValidationError) -> str:
     first = error.errors()[0]
     where = ", ".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        kinds: tuple[type[BaseModel], ...] = (
-            Study, Method, LearnerChoice, EvalSet, Sweep, Ratio, Certifiable, *PROGRAMS.values()
-        )  # fmt: skip
+        kinds = (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio)
         known = {name for kind in kinds for name in kind.model_fields}
         return f"{where} is nothing that a study has: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":

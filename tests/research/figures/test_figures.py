@@ -12,6 +12,7 @@ from research.figures import FIGURES, find_figure, reproduce
 from research.figures.chapter_3 import METHODS
 from research.figures.chapter_4 import MOVED_ELSEWHERE
 from research.figures.thesis import TABLE_3_2, TABLE_4_1, THESIS
+from research.studies import study_path
 
 TABLES = {"table 3.2": TABLE_3_2, "table 4.1": TABLE_4_1}
 
@@ -89,7 +90,7 @@ def finished(out, study, method, seed, endings):
 
 def test_the_figures_are_drawn_from_the_studys_runs_and_from_every_seed_there_is(tmp_path):
     for algorithm in ("sac", "tqc"):
-        study = load_study(f"pouring_{algorithm}")
+        study = load_study(study_path(f"pouring_{algorithm}"))
         for method in METHODS:
             ending = "s" if method.startswith("rl_sct") else "c"
             finished(tmp_path, study, method, study.seeds[0], "tp" + ending * 10)
@@ -106,7 +107,7 @@ def test_the_figures_are_drawn_from_the_studys_runs_and_from_every_seed_there_is
 
 
 def test_the_force_of_the_grid_clamp_is_compared_seed_by_seed(tmp_path):
-    study = load_study("grid_clamp_figures")
+    study = load_study(study_path("grid_clamp_figures"))
     for method in study.methods:
         finished(tmp_path, study, method, 0, "t" + "s" * 11)
     result = reproduce("3.11", seeds=1, episodes=12, out=tmp_path)

@@ -12,6 +12,9 @@ from guiderail.tools.cli.main import app, main
 from guiderail.tools.environments import as_value
 from guiderail.tools.learning.run_folder import RunFolder
 from research import benchmarks
+from research.studies import study_path
+
+CONNECTOR = str(study_path("connector"))
 
 
 def call(capsys, *arguments):
@@ -68,16 +71,12 @@ def trained(bead_run):
         (["reproduce", "1.1"], "no figure '1.1'"),
         (["reproduce", "5.66"], "did you mean 5.6?"),
         (["reproduce", "5.6", "--seeds", "0"], "at least one seed"),
-        (["study", "conector", "--out", "new"], "did you mean connector?"),
-        (["study", "connector", "--out", "new", "--seeds", "1;2"], "whole numbers separated by commas"),
-        (["study", "connector", "--out", "new", "--methods", "skgrll"], "did you mean skgrl?"),
-        (["study", "connector", "--out", "new", "--engine", "rya"], "did you mean ray?"),
-        (["study", "connector", "--out", "new", "--processes", "0"], "at least one process"),
-        (["study", "connector", "--out", "new", "--address", "auto"], "give --engine ray too"),
-        (["study", "certificates", "--out", "new", "--methods", "a", "--seeds", "1"], "leave out --methods, --seeds"),
-        (["study", "certificates", "--out", "new", "--engine", "process"], "trains nothing: leave out --engine"),
-        (["study", "smoothness", "--out", "new", "--processes", "2"], "trains nothing: leave out --processes"),
-        (["study", "smoothness", "--out", "new", "--address", "auto"], "trains nothing: leave out --address"),
+        (["study", "connector.yaml", "--out", "new"], "there is no file connector.yaml"),
+        (["study", CONNECTOR, "--out", "new", "--seeds", "1;2"], "whole numbers separated by commas"),
+        (["study", CONNECTOR, "--out", "new", "--methods", "skgrll"], "did you mean skgrl?"),
+        (["study", CONNECTOR, "--out", "new", "--engine", "rya"], "did you mean ray?"),
+        (["study", CONNECTOR, "--out", "new", "--processes", "0"], "at least one process"),
+        (["study", CONNECTOR, "--out", "new", "--address", "auto"], "give --engine ray too"),
         (["bench", "primitve"], "did you mean primitive?"),
         (["bench", "learner", "Pouring"], "of no task: leave task out"),
         (["bench", "training", "Puring"], "did you mean Pouring?"),
@@ -219,7 +218,6 @@ def test_every_help_has_an_example_that_can_be_typed_and_starts_nothing(command,
 def test_help_names_the_choices(capsys):
     for command, words in (
         ("train", ("NarrowPassage", "skgrl", "tqc", "tqc_contact")),
-        ("study", ("connector_disc", "smoothness")),
         ("reproduce", ("table 3.3", "5.10")),
         ("bench", ("primitive", "simulation", "learner", "training", "Pouring")),
         ("stress", ("BncConnector", "Pouring")),
@@ -285,7 +283,7 @@ def test_values_are_read_as_what_they_are(text, value):
 
 def test_lists_can_be_read_by_a_program(capsys):
     listed = json.loads(call(capsys, "list", "--json")[1])
-    assert {"tasks", "guidance", "learners", "presets", "studies", "figures"} <= listed.keys()
+    assert {"tasks", "guidance", "learners", "presets"} <= listed.keys()
     assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
     assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["action_repeat"]
     assert "ten in a row" in call(capsys, "list", "metrics")[1]

@@ -12,7 +12,7 @@ from guiderail.tools.environments import import_modules, make_environment
 from guiderail.tools.evaluation.baselines import always
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import STATISTICS
-from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study, shipped_studies
+from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study
 from guiderail.tools.experiments.engines.engine import make_engine
 from guiderail.tools.experiments.study import (
     Job,
@@ -28,6 +28,7 @@ from guiderail.tools.experiments.sweep import AT_ONCE, NEVER, breaking_point
 from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import read_table
+from research.studies import study_names, study_path
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
 BEAD = {
@@ -178,7 +179,7 @@ def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
 
 
 def test_a_study_says_in_what_its_methods_differ_from_the_thesis():
-    study = load_study("connector_hard").only(["kgrl", "skgrl", "uniform_random", "scripted"])
+    study = load_study(study_path("connector_hard")).only(["kgrl", "skgrl", "uniform_random", "scripted"])
     told = differing(study)
     assert "reward aligned (thesis: sparse)" in told["all methods"]
     assert any(words.startswith("difficulty 'hard', which is ours") for words in told["all methods"])
@@ -340,23 +341,20 @@ def test_what_is_no_study_is_one_sentence(text, tmp_path):
     assert "\n" not in str(refused.value)
 
 
-def test_a_study_is_named_by_its_file_or_by_its_name(tmp_path):
+def test_load_study_refuses_a_missing_file(tmp_path):
     with pytest.raises(InputError, match="did you mean connector"):
-        load_study("conector")
+        study_path("conector")
     with pytest.raises(InputError, match="there is no file"):
         load_study(tmp_path / "none.yaml")
-    chosen = load_study("connector").only(["kgrl"], [1, 2])
+    chosen = load_study(study_path("connector")).only(["kgrl"], [1, 2])
     assert (list(chosen.methods), chosen.seeds) == (["kgrl"], (1, 2))
     with pytest.raises(InputError, match="did you mean kgrl"):
         chosen.only(["kgrll"])
 
 
-@pytest.mark.parametrize("name", shipped_studies())
+@pytest.mark.parametrize("name", study_names())
 def test_every_study_that_comes_along_makes_sense(name, tmp_path):
-    declared = load_study(name)
-    if not isinstance(declared, Study):
-        assert declared.program == name
-        return
+    declared = load_study(study_path(name))
     assert declared.name == name
     import_modules(declared.imports)
     for method in declared.methods:
@@ -367,7 +365,7 @@ def test_every_study_that_comes_along_makes_sense(name, tmp_path):
 
 
 def test_a_person_pours_and_the_constraints_are_why(tmp_path):
-    declared = load_study("pouring_mugs").only(["person", "person_unconstrained"])
+    declared = load_study(study_path("pouring_mugs")).only(["person", "person_unconstrained"])
     declared = declared.model_copy(update={"eval_set": (EvalSet(episodes=1),)})
     bound, free = run(declared, tmp_path).to_dict("records")
     assert (bound["success_rate"], free["success_rate"]) == (1.0, 0.0)
@@ -377,7 +375,7 @@ def test_a_person_pours_and_the_constraints_are_why(tmp_path):
 
 
 def test_a_policy_learns_on_rails_wherever_it_is_judged(tmp_path):
-    declared = load_study("connector_on_arm")
+    declared = load_study(study_path("connector_on_arm"))
     config = Job(declared, "skgrl", 30, tmp_path).config(80)
     assert config.environment["station"] == "gantry"
     assert declared.eval_set[0].env == {"station": "arm"}
