@@ -536,7 +536,7 @@ def worlds() -> str:
             page += f"### {type(world).__name__}\n\n" + exported(type(world).__name__, type(world))
         rows = []
         for name in stations_for(kind):
-            if not STATIONS.get(name).simulated:
+            if not STATIONS.get(name).is_simulated:
                 continue
             station = make_station(resolve(task, {"station": name}))
             ports = (station.get_output_port(index) for index in range(station.num_output_ports()))

@@ -174,7 +174,9 @@ def make_station(resolved: Resolved) -> Station:
         )
     build = partial(kind.build, world, **_values(resolved.models["station"]))
     return (
-        disturbed(build, disturbances, kind.simulated, kind.name) if isinstance(disturbances, Disturbances) else build()
+        disturbed(build, disturbances, kind.is_simulated, kind.name)
+        if isinstance(disturbances, Disturbances)
+        else build()
     )
 
 
@@ -214,7 +216,7 @@ def make_env(task: str, *, render_mode: str | None = None, **options: Any) -> Gu
     """
     check_render_mode(render_mode)
     resolved = resolve(task, options)
-    if not resolved.station.simulated:
+    if not resolved.station.is_simulated:
         raise InputError(
             f"station={resolved.station.name!r} is a real robot, which no reset can put anywhere: train and evaluate "
             "in a simulation, and run what was learned by guiderail run"

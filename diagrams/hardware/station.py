@@ -31,7 +31,7 @@ from guiderail.diagrams.stations.station import (
     Station,
     add_workcell_plant,
     export_station_ports,
-    force_first,
+    to_wrench_order,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
@@ -150,7 +150,7 @@ class HardwareOptions(Options):
     robot_timeout: Number = Field(10.0, gt=0, description="how long to wait for the robot's first status [s]")
 
 
-@register_station("hardware", world="workcell", options=HardwareOptions, simulated=False)
+@register_station("hardware", world="workcell", options=HardwareOptions, is_simulated=False)
 class HardwareStation(Station):
     """The impedance controller on this machine, the arm at the other end of Drake's LCM messages.
 
@@ -218,7 +218,7 @@ class HardwareStation(Station):
         self.lcm = bus = lcm or open_bus(lcm_url)
         self.lcm_url = lcm_url
         self.period = period = driver.period if period is None else period
-        self.known = known = ArmControllerPlant(workcell, robot, end_effector)
+        self.controller_plant = known = ArmControllerPlant(workcell, robot, end_effector)
         self.limits = limits = limits or safety_limits(known.plant, driver)
         self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
         self._robot_timeout, self._wrench_time_constant = robot_timeout, wrench_time_constant
@@ -406,12 +406,12 @@ class HardwareStation(Station):
         Args:
             positions: of the joints, (n,) [rad].
         """
-        J, limits = self._jacobian(positions), force_first(self.impedance.limits)
+        J, limits = self._jacobian(positions), to_wrench_order(self.impedance.limits)
         return (limits[:3] @ np.abs(J[3:]) + limits[3:] @ np.abs(J[:3])) / np.array(self.limits.torque)
 
     def _jacobian(self, positions: np.ndarray) -> np.ndarray:
         """Of the tool centre in the target's axes, (6, n), its rotation first."""
-        plant, arm = self.known.plant, self.known.arm
+        plant, arm = self.controller_plant.plant, self.controller_plant.arm
         context = plant.CreateDefaultContext()
         plant.SetPositions(context, positions)
         return plant.CalcJacobianSpatialVelocity(
@@ -451,14 +451,14 @@ class SimulatedIiwa(Diagram):
             return arm
 
         self.plant, self.scene_graph, self.arm = add_workcell_plant(builder, workcell, time_step, add)
-        self.known = ArmControllerPlant(workcell, IIWA14, end_effector)
+        self.controller_plant = ArmControllerPlant(workcell, IIWA14, end_effector)
         BuildIiwaControl(
             builder,
             lcm,
             self.plant,
             self.arm.model,
             IiwaDriver(control_mode="torque_only", lcm_status_period=IIWA_DRIVER.period),
-            self.known.plant,
+            self.controller_plant.plant,
         )
         builder.BuildInto(self)
 
@@ -475,4 +475,4 @@ class SimulatedIiwa(Diagram):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
-        self.known.place(self.plant, self.arm.model, context, pose)
+        self.controller_plant.place(self.plant, self.arm.model, context, pose)

@@ -22,7 +22,7 @@ from guiderail.diagrams.stations.station import (
     Station,
     add_workcell_plant,
     add_wrench_sensor,
-    checked_pose,
+    check_pose,
     export_simulation_ports,
 )
 from guiderail.diagrams.stations.workcell import Workcell
@@ -41,7 +41,7 @@ from guiderail.models.robots.robot import (
 from guiderail.systems.gripper_command import GripperCommand
 
 # Half way through a quarter turn of what is held, from 90 degrees to 0.
-MIDDLE_OF_TURN = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
+MID_TURN_POSE = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class ArmControllerPlant:
             end_effector: which tool, or its name.
         """
         self.plant, self.arm = controller_model(workcell, robot, end_effector)
-        self.posture = self.solve(MIDDLE_OF_TURN, np.array(find_robot(robot).home))
+        self.posture = self.solve(MID_TURN_POSE, np.array(find_robot(robot).home))
 
     @property
     def target(self) -> Frame:
@@ -163,7 +163,7 @@ class ArmControllerPlant:
     def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
         """Puts an arm of a station's plant at rest with its tool centre at `pose`, (6,); `context` is the root's."""
         plant_context = plant.GetMyMutableContextFromRoot(context)
-        plant.SetPositions(plant_context, model, self.solve(checked_pose(pose, POSE_SIZE), self.posture))
+        plant.SetPositions(plant_context, model, self.solve(check_pose(pose, POSE_SIZE), self.posture))
         plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
 
 
@@ -244,7 +244,7 @@ class ArmStation(Station):
         end_effector = find_end_effector(end_effector)
         if time_step is None:
             time_step = PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD
-        self._known = ArmControllerPlant(workcell, robot, end_effector)
+        self._controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)
         )
@@ -252,7 +252,7 @@ class ArmStation(Station):
         wrench = add_wrench_sensor(builder, plant, workcell, arm.wrist, arm.tool, arm.tool_centre, wrench_time_constant)
         torque = add_impedance_control(
             builder,
-            self._known,
+            self._controller_plant,
             impedance,
             CONTROL_PERIOD,
             state=plant.get_state_output_port(arm.model),
@@ -276,7 +276,7 @@ class ArmStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
-        self._known.place(self.plant, self.arm.model, context, pose)
+        self._controller_plant.place(self.plant, self.arm.model, context, pose)
 
     def set_payload(self, context: Context, mass: float) -> None:
         """Adds a mass [kg] to the tool that neither controller nor sensor knows of; `context` is the root context."""

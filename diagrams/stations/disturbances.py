@@ -60,14 +60,14 @@ class Disturbances(Options):
 
     @field_validator("friction_factor", "modulus_factor", "wrench_scale")
     @classmethod
-    def _is_a_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+    def _check_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
         if not 1.0 / MANY_TIMES <= value[0] <= value[1] <= MANY_TIMES:
             raise ValueError(f"give two factors from {1.0 / MANY_TIMES} to {MANY_TIMES}, the smaller one first")
         return value
 
     @field_validator("wrench_bias", "wrench_noise")
     @classmethod
-    def _is_two_sizes(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+    def _check_magnitudes(cls, value: tuple[float, ...]) -> tuple[float, ...]:
         if min(value) < 0.0:
             raise ValueError("give a force and a torque, none negative")
         return value
@@ -101,7 +101,7 @@ class DisturbedStation(Station):
         if d.payload and not hasattr(station, "set_payload"):
             raise InputError("a payload hangs from an arm's tool: choose station=arm, or leave payload out")
         self.plant, self.scene_graph = station.plant, station.scene_graph
-        self.control_period, self.wraps_angles = _period(d), station.wraps_angles
+        self.control_period, self.wraps_angles = _control_period_of(d), station.wraps_angles
         period = self.control_period
         builder = DiagramBuilder()
         self._inner = builder.AddNamedSystem("station", station)
@@ -135,8 +135,8 @@ class DisturbedStation(Station):
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Draws what an episode's contact and sensors are like."""
         d = self._disturbances
-        friction, modulus = (_drawn(rng, factors) for factors in (d.friction_factor, d.modulus_factor))
-        scale, seed = _drawn(rng, d.wrench_scale), int(rng.integers(2**31))
+        friction, modulus = (_sample_factor(rng, factors) for factors in (d.friction_factor, d.modulus_factor))
+        scale, seed = _sample_factor(rng, d.wrench_scale), int(rng.integers(2**31))
         bias = rng.uniform(-1.0, 1.0, 6) * np.repeat(d.wrench_bias, 3)
         beside = np.append(rng.uniform(-1.0, 1.0, 3) * d.pose_bias, np.zeros(3))
         if (friction, modulus) != (1.0, 1.0):
@@ -154,7 +154,7 @@ class DisturbedStation(Station):
         return {"wrench": self._wrench, "pose": self._pose, "commands": self._commands}
 
 
-def disturbed(build: Callable[..., Station], disturbances: Disturbances, simulated: bool, name: str) -> Station:
+def disturbed(build: Callable[..., Station], disturbances: Disturbances, is_simulated: bool, name: str) -> Station:
     """The station that `build` makes, disturbed where anything is; otherwise it is that station itself.
 
     Args:
@@ -168,7 +168,7 @@ def disturbed(build: Callable[..., Station], disturbances: Disturbances, simulat
     """
     if not disturbances.any:
         return build()
-    if not simulated:
+    if not is_simulated:
         raise InputError(f"station={name!r} is a real robot, which has disturbances of its own: leave them out")
     how: dict[str, Any] = {}
     if disturbances.stiffness_factor != 1.0:
@@ -180,13 +180,13 @@ def disturbed(build: Callable[..., Station], disturbances: Disturbances, simulat
     return DisturbedStation(build(**how), disturbances)
 
 
-def _drawn(rng: np.random.Generator, factors: tuple[float, ...]) -> float:
+def _sample_factor(rng: np.random.Generator, factors: tuple[float, ...]) -> float:
     """A factor between two, as likely to double as to halve."""
     low, high = np.log(factors)
     return float(np.exp(rng.uniform(low, high)))
 
 
-def _period(d: Disturbances) -> float:
+def _control_period_of(d: Disturbances) -> float:
     if d.control_period is None:
         return CONTROL_PERIOD
     steps = round(d.control_period / PLANT_PERIOD)

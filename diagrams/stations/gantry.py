@@ -32,7 +32,7 @@ from guiderail.diagrams.stations.station import (
     Impedance,
     Station,
     add_workcell_plant,
-    checked_pose,
+    check_pose,
     export_simulation_ports,
     export_station_ports,
 )
@@ -42,7 +42,7 @@ from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.pose_wrench import PoseWrench
 
-RAILS = (
+GANTRY_JOINTS = (
     ("x", PrismaticJoint, [1.0, 0.0, 0.0]),
     ("y", PrismaticJoint, [0.0, 1.0, 0.0]),
     ("z", PrismaticJoint, [0.0, 0.0, 1.0]),
@@ -60,7 +60,7 @@ LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 ImpedanceControl = Literal["joint", "cartesian"]
 # Of the plant [s], with a controller: its forces are held for a step, where the rails' own are solved with it. It is
 # then as near to the finest step as the rails' own are at `PLANT_PERIOD`: see `guiderail bench impedance`.
-CONTROLLED_PERIOD = PLANT_PERIOD / 2
+CARTESIAN_PLANT_PERIOD = PLANT_PERIOD / 2
 
 
 def damping(impedance: Impedance) -> np.ndarray:
@@ -69,7 +69,7 @@ def damping(impedance: Impedance) -> np.ndarray:
     return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
 
 
-class RailsOptions(ContactOptions):
+class GantryOptions(ContactOptions):
     """Of the rails' station."""
 
     impedance_control: ImpedanceControl = Field(
@@ -79,8 +79,8 @@ class RailsOptions(ContactOptions):
     )
 
 
-@register_station("gantry", world="workcell", options=RailsOptions)
-class RailsStation(Station):
+@register_station("gantry", world="workcell", options=GantryOptions)
+class GantryStation(Station):
     """Joints x, y, z, Rz, Ry, Rx from the target frame to the tool centre, each with a spring, a damper and a limit.
 
     Their positions are the pose itself. Springs and dampers are the plant's own actuator gains, solved implicitly with
@@ -111,40 +111,40 @@ class RailsStation(Station):
         super().__init__()
         builder = DiagramBuilder()
         is_joint = impedance_control == "joint"
-        time_step = time_step or (PLANT_PERIOD if is_joint else CONTROLLED_PERIOD)
+        time_step = time_step or (PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD)
         if not is_joint:
-            _refuse_long_step(impedance, time_step)
-        self.plant, self.scene_graph, self.rails = add_workcell_plant(
-            builder, workcell, time_step, lambda plant: _add_rails(plant, workcell, impedance, with_gains=is_joint)
+            _check_time_step(impedance, time_step)
+        self.plant, self.scene_graph, self.gantry = add_workcell_plant(
+            builder, workcell, time_step, lambda plant: _add_gantry(plant, workcell, impedance, with_gains=is_joint)
         )
-        plant, rails = self.plant, self.rails
+        plant, gantry = self.plant, self.gantry
         pose = builder.AddNamedSystem("pose", MatrixGain(np.eye(POSE_SIZE, 2 * POSE_SIZE)))
-        builder.Connect(plant.get_state_output_port(rails), pose.get_input_port())
-        wrench = _add_wrench(builder, plant, rails, pose.get_output_port(), wrench_time_constant)
+        builder.Connect(plant.get_state_output_port(gantry), pose.get_input_port())
+        wrench = _add_wrench(builder, plant, gantry, pose.get_output_port(), wrench_time_constant)
         if is_joint:
-            _add_joint_control(builder, plant, rails, impedance, pose=pose.get_output_port(), wrench=wrench)
+            _add_joint_control(builder, plant, gantry, impedance, pose=pose.get_output_port(), wrench=wrench)
         else:
             torque = add_impedance_control(
                 builder,
-                _known(workcell, impedance),
+                _controller_plant(workcell, impedance),
                 impedance,
                 CONTROL_PERIOD,
-                state=plant.get_state_output_port(rails),
+                state=plant.get_state_output_port(gantry),
                 wrench=wrench,
                 compensate_gravity=False,
             )
-            builder.Connect(torque, plant.get_actuation_input_port(rails))
+            builder.Connect(torque, plant.get_actuation_input_port(gantry))
         export_simulation_ports(builder, self.plant, self.scene_graph)
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.rails, checked_pose(pose, POSE_SIZE))
-        self.plant.SetVelocities(plant_context, self.rails, np.zeros(POSE_SIZE))
+        self.plant.SetPositions(plant_context, self.gantry, check_pose(pose, POSE_SIZE))
+        self.plant.SetVelocities(plant_context, self.gantry, np.zeros(POSE_SIZE))
 
 
-def longest_step(impedance: Impedance) -> float:
+def max_stable_time_step(impedance: Impedance) -> float:
     """The time step [s] from which on a controller of the rails with that impedance is unstable.
 
     With a force K e − D v that is held for a step h, and x' = v' where the step ends, a mode of frequency ω and damping
@@ -156,8 +156,8 @@ def longest_step(impedance: Impedance) -> float:
     return 2.0 * float(np.hypot(1.0, ratio) - ratio) / fastest
 
 
-def _refuse_long_step(impedance: Impedance, time_step: float) -> None:
-    longest = longest_step(impedance)
+def _check_time_step(impedance: Impedance, time_step: float) -> None:
+    longest = max_stable_time_step(impedance)
     if time_step >= longest:
         raise InputError(
             f"time_step {time_step:g} s is too long for impedance_control='cartesian', which needs less than "
@@ -175,9 +175,9 @@ class GantryControllerPlant:
     posture: np.ndarray
 
 
-def _known(workcell: Workcell, impedance: Impedance) -> GantryControllerPlant:
+def _controller_plant(workcell: Workcell, impedance: Impedance) -> GantryControllerPlant:
     plant = MultibodyPlant(0.0)
-    _add_rails(plant, workcell, impedance, with_gains=False)
+    _add_gantry(plant, workcell, impedance, with_gains=False)
     plant.Finalize()
     target, tool_centre = (plant.GetFrameByName(name) for name in ("target", "tool_centre"))
     return GantryControllerPlant(plant, target, tool_centre, np.zeros(POSE_SIZE))
@@ -186,7 +186,7 @@ def _known(workcell: Workcell, impedance: Impedance) -> GantryControllerPlant:
 def _add_joint_control(
     builder: DiagramBuilder,
     plant: MultibodyPlant,
-    rails: ModelInstanceIndex,
+    gantry: ModelInstanceIndex,
     impedance: Impedance,
     *,
     pose: OutputPort,
@@ -199,8 +199,8 @@ def _add_joint_control(
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
     builder.Connect(watchdog.get_safe_pose_output_port(), desired_state.get_input_port())
     builder.Connect(pose, watchdog.get_pose_input_port())
-    builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(rails))
-    builder.Connect(plant.get_net_actuation_output_port(rails), monitor.get_impedance_wrench_input_port())
+    builder.Connect(desired_state.get_output_port(), plant.get_desired_state_input_port(gantry))
+    builder.Connect(plant.get_net_actuation_output_port(gantry), monitor.get_impedance_wrench_input_port())
     export_station_ports(
         builder,
         watchdog.get_desired_pose_input_port(),
@@ -213,14 +213,14 @@ def _add_joint_control(
     )
 
 
-def _add_rails(
+def _add_gantry(
     plant: MultibodyPlant, workcell: Workcell, impedance: Impedance, *, with_gains: bool
 ) -> ModelInstanceIndex:
     """Adds the rails and behind them the tool with the workpiece, all weightless, with springs and dampers or none."""
     model = plant.AddModelInstance("gantry")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     for (name, joint_type, axis), stiffness, damps, limit in zip(
-        RAILS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
+        GANTRY_JOINTS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
     ):
         link = plant.AddRigidBody(f"{name}_link", model, SpatialInertia.SolidSphereWithMass(LINK_MASS, LINK_RADIUS))
         joint = plant.AddJoint(joint_type(name, parent, link.body_frame(), axis))
@@ -238,7 +238,7 @@ def _add_rails(
 
 
 def _add_wrench(
-    builder: DiagramBuilder, plant: MultibodyPlant, rails: ModelInstanceIndex, pose: OutputPort, time_constant: float
+    builder: DiagramBuilder, plant: MultibodyPlant, gantry: ModelInstanceIndex, pose: OutputPort, time_constant: float
 ) -> OutputPort:
     """Adds the wrench of the plug's contact, low-pass filtered: one plant step old, as a sensor's is.
 
@@ -249,7 +249,7 @@ def _add_wrench(
     one, zero = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
     low_pass = builder.AddNamedSystem("low_pass", LinearSystem(decay * one, (1.0 - decay) * one, one, zero, period))
     wrench = builder.AddNamedSystem("wrench", PoseWrench())
-    builder.Connect(plant.get_generalized_contact_forces_output_port(rails), low_pass.get_input_port())
+    builder.Connect(plant.get_generalized_contact_forces_output_port(gantry), low_pass.get_input_port())
     builder.Connect(low_pass.get_output_port(), wrench.get_generalized_force_input_port())
     builder.Connect(pose, wrench.get_pose_input_port())
     return wrench.get_wrench_output_port()

@@ -9,7 +9,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from guiderail.diagrams.stations.station import Impedance, export_station_ports, force_first
+from guiderail.diagrams.stations.station import Impedance, export_station_ports, to_wrench_order
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 
@@ -37,35 +37,40 @@ class ControllerPlant(Protocol):
 def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains:
     """The station's impedance, which is ordered as a pose is, as the controller wants it."""
     return ImpedanceGains(
-        stiffness=np.diag(force_first(impedance.stiffness)),
-        wrench_limits=force_first(impedance.limits),
+        stiffness=np.diag(to_wrench_order(impedance.stiffness)),
+        wrench_limits=to_wrench_order(impedance.limits),
         posture=posture,
         damping_ratio=impedance.damping_ratio,
     )
 
 
 def add_controller(
-    builder: DiagramBuilder, known: ControllerPlant, impedance: Impedance, period: float, *, compensate_gravity: bool
+    builder: DiagramBuilder,
+    controller_plant: ControllerPlant,
+    impedance: Impedance,
+    period: float,
+    *,
+    compensate_gravity: bool,
 ) -> tuple[CartesianImpedanceController, ImpedanceMonitor]:
     """Adds a robot's controller, sampled once in `period` [s], and what watches its wrench; the caller wires both."""
     controller = builder.AddNamedSystem(
         "controller",
         CartesianImpedanceController(
-            known.plant,
-            known.target,
-            known.tool_centre,
-            impedance_gains(impedance, known.posture),
+            controller_plant.plant,
+            controller_plant.target,
+            controller_plant.tool_centre,
+            impedance_gains(impedance, controller_plant.posture),
             period=period,
             compensate_gravity=compensate_gravity,
         ),
     )
-    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(force_first(impedance.limits)))
+    monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(to_wrench_order(impedance.limits)))
     return controller, monitor
 
 
 def add_impedance_control(
     builder: DiagramBuilder,
-    known: ControllerPlant,
+    controller_plant: ControllerPlant,
     impedance: Impedance,
     period: float,
     *,
@@ -77,7 +82,9 @@ def add_impedance_control(
 
     Its watchdog checks commands once in `period` [s].
     """
-    controller, monitor = add_controller(builder, known, impedance, period, compensate_gravity=compensate_gravity)
+    controller, monitor = add_controller(
+        builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity
+    )
     builder.Connect(state, controller.get_state_input_port())
     builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
     export_station_ports(

@@ -11,7 +11,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, FixedOffsetFrame, PrismaticJoint, SpatialInertia
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, RAILS, damping
+from guiderail.diagrams.stations.gantry import CARRIAGE_INERTIA, CARRIAGE_MASS, GANTRY_JOINTS, damping
 from guiderail.diagrams.stations.registry import register_station
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
@@ -20,7 +20,7 @@ from guiderail.diagrams.stations.station import (
     ContactOptions,
     Impedance,
     Station,
-    checked_pose,
+    check_pose,
     export_station_ports,
 )
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
@@ -96,7 +96,7 @@ def mujoco_model(
     tool = spec.worldbody.add_body(
         name=TOOL, mass=CARRIAGE_MASS, inertia=[CARRIAGE_INERTIA] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
     )
-    _add_rails(mujoco, spec, tool, impedance)
+    _add_gantry(mujoco, spec, tool, impedance)
     moments = inertia.Shift(inertia.get_com()).CalcRotationalInertia().get_moments()
     held = tool.add_body(
         name=WORKPIECE, mass=inertia.get_mass(), inertia=moments, ipos=inertia.get_com(), explicitinertial=True
@@ -110,9 +110,9 @@ def mujoco_model(
     return spec.compile()
 
 
-def _add_rails(mujoco: Any, spec: Any, tool: Any, impedance: Impedance) -> None:
+def _add_gantry(mujoco: Any, spec: Any, tool: Any, impedance: Impedance) -> None:
     for (name, joint_type, axis), stiffness, damps, limit in zip(
-        RAILS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
+        GANTRY_JOINTS, impedance.stiffness, damping(impedance), impedance.limits, strict=True
     ):
         slides = joint_type is PrismaticJoint
         tool.add_joint(
@@ -163,7 +163,7 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
 
 @register_station("mujoco", world="workcell", options=ContactOptions)
 class MujocoStation(Station):
-    """`RailsStation`'s twin, stepped by MuJoCo: ports, rails, impedance, watchdog and filter are the same.
+    """`GantryStation`'s twin, stepped by MuJoCo: ports, rails, impedance, watchdog and filter are the same.
 
     Drake's plant is still there, without joints or a step: it knows where the fixture stands and how the workpiece
     sits in the tool, which a reset draws into its context, and what all of it looks like.
@@ -203,38 +203,38 @@ class MujocoStation(Station):
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
         surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
-        rails = MujocoRails(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
-        self.rails = builder.AddNamedSystem("gantry", rails)
+        gantry = MujocoRails(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
+        self.gantry = builder.AddNamedSystem("gantry", gantry)
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
         monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
-        builder.Connect(plant.get_body_poses_output_port(), rails.get_nominal_body_poses_input_port())
-        builder.Connect(watchdog.get_safe_pose_output_port(), rails.get_desired_pose_input_port())
-        builder.Connect(rails.get_pose_output_port(), watchdog.get_pose_input_port())
-        builder.Connect(rails.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
+        builder.Connect(plant.get_body_poses_output_port(), gantry.get_nominal_body_poses_input_port())
+        builder.Connect(watchdog.get_safe_pose_output_port(), gantry.get_desired_pose_input_port())
+        builder.Connect(gantry.get_pose_output_port(), watchdog.get_pose_input_port())
+        builder.Connect(gantry.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
         builder.Connect(
-            rails.get_geometry_poses_output_port(), self.scene_graph.get_source_pose_port(plant.get_source_id())
+            gantry.get_geometry_poses_output_port(), self.scene_graph.get_source_pose_port(plant.get_source_id())
         )
         export_station_ports(
             builder,
             watchdog.get_desired_pose_input_port(),
             watchdog.get_command_time_input_port(),
-            pose=rails.get_pose_output_port(),
-            wrench=rails.get_wrench_output_port(),
+            pose=gantry.get_pose_output_port(),
+            wrench=gantry.get_wrench_output_port(),
             contact_force=monitor.get_contact_force_output_port(),
             saturation=monitor.get_saturation_output_port(),
             command_timed_out=watchdog.get_holding_output_port(),
         )
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
-        builder.ExportOutput(rails.get_body_poses_output_port(), "body_poses")
+        builder.ExportOutput(gantry.get_body_poses_output_port(), "body_poses")
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
-        self.rails.set_pose(self.rails.GetMyMutableContextFromRoot(context), checked_pose(pose, POSE_SIZE))
+        self.gantry.set_pose(self.gantry.GetMyMutableContextFromRoot(context), check_pose(pose, POSE_SIZE))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
         """Multiplies the engine's friction and compliance; `context` is the root context."""
-        self.rails.set_contact(self.rails.GetMyMutableContextFromRoot(context), friction, modulus)
+        self.gantry.set_contact(self.gantry.GetMyMutableContextFromRoot(context), friction, modulus)
 
 
 def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Workcell) -> MovedBodies:

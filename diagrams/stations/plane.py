@@ -12,7 +12,7 @@ from pydrake.systems.primitives import Adder, Gain, LinearSystem, MatrixGain, Mu
 
 from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import Station, checked_pose, export_station_ports
+from guiderail.diagrams.stations.station import Station, check_pose, export_station_ports
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
@@ -152,7 +152,7 @@ class PlaneStation(Station):
         """Puts the robot's centre at (x, y), at rest; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositionsAndVelocities(
-            plant_context, self._robot, np.concatenate([checked_pose(pose, 2), np.zeros(2)])
+            plant_context, self._robot, np.concatenate([check_pose(pose, 2), np.zeros(2)])
         )
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:

@@ -13,7 +13,7 @@ from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscrete
 
 from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import POSE_SIZE, Station, checked_pose, export_station_ports
+from guiderail.diagrams.stations.station import POSE_SIZE, Station, check_pose, export_station_ports
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
@@ -27,7 +27,7 @@ from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 # Half way between the pourings that the workspace allows, so that a search ends on the same branch for all of them.
-MIDDLE_OF_POURING = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
+MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
 
 # More than any guidance asks for, so that it is the guidance that says how fast.
 SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
@@ -178,7 +178,7 @@ class PouringStation(Station):
         )
         self._controller_tip = tip
         self._controller_plant.Finalize()
-        self.posture = self.solve(MIDDLE_OF_POURING, np.array(config.arm.level_posture))
+        self.posture = self.solve(MID_POURING_POSE, np.array(config.arm.level_posture))
 
         controller = CartesianPositionController(
             self._controller_plant,
@@ -250,7 +250,7 @@ class PouringStation(Station):
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Puts the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        self.plant.SetPositions(plant_context, self.arm, self.solve(checked_pose(pose, POSE_SIZE), self.posture))
+        self.plant.SetPositions(plant_context, self.arm, self.solve(check_pose(pose, POSE_SIZE), self.posture))
         self.plant.SetVelocities(plant_context, self.arm, np.zeros(self.config.arm.num_joints))
         X_WP = self._tip.CalcPoseInWorld(plant_context)
         for ball, p_PB in zip(self._balls, self.config.stack(), strict=True):
@@ -293,7 +293,7 @@ def _add_table(plant: MultibodyPlant, config: PouringConfig) -> None:
     add_shape(plant, plant.world_body(), "table", X_WG, Box(1.0, 1.6, 0.1), WOOD)
 
 
-def vessel_or_refuse(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
+def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
     """A mug of these sizes, if both balls go in."""
     if not ball.diameter * 1.25 <= inner_diameter <= 0.2 or not ball.diameter * 1.5 <= depth <= 0.25:
         raise InputError(

@@ -31,7 +31,7 @@ class StationKind:
     world: str
     options: type[Options] | None
     words: str
-    simulated: bool = True
+    is_simulated: bool = True
 
 
 STATIONS: Registry[StationKind] = Registry(
@@ -43,7 +43,7 @@ STATIONS: Registry[StationKind] = Registry(
 
 
 def register_station(
-    name: str, *, world: str, options: type[Options] | None = None, simulated: bool = True
+    name: str, *, world: str, options: type[Options] | None = None, is_simulated: bool = True
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
     """A decorator that adds a station; it decorates a class or a function that takes a world and its options.
 
@@ -54,7 +54,7 @@ def register_station(
 
     def add(build: Any) -> Any:
         words = str(build.__doc__ or "").strip().splitlines()
-        STATIONS.register(name, StationKind(name, build, world, options, words[0] if words else "", simulated))
+        STATIONS.register(name, StationKind(name, build, world, options, words[0] if words else "", is_simulated))
         return build
 
     return add

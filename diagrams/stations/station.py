@@ -158,7 +158,7 @@ class Station(Diagram):
         """Puts the robot at rest with its tool centre at `pose`, (6,); `context` is the root context.
 
         Raises:
-            InputError: if these are not that many finite numbers (see `checked_pose`).
+            InputError: if these are not that many finite numbers (see `check_pose`).
         """
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
@@ -166,14 +166,14 @@ class Station(Diagram):
 
         `context` is the root context; it is Drake's contact here, and another engine's station overrides it.
         """
-        change_contact(self.plant, self.scene_graph, context, friction, modulus)
+        scale_contact(self.plant, self.scene_graph, context, friction, modulus)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Draws what a reset draws of the station itself, and says so; `context` is the root context."""
         return {}
 
 
-def checked_pose(pose: ArrayLike, size: int) -> np.ndarray:
+def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
     """A pose (size,) that a robot can be put to: Drake would end the process for one that is not finite.
 
     Raises:
@@ -188,7 +188,7 @@ def checked_pose(pose: ArrayLike, size: int) -> np.ndarray:
     return numbers
 
 
-def change_contact(
+def scale_contact(
     plant: MultibodyPlant, scene_graph: SceneGraph, context: Context, friction: float, modulus: float
 ) -> None:
     """Multiplies friction and hydroelastic modulus of all of a plant's surfaces, in the root context alone."""
@@ -251,7 +251,7 @@ def add_wrench_sensor(
     return sensor.get_wrench_output_port()
 
 
-def force_first(values: Sequence[float]) -> np.ndarray:
+def to_wrench_order(values: Sequence[float]) -> np.ndarray:
     """What is ordered as a pose is, [x y z Rz Ry Rx], as a wrench is: [x y z Rx Ry Rz]."""
     return np.array(values)[[0, 1, 2, 5, 4, 3]]
 

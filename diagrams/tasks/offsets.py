@@ -35,7 +35,7 @@ class FixtureOffsetOptions(Options):
 
     @field_validator("offset_range")
     @classmethod
-    def _is_a_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+    def _check_range(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
         if value is not None and not 0.0 <= value[0] <= value[1] <= LARGEST_OFFSET:
             raise ValueError(f"give two distances from 0 to {LARGEST_OFFSET} m, the smaller one first")
         return value

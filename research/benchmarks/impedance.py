@@ -16,7 +16,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.recording import DrivenStation, along
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.units import MM
@@ -67,7 +67,7 @@ def measure() -> dict[str, Any]:
 def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarray]:
     """What a scripted insertion comes to and costs with a time step [s], and where the plug was, (n, 6)."""
     workcell, (times, poses) = BncWorkcell(), insert_and_lock()
-    station = RailsStation(workcell, time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
+    station = GantryStation(workcell, time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
     driven = DrivenStation(station, along(times, poses), round(times[-1] / CONTROL_PERIOD))
     driven.start(poses[0])
     begin = time.process_time()
@@ -84,7 +84,7 @@ def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarra
 
 def step_response(control: str, time_step: float | None = None) -> dict[str, Any]:
     """How far the tool centre is at the control instants after a step of all six coordinates, in its parts, (n, 6)."""
-    station = RailsStation(BncWorkcell(), time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
+    station = GantryStation(BncWorkcell(), time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
     start = np.array([0.0, 0.0, 50.0 * MM, 0.0, 0.0, 0.0])
     simulator = Simulator(station)
     context = simulator.get_mutable_context()

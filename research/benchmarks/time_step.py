@@ -16,7 +16,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.recording import DrivenStation, along
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.units import MM
@@ -37,7 +37,7 @@ def simulate(motion: str, time_step: float) -> tuple[dict[str, np.ndarray], floa
     """The recorded signals of a motion with that time step [s], and the CPU seconds that it took."""
     task, offset = MOTIONS[motion]
     workcell, times, poses, _ = scripted_motion(task)
-    station = RailsStation(workcell, time_step=time_step)
+    station = GantryStation(workcell, time_step=time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     if isinstance(workcell, BncWorkcell):
         workcell.set_jack_offset(station.plant, driven.plant_context, RigidTransform(np.array(offset)))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.envs.recording import drive_along
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
@@ -39,7 +39,7 @@ SEARCH_SESSION = Session(bnc_search.demonstrator_motions, bnc_search.PATH)
 def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
     """One motion (N, 6) through the rails' impedance, and whether the plug was locked in the end."""
     workcell = BncWorkcell()
-    driven, recording = drive_along(RailsStation(workcell, time_step=TIME_STEP), TIMES, motion)
+    driven, recording = drive_along(GantryStation(workcell, time_step=TIME_STEP), TIMES, motion)
     return recording, workcell.is_locked(workcell.plug_in_locked_frame(driven.station.plant, driven.plant_context))
 
 

@@ -124,7 +124,7 @@ def test_the_limits_of_a_robot_are_those_that_the_page_names():
     rows = dict(re.findall(r"^\| ([^|]+) \| (.+) \|$", page.partition("\n## ")[0], re.MULTILINE))
     station = HardwareStation(BncWorkcell(), DrakeLcm("memq://"))
     limits, status, force = station.limits, station.status_limits, np.array(station.impedance.limits[:3])
-    load = station.load_of_force(station.known.solve(START, station.known.posture)).max()
+    load = station.load_of_force(station.controller_plant.solve(START, station.controller_plant.posture)).max()
     age = f"{status.max_age / MM:.0f} ms"
     said = {
         "age of a status": f"{MISSED} periods: {age} |",

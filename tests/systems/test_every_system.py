@@ -82,7 +82,7 @@ def built():
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),
         systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
-        MujocoStation(BncWorkcell()).rails,
+        MujocoStation(BncWorkcell()).gantry,
         systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
         systems.PoseWrench(),
         systems.Recorder({"u": 2}, 4, PERIOD),

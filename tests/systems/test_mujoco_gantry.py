@@ -41,7 +41,7 @@ def test_in_the_air_it_goes_where_it_is_told_without_a_force(station):
 
 def test_it_pushes_as_far_as_its_limits(station):
     context = advanced(station, FREE + [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 1)
-    pushed = station.rails.get_impedance_wrench_output_port().Eval(station.rails.GetMyContextFromRoot(context))
+    pushed = station.gantry.get_impedance_wrench_output_port().Eval(station.gantry.GetMyContextFromRoot(context))
     assert pushed[0] == pytest.approx(Impedance().limits[0])
 
 
@@ -87,7 +87,7 @@ def test_the_contact_itself_is_as_many_times_stiffer_as_it_is_told():
 
 def test_what_is_no_stiffer_is_stepped_as_the_model_says(station):
     """And what is stiffer leaves nothing behind in the model."""
-    model = station.rails.model
+    model = station.gantry.model
     names = ("jnt_stiffness", "dof_damping", "geom_solref", "geom_friction")
     before = {name: getattr(model, name).copy() for name in names} | {"timestep": model.opt.timestep}
     for factors in ((0.5, 7.0), (1.0, 1.0)):
@@ -108,4 +108,4 @@ def test_what_makes_no_sense_is_refused(station, period, constant):
     plant = station.plant
     moved = MovedBodies(*(plant.GetBodyByName(name) for name in ("jack", "tool_centre", "plug")))
     with pytest.raises(InputError):
-        MujocoRails(station.rails.model, plant, moved, BncWorkcell().X_WT, period, constant)
+        MujocoRails(station.gantry.model, plant, moved, BncWorkcell().X_WT, period, constant)

@@ -18,7 +18,7 @@ def test_what_is_asked_for_and_the_other_station_does_not_have_is_refused():
     assert changed_environment("BncConnector", learned, {}) == learned
     assert changed_environment("BncConnector", learned, {"station": "gantry"})["impedance_control"] == "cartesian"
     asked = changed_environment("BncConnector", learned, {"station": "arm", "impedance_control": "joint"})
-    with pytest.raises(InputError, match="it is one of station='rails'"):
+    with pytest.raises(InputError, match="it is one of station='gantry'"):
         check_environment("BncConnector", asked)
 
 

@@ -938,7 +938,7 @@ def _is_robot(station: Any) -> bool:
     if station is None:
         return False
     stations = import_module("guiderail.diagrams.stations.registry").STATIONS
-    return station in stations.names() and not stations.get(station).simulated
+    return station in stations.names() and not stations.get(station).is_simulated
 
 
 def _beside(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:

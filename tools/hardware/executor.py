@@ -253,7 +253,7 @@ class SkillExecutor:
         folder.mkdir(parents=True, exist_ok=True)
         number = _next_number(folder)
         ledger = table(self.trace, number)
-        joints = self._station.known.plant.num_positions()
+        joints = self._station.controller_plant.plant.num_positions()
         for name, values in self._joints.items():
             for joint, column in enumerate(np.reshape(values[: len(self.trace)], (len(self.trace), joints)).T):
                 ledger = ledger.append_column(f"{name}_{joint}", pa.array(column))
@@ -331,7 +331,7 @@ def run_policy(
 def on_a_robot(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
     """An environment's options without those of the station that it was learned on."""
     kind = STATIONS.get(station)
-    if kind.simulated:
+    if kind.is_simulated:
         raise InputError(f"station {station!r} is a simulation: watch the policy there by guiderail replay")
     learned_on = STATIONS.get(resolve(task, environment).station.name).options or Options
     return {name: value for name, value in environment.items() if name not in learned_on.model_fields}

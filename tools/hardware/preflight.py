@@ -38,7 +38,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, c
         start: where the skill starts, (6,).
         commands: how many the robot was sent meanwhile, by whomever.
     """
-    plant, arm = station.known.plant, station.known.arm
+    plant, arm = station.controller_plant.plant, station.controller_plant.arm
     pose = station.get_pose_output_port().Eval(context)
     away, turned = distance(pose, start)
     name = station.driver.name

@@ -73,7 +73,7 @@ def serve_iiwa(
     )
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
-    SafetyMonitor(ears, driver, robot.known.plant, safety_limits(robot.known.plant, driver))
+    SafetyMonitor(ears, driver, robot.controller_plant.plant, safety_limits(robot.controller_plant.plant, driver))
     if moved is not None:
         fixture, workpiece = declared.offsets.draw(np.random.default_rng(0), moved)
         declared.set_part_offsets(robot, simulator.get_mutable_context(), fixture, workpiece)

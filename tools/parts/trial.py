@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import EventStatus
 
 from guiderail.diagrams.envs.recording import DrivenStation, along, drive_along
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.part.file import PartTaskFile
 from guiderail.diagrams.tasks.part.task import PartInsertion, workcell
@@ -59,7 +59,7 @@ class Depths:
     the compliant part.
     """
 
-    def __init__(self, station: RailsStation, surfaces: dict[str, np.ndarray], snapping: set[str]):
+    def __init__(self, station: GantryStation, surfaces: dict[str, np.ndarray], snapping: set[str]):
         """
         Args:
             station: of the parts.
@@ -122,7 +122,7 @@ def insert(
     numbers = file.motion
     times, poses = straight(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
     world = workcell(folder, file)
-    station = RailsStation(world, time_step=file.time_step)
+    station = GantryStation(world, time_step=file.time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     world.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
     compliant = {
@@ -225,7 +225,7 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:
-    driven, _ = drive_along(RailsStation(workcell(folder, file), time_step=file.time_step), times, motion)
+    driven, _ = drive_along(GantryStation(workcell(folder, file), time_step=file.time_step), times, motion)
     plant = driven.station.plant
     X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
     turn = X.rotation().ToAngleAxis()

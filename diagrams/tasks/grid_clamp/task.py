@@ -58,7 +58,7 @@ class GridClampOptions(Options):
 
     @field_validator("start_height")
     @classmethod
-    def _is_a_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+    def _check_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
         if not HEIGHTS[0] <= value[0] <= value[1] <= HEIGHTS[1]:
             raise ValueError(f"give two heights from {HEIGHTS[0]} to {HEIGHTS[1]} m, the lower one first")
         return value

@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_frame, viewpoint
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PlacedTemplate
-from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, vessel_or_refuse
+from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, make_mug
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream, in_ring
 from guiderail.diagrams.tasks.pouring.options import (
@@ -118,7 +118,7 @@ class Pouring(Task):
         super().__init__(options, choice)
         options.check()
         self._config = PouringConfig(
-            mug=vessel_or_refuse(options.mug_inner_diameter, options.mug_depth, options.ball),
+            mug=make_mug(options.mug_inner_diameter, options.mug_depth, options.ball),
             ball=options.ball,
             num_balls=options.balls,
         )

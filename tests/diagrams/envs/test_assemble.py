@@ -9,7 +9,7 @@ from guiderail import make_env
 from guiderail.diagrams.envs.assemble import known_of
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmStation
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import ReferenceTrajectory
 
@@ -36,7 +36,7 @@ def known(turn, station, period=PERIOD):
 @pytest.mark.parametrize("period", [0.01, 0.1])
 def test_a_motion_keeps_the_speed_at_which_it_was_demonstrated(period):
     with pytest.raises(InputError, match="of another speed than was demonstrated"):
-        known(1.0, RailsStation, period)
+        known(1.0, GantryStation, period)
 
 
 def test_a_clock_that_is_disturbed_is_no_other_demonstration():
@@ -47,7 +47,7 @@ def test_a_clock_that_is_disturbed_is_no_other_demonstration():
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
 def test_a_half_turn_is_for_stations_whose_angles_do_not_jump(turn):
     """From −180° to 180° a measured angle jumps by a full turn, and a history of it would lead all the way round."""
-    assert known(turn, RailsStation).demonstrations is not None
+    assert known(turn, GantryStation).demonstrations is not None
     for station in (ArmStation, HardwareStation):
         with pytest.raises(InputError, match="jumps by a full turn at 180°"):
             known(turn, station)

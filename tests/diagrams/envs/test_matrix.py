@@ -42,7 +42,7 @@ def test_a_pair_runs_or_says_what_is_missing(task, guidance):
 @pytest.mark.parametrize("task", OWN)
 def test_both_contracts_hold_in_every_tasks_diagram(task):
     for name in stations_for(TASKS.get(task).workcell_kind):
-        if STATIONS.get(name).simulated:
+        if STATIONS.get(name).is_simulated:
             diagram = make_env(task, station=name).task.diagram
         else:
             with pytest.raises(InputError, match="guiderail run"):

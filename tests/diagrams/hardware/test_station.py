@@ -18,7 +18,7 @@ from guiderail.diagrams.hardware.clock import LockstepClock
 from guiderail.diagrams.hardware.monitor import word_channel
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa, find_driver, safety_limits
 from guiderail.diagrams.stations.arm import ArmStation
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
@@ -38,7 +38,7 @@ class OneProcess:
         self.lcm = lcm = DrakeLcm("memq://")
         self.torques = []
         self.robot = SimulatedIiwa(WORKCELL, lcm)
-        limits = replace(safety_limits(self.robot.known.plant, IIWA_DRIVER), damping_time=0.2, ramp_time=0.1)
+        limits = replace(safety_limits(self.robot.controller_plant.plant, IIWA_DRIVER), damping_time=0.2, ramp_time=0.1)
         self.station = HardwareStation(WORKCELL, lcm, robot_timeout=1.0, limits=limits)
         self.robot_simulator, self.simulator = self.robot.simulator(), Simulator(self.station)
         self.robot.set_pose(self.robot_simulator.get_mutable_context(), START)
@@ -271,14 +271,14 @@ def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
 def test_the_full_wrench_at_the_longest_lever_is_clipped_on_the_wrist_alone():
     """With an outstretched tool the impedance's limits would take more than the driver allows on joints 4 to 6."""
     station = HardwareStation(WORKCELL, DrakeLcm("memq://"))
-    load = station.load_of_force(station.known.solve(START, station.known.posture))
+    load = station.load_of_force(station.controller_plant.solve(START, station.controller_plant.posture))
     assert (load[[0, 1, 2, 6]] < 0.7).all()
     assert 1.0 < load[3:6].max() < 1.5
 
 
 def test_no_wrench_within_its_limits_loads_a_joint_more_than_is_read_out():
     station = HardwareStation(WORKCELL, DrakeLcm("memq://"), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1)))
-    positions = station.known.solve(START, station.known.posture)
+    positions = station.controller_plant.solve(START, station.controller_plant.posture)
     J = np.roll(station._jacobian(positions), 3, axis=0)  # the force first
     corners = np.array(list(itertools.product(*((-limit, limit) for limit in (40.0, 30.0, 20.0, 1, 2, 3)))))
     worst = np.abs(corners @ J).max(axis=0) / np.array(station.limits.torque)
@@ -313,7 +313,7 @@ def test_a_deputy_is_heard_in_a_larger_diagram_too():
 
 
 def test_all_stations_have_the_same_ports():
-    stations = [RailsStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, DrakeLcm("memq://"))]
+    stations = [GantryStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, DrakeLcm("memq://"))]
     simulated_only = {"query", "body_poses"}
     robots_own = {"fault", "phase"} | {f"iiwa.{name}" for name in ALIASES}
     for station in stations:

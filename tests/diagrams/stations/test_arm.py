@@ -14,7 +14,7 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.recording import drive_along
-from guiderail.diagrams.stations.arm import MIDDLE_OF_TURN, ArmControllerPlant, ArmStation
+from guiderail.diagrams.stations.arm import MID_TURN_POSE, ArmControllerPlant, ArmStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
@@ -100,7 +100,7 @@ def test_static_displacement_is_the_compliance_times_the_wrench(robot):
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_pushed_and_released_it_comes_to_rest_at_the_plants_step(robot):
     """With a tenth of the usual damping even: a controller that is too slow for what it controls would ring."""
-    held = Held(robot, MIDDLE_OF_TURN, impedance=Impedance(damping_ratio=0.1))
+    held = Held(robot, MID_TURN_POSE, impedance=Impedance(damping_ratio=0.1))
     before = held.X_TP()
     held.push([15.0, -10.0, 12.0, 0.5, -0.5, 0.5])
     held.advance(0.3)
@@ -118,7 +118,7 @@ def test_pushed_and_released_it_comes_to_rest_at_the_plants_step(robot):
 def test_a_quarter_turn_lies_in_the_middle_of_the_last_joints_range(robot):
     known = ArmControllerPlant(WORKCELL, robot)
     lower, upper = known.plant.GetPositionLowerLimits()[-1], known.plant.GetPositionUpperLimits()[-1]
-    last = [known.solve(MIDDLE_OF_TURN + [0, 0, 0, turn, 0, 0], known.posture)[-1] for turn in (-np.pi / 4, np.pi / 4)]
+    last = [known.solve(MID_TURN_POSE + [0, 0, 0, turn, 0, 0], known.posture)[-1] for turn in (-np.pi / 4, np.pi / 4)]
     assert abs(known.posture[-1] - 0.5 * (lower + upper)) < np.deg2rad(15.0)
     # A redundant arm turns with its elbow too, so that its last joint turns by less.
     assert np.deg2rad(70.0) < abs(last[1] - last[0]) < np.deg2rad(91.0)
@@ -131,7 +131,7 @@ WRIST, ELBOW = np.array([-0.24, -1.4, 1.85, -2.0, 0.0, 0.0]), np.array([-0.24, -
 
 @pytest.mark.parametrize("singular", [WRIST, ELBOW])
 def test_an_arm_of_six_joints_rests_in_a_singular_posture(singular):
-    held = Held("ur5e", MIDDLE_OF_TURN)
+    held = Held("ur5e", MID_TURN_POSE)
     held.put(singular)
     held.push([8.0, 5.0, -6.0, 0.3, 0.3, -0.3])
     speeds = []
@@ -149,7 +149,7 @@ def test_pulled_to_its_full_length_an_arm_does_not_jerk():
 
     With the plain inverse of the inertia at the tool they jump by more than 10 Nm, back and forth.
     """
-    held = Held("ur5e", MIDDLE_OF_TURN)
+    held = Held("ur5e", MID_TURN_POSE)
     nearly = np.array([-0.24, -1.4, 0.3, -2.0, -1.57, 0.0])
     start = held.put(nearly)
     controller = held.station.GetSubsystemByName("controller")

@@ -5,7 +5,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.recording import drive_along
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.objects.bnc_connector.motion import CLEAR, MM, insert_and_lock, poses
@@ -21,7 +21,7 @@ ENTRY_BOTTOM = (
 
 
 def run(times, z_mm, yaw_deg, *, time_step=0.005, impedance=None, prepare=None):
-    station = RailsStation(WORKCELL, impedance or Impedance(), time_step)
+    station = GantryStation(WORKCELL, impedance or Impedance(), time_step)
     motion = poses(np.array(z_mm) * MM, np.deg2rad(yaw_deg))
     return drive_along(station, times, motion, prepare)
 
@@ -117,7 +117,7 @@ def test_the_lugs_do_not_tunnel_when_turned_at_the_effort_limit():
 
 def test_halving_the_plant_step_changes_the_locked_pose_little(locked):
     times, motion = insert_and_lock()
-    _, recording = drive_along(RailsStation(WORKCELL, time_step=0.0025), times, motion)
+    _, recording = drive_along(GantryStation(WORKCELL, time_step=0.0025), times, motion)
     difference = recording["pose"][-1] - locked["pose"][-1]
     assert np.abs(difference[:3]).max() < 0.1 * MM
     assert np.abs(np.rad2deg(difference[3:])).max() < 0.5
@@ -131,7 +131,7 @@ def test_a_jack_that_was_moved_in_the_context_is_locked_where_it_is():
     def move(plant, context):
         WORKCELL.set_jack_offset(plant, context, X_TTactual)
 
-    driven, recording = drive_along(RailsStation(WORKCELL), times, shifted, move)
+    driven, recording = drive_along(GantryStation(WORKCELL), times, shifted, move)
     X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM
     np.testing.assert_allclose(recording["pose"][-1, :3], X_TTactual.translation(), atol=0.3 * MM)
@@ -149,7 +149,7 @@ def test_a_plug_that_was_held_askew_is_what_has_to_hit_the_jack():
     dense = np.stack([np.interp(fine, times, column) for column in motion.T], axis=1)
     dense[:, 0] -= offset[0] * np.cos(dense[:, 3])
     dense[:, 1] -= offset[0] * np.sin(dense[:, 3])
-    driven, _ = drive_along(RailsStation(WORKCELL), fine, dense, grasp)
+    driven, _ = drive_along(GantryStation(WORKCELL), fine, dense, grasp)
     X = WORKCELL.plug_in_locked_frame(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM
 
@@ -159,6 +159,6 @@ def test_without_correction_an_offset_of_one_and_a_half_millimetres_jams():
         WORKCELL.set_jack_offset(plant, context, RigidTransform([1.5 * MM, 0.0, 0.0]))
 
     times, motion = insert_and_lock()
-    _, recording = drive_along(RailsStation(WORKCELL), times, motion, move)
+    _, recording = drive_along(GantryStation(WORKCELL), times, motion, move)
     assert recording["pose"][-1, 2] > ENTRY_BOTTOM * MM + 2.0 * MM
     assert recording["contact_force"].max() > 15.0

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.diagrams.envs.make import resolve
 from guiderail.diagrams.envs.recording import drive_along
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
@@ -23,7 +23,7 @@ def build(request):
     """Makes the station."""
     options = {"difficulty": "hard", **request.param}
     workcell = resolve("BncConnector", options).task.workcell()
-    return lambda: RailsStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
+    return lambda: GantryStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ from pydrake.multibody.plant import ExternallyAppliedSpatialForce
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.stations import gantry as rails
-from guiderail.diagrams.stations.gantry import RailsStation, longest_step
+from guiderail.diagrams.stations import gantry as gantry
+from guiderail.diagrams.stations.gantry import GantryStation, max_stable_time_step
 from guiderail.diagrams.stations.station import INPUTS, PLANT_PERIOD, Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
@@ -25,7 +25,7 @@ class Held:
     """The rails with their jack far away, told to stay where they are put, and a hand that pushes the tool."""
 
     def __init__(self, pose, control, impedance=None, time_step=None):
-        self.station = RailsStation(WORKCELL, impedance or Impedance(), time_step, impedance_control=control)
+        self.station = GantryStation(WORKCELL, impedance or Impedance(), time_step, impedance_control=control)
         self.plant = self.station.plant
         self.simulator = Simulator(self.station)
         self.context = self.simulator.get_mutable_context()
@@ -86,7 +86,7 @@ def test_it_pushes_with_no_more_than_its_limits():
 
 
 def test_the_station_has_the_same_ports():
-    own, controlled = (RailsStation(WORKCELL, impedance_control=control) for control in CONTROLS)
+    own, controlled = (GantryStation(WORKCELL, impedance_control=control) for control in CONTROLS)
     for count, get in (("num_input_ports", "get_input_port"), ("num_output_ports", "get_output_port")):
         names = [[getattr(s, get)(i).get_name() for i in range(getattr(s, count)())] for s in (own, controlled)]
         assert names[0] == names[1]
@@ -106,11 +106,11 @@ def fastest_after_a_push(impedance, time_step):
 
 @pytest.mark.parametrize("impedance", [Impedance(), Impedance(damping_ratio=0.4)])
 def test_a_time_step_at_which_the_controller_would_ring_is_refused(impedance, monkeypatch):
-    longest = longest_step(impedance)
+    longest = max_stable_time_step(impedance)
     with pytest.raises(InputError, match="too long for impedance_control='cartesian'"):
-        RailsStation(WORKCELL, impedance, longest, impedance_control="cartesian")
+        GantryStation(WORKCELL, impedance, longest, impedance_control="cartesian")
     assert fastest_after_a_push(impedance, 0.95 * longest) < 0.01
-    monkeypatch.setattr(rails, "_refuse_long_step", lambda impedance, time_step: None)
+    monkeypatch.setattr(gantry, "_refuse_long_step", lambda impedance, time_step: None)
     assert fastest_after_a_push(impedance, 1.1 * longest) > 1.0  # until the limits hold it
 
 
@@ -123,5 +123,5 @@ def test_the_control_is_chosen_where_an_environment_is_made():
         make_env("BncConnector", impedance_control="cartesan")
     with pytest.raises(InputError, match="is too long for impedance_control"):
         make_env("BncConnector", impedance_control="cartesian", time_step=0.02)
-    with pytest.raises(InputError, match="it is one of station='rails'"):
+    with pytest.raises(InputError, match="it is one of station='gantry'"):
         make_env("BncConnector", station="arm", impedance_control="cartesian")

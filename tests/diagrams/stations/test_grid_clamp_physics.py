@@ -6,7 +6,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.arm import ArmStation
-from guiderail.diagrams.stations.gantry import RailsStation
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.models.objects.grid_clamp.geometry import MM
@@ -17,7 +17,7 @@ BESIDE = 1.0 * MM  # farther than this from its hole's centre a tip is not in th
 PUSH_60_N = Impedance(limits=(60.0, 60.0, 60.0, 3.0, 3.0, 3.0))
 
 
-def descend(times, z_mm, *, xy_mm=(0.0, 0.0), tilt_deg=0.0, grasp_mm=None, table_mm=None, station=RailsStation, **kw):
+def descend(times, z_mm, *, xy_mm=(0.0, 0.0), tilt_deg=0.0, grasp_mm=None, table_mm=None, station=GantryStation, **kw):
     """Drives along z at a place and a tilt; returns the driven station and the recording."""
     poses = np.zeros((len(times), 6))
     poses[:, :2] = np.array(xy_mm) * MM
@@ -83,7 +83,7 @@ def test_sixty_newtons_sideways_do_not_pull_a_seated_clamp_through_the_walls():
     poses = np.zeros((4, 6))
     poses[:, 2] = np.array([16.0, -4.0, -4.0, -4.0]) * MM
     poses[2:, 0] = 60.0 * MM
-    driven, recording = drive_along(RailsStation(WORKCELL, PUSH_60_N), [0, 0.8, 2.0, 2.5], poses)
+    driven, recording = drive_along(GantryStation(WORKCELL, PUSH_60_N), [0, 0.8, 2.0, 2.5], poses)
     assert abs(recording["wrench"][-1, 0]) > 50.0
     assert np.abs(WORKCELL.clamp_in_target(driven.station.plant, driven.plant_context).translation()).max() < 0.3 * MM
 
@@ -112,7 +112,7 @@ def test_what_friction_bears_does_not_creep():
     """Beside its holes, 27 N down and 2 N sideways, where 5.4 N would slip: it keeps its place for three seconds."""
     poses = np.array([[16.0, 2.5], [-6.0, 2.5], [-6.0, 2.5 + 2.0 / 1.5], [-6.0, 2.5 + 2.0 / 1.5]])  # 1.5 N/mm
     _, recording = drive_along(
-        RailsStation(WORKCELL),
+        GantryStation(WORKCELL),
         [0.0, 0.9, 1.0, 4.5],
         MM * np.column_stack([poses[:, 1], [1.0] * 4, poses[:, 0], np.zeros((4, 3))]),
     )

@@ -239,7 +239,7 @@ def test_what_a_task_draws_is_where_the_engine_has_it():
     _, info = env.reset(seed=2)
     station = env.task.diagram.GetSubsystemByName("station")
     env.step(np.zeros(2))
-    model = station.rails.model
+    model = station.gantry.model
     X_TT = RigidTransform([*info["jack_offset"], 0.0])
     expected = (X_TT @ CONNECTOR.X_JT.inverse()).translation()
     np.testing.assert_allclose(model.body("fixture").pos, expected, atol=1e-12)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.stations.pouring import MIDDLE_OF_POURING, PouringConfig, PouringStation
+from guiderail.diagrams.stations.pouring import MID_POURING_POSE, PouringConfig, PouringStation
 from guiderail.models.common.errors import InputError
 
 UPRIGHT = np.array([-0.15, -0.20, 0.15, 0.0, 0.0, 0.0])
-TILTED = MIDDLE_OF_POURING + [0.0, 0.0, 0.0, 0.0, 0.0, -1.2]
+TILTED = MID_POURING_POSE + [0.0, 0.0, 0.0, 0.0, 0.0, -1.2]
 
 
 def test_an_arm_of_six_joints_tilts_the_thermos_over_the_mug():

@@ -363,7 +363,7 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
         ({"reward": "dense"}, "no reward 'dense': choose one of shaped, sparse"),
         ({"observation": "smell"}, "choose one of image, state"),
         ({"stetion": "plane"}, "no option 'stetion' here: did you mean station"),
-        ({"station": "gantry"}, "no station 'rails'.*plane"),
+        ({"station": "gantry"}, "no station 'gantry'.*plane"),
         ({"difficulty": "hopeless"}, "no difficulty 'hopeless'"),
         ({"render_mode": "ascii"}, "render mode"),
         ({"action_repeat": 0}, "action_repeat"),

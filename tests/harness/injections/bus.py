@@ -59,11 +59,11 @@ class Bus:
         workcell = BncWorkcell()
         self.near_robot, self.near_station = DrakeLcm("memq://"), DrakeLcm("memq://")
         self.robot = SimulatedIiwa(workcell, self.near_robot)
-        limits = safety_limits(self.robot.known.plant, IIWA_DRIVER)
+        limits = safety_limits(self.robot.controller_plant.plant, IIWA_DRIVER)
         limits = dataclasses.replace(limits, damping_time=0.2, ramp_time=0.1)
         self.limits = np.array(limits.torque)
         self.station = HardwareStation(workcell, self.near_station, robot_timeout=1.0, limits=limits)
-        self.deputy = SafetyMonitor(self.near_robot, IIWA_DRIVER, self.robot.known.plant, limits)
+        self.deputy = SafetyMonitor(self.near_robot, IIWA_DRIVER, self.robot.controller_plant.plant, limits)
         self.on_status = self.on_command = passes
         self.has_robot = self.has_controller = self.has_safety_monitor = True
         self.torques: list[np.ndarray] = []

@@ -16,7 +16,7 @@ class Together:
 
     def __init__(self, workcell, lcm, start, deputy=True):
         self.robot = SimulatedIiwa(workcell, lcm)
-        plant = self.robot.known.plant
+        plant = self.robot.controller_plant.plant
         if deputy:
             self.deputy = SafetyMonitor(lcm, IIWA_DRIVER, plant, safety_limits(plant, IIWA_DRIVER))
         self.simulator = self.robot.simulator()

@@ -323,7 +323,7 @@ STATION = """
 from guiderail.diagrams.stations.registry import register_station
 
 
-@register_station("desk", world="workcell", simulated=False)
+@register_station("desk", world="workcell", is_simulated=False)
 def desk(world):
     raise NotImplementedError
 """
