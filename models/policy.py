@@ -15,7 +15,6 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import digest, read_bytes
 
 FORMAT = "guiderail policy 2"
-WITHOUT_DIGEST = "guiderail policy 1"  # what earlier versions wrote
 MOST_WEIGHTS = 200_000_000  # [bytes] a policy of 256 × 256 units has 0.3 million
 MOST_DESCRIPTION = 1_000_000  # [bytes]
 
@@ -76,12 +75,16 @@ class Policy:
         return (height // self.description["pool"]) * (width // self.description["pool"]) * channels
 
     @classmethod
-    def load(cls, folder: Path) -> "Policy":
-        """The policy of a run.
+    def load(cls, folder: Path | str) -> "Policy":
+        """Read the policy that a run left in its folder.
+
+        Args:
+            folder: Folder with `policy.safetensors` and `policy.json`.
 
         Raises:
-            InputError: if there is none, or it is damaged.
+            InputError: If a file is missing or damaged.
         """
+        folder = Path(folder)
         weights, description = folder / "policy.safetensors", folder / "policy.json"
         for path in (weights, description):
             if not path.is_file():
@@ -89,9 +92,8 @@ class Policy:
         try:
             values = json.loads(read_bytes(description, "description of a policy", MOST_DESCRIPTION))
             arrays = load(read_bytes(weights, "policy's weights", MOST_WEIGHTS))
-            whole = values["format"] == WITHOUT_DIGEST or values.pop("digest") == _digest(arrays, values)
-            if not whole or values["format"] not in (FORMAT, WITHOUT_DIGEST):
-                raise ValueError("another format, or not what was written")
+            if values["format"] != FORMAT or values.pop("digest") != _digest(arrays, values):
+                raise ValueError("the format or the digest differs")
             if len(arrays) % 2:
                 raise ValueError("a layer has a weight and a bias")
             layers = [(arrays[f"layers.{i}.weight"], arrays[f"layers.{i}.bias"]) for i in range(len(arrays) // 2)]
@@ -101,8 +103,9 @@ class Policy:
                 f"the policy in {folder} is damaged or of another version: write it anew with guiderail train --resume"
             ) from error
 
-    def save(self, folder: Path, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
+    def save(self, folder: Path | str, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
         """Writes `policy.safetensors` and `policy.json`; `write` is how, such as a whole file or none."""
+        folder = Path(folder)
         arrays: dict[str, np.ndarray] = {}
         for index, (weight, bias) in enumerate(self._layers):
             arrays |= {f"layers.{index}.weight": weight, f"layers.{index}.bias": bias}

@@ -43,7 +43,7 @@ class _AskedFor(Exception):
 
 def by_study(out):
     said = {"name": "one", "task": "GridClamp", "methods": {"zero": {"policy": "zero"}}, "seeds": [1]}
-    run_job(Job(Study.model_validate(said | {"judged on": [{"env": HARD, "episodes": 2}]}), "zero", 1, out))
+    run_job(Job(Study.model_validate(said | {"eval_set": [{"env": HARD, "episodes": 2}]}), "zero", 1, out))
 
 
 @pytest.mark.parametrize(

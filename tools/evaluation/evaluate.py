@@ -22,7 +22,6 @@ from guiderail.tools.evaluation.metrics import episodes_to_convergence, summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import PolicyFn, as_learned, check_seed, rollout, suits
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.visualization.style import is_demonstrated
@@ -270,9 +269,7 @@ def kept_file(
     deciding = {key: value for key, value in how.items() if key != "words"}
     content = task_content(config.task, environment, config.imports)
     about = [*([] if about is None else [about]), *filter(None, [content])]
-    told = json.dumps(
-        [older.options(environment), deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str
-    )
+    told = json.dumps([environment, deciding, config.seed, installed_versions(), *about], sort_keys=True, default=str)
     return kept / f"{name}-{hashlib.blake2b(told.encode(), digest_size=6).hexdigest()}.csv"
 
 

@@ -35,7 +35,7 @@ def _filled_in(**words: Any) -> AfterValidator:
 
 
 RunName = Annotated[str, _filled_in(method="skgrl", seed=0, episodes=60, algorithm="tqc")]
-EvaluatedFile = Annotated[str, _filled_in(name="held_out", mark=60, episodes=100, digest="0a")]
+EvaluatedFile = Annotated[str, _filled_in(name="held_out", after_episodes=60, episodes=100, digest="0a")]
 
 
 class _Strict(BaseModel):
@@ -73,7 +73,7 @@ class EvalSet(_Strict):
     options: dict[str, Any] = {}  # of each reset
     episodes: Whole = Field(default=100, ge=1)  # how many
     first_seed: Whole = Field(default=HELD_OUT_SEED, ge=0)  # of the first episode; each has the next
-    file: EvaluatedFile = "{name}-{mark}-{digest}.csv"  # in the run's folder: what was evaluated already
+    file: EvaluatedFile = "{name}-{after_episodes}-{digest}.csv"  # in the run's folder: what was evaluated already
 
 
 class Sweep(_Strict):
@@ -87,7 +87,7 @@ class Sweep(_Strict):
     def eval_set(self, value: float) -> EvalSet:
         """What is judged at one of its values."""
         name = f"{self.quantity} {value:g}"
-        file = re.sub(r"\W+", "_", self.quantity).strip("_") + f"-{value:g}-{{mark}}-{{digest}}.csv"
+        file = re.sub(r"\W+", "_", self.quantity).strip("_") + f"-{value:g}-{{after_episodes}}-{{digest}}.csv"
         return EvalSet(name=name, env=self.at[value], options=self.options, episodes=self.episodes, file=file)
 
 

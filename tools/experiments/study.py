@@ -41,7 +41,6 @@ from guiderail.tools.experiments.progress import Board
 from guiderail.tools.experiments.sweep import broken, draw_sweeps
 from guiderail.tools.experiments.worker import Attempt
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.learning.train import configure, with_defaults
 from guiderail.tools.tables import write_table
@@ -372,9 +371,9 @@ def _digest(job: Job, judged: EvalSet | None = None, mark: int = 0) -> str:
     if judged is not None and "difficulty" in judged.env:
         where = changed_environment(job.study.task, where, judged.env)
     content = task_content(job.study.task, where, job.study.imports)
-    environment = json.dumps(older.options(where), sort_keys=True, default=str) + content
-    told = said + method + environment + older.task(job.study.task)
-    if judged is not None and mark and "{mark}" not in judged.file:
+    environment = json.dumps(where, sort_keys=True, default=str) + content
+    told = said + method + environment + job.study.task
+    if judged is not None and mark and "{after_episodes}" not in judged.file:
         told += f"mark {mark}"
     if "{seed}" not in job.study.folder:
         told += f"seed {job.seed}"
@@ -406,7 +405,7 @@ def _refuse_other_rows(job: Job, file: Path, judged: EvalSet, mark: int) -> None
     if "{digest}" not in judged.file and says.exists() and says.read_text() != _digest(job, judged, mark):
         raise InputError(
             f"{file} holds episodes of another study, of other settings or after other training: name another folder "
-            "with --out, or write {mark} and {digest} into the file's name"
+            "with --out, or write {after_episodes} and {digest} into the file's name"
         )
 
 

@@ -11,7 +11,6 @@ from pydantic.dataclasses import dataclass
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.older import SETTINGS as OLDER
 
 
 def _usable_entropy(ent_coef: str) -> str:
@@ -147,8 +146,6 @@ def resolve_preset(name: str, algorithm: str, settings: Mapping[str, Any] | None
     known = {field.name for field in fields(LearnerConfig)} - {"algorithm"}
     values = asdict(PRESETS[name]) | {"algorithm": algorithm}
     for key, value in (settings or {}).items():
-        if key in OLDER:
-            raise InputError(f"the setting {key!r} is called {OLDER[key]!r}: give that")
         if key not in known:
             raise InputError(f"a learner has no setting {brief(key)}: {did_you_mean(key, known)}")
         values[key] = value

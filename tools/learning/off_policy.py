@@ -27,7 +27,6 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning import older
 from guiderail.tools.learning.checkpoint import CheckpointSelection
 from guiderail.tools.learning.config import LearnerConfig, action_gamma
 from guiderail.tools.learning.fast_sb3.ensemble import EnsembleSac, EnsembleTqc
@@ -355,7 +354,6 @@ class OffPolicyLearner(Learner):
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Becomes what it was when `state` was called; raises something, a ValueError at last, where that can't be."""
-        arrays, values = older.checkpoint(arrays, values)
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
         for name, module in self._modules().items():
             module.load_state_dict({k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(name + "/")})

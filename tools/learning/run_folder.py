@@ -20,7 +20,6 @@ from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import check_environment, import_modules, task_content
 from guiderail.tools.evaluation.metrics import checked_rows
 from guiderail.tools.files import LOCK, remove_parts, write_atomically
-from guiderail.tools.learning import older
 from guiderail.tools.learning.config import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
@@ -189,10 +188,8 @@ class RunFolder:
             )
         try:
             values = load_yaml(file, "configuration")
-            # A setting that did not exist yet was off, as its default is, whatever the preset has become since.
-            values["learner"] = LearnerConfig(**(asdict(LearnerConfig()) | older.settings(values["learner"])))
+            values["learner"] = LearnerConfig(**values["learner"])
             values["environment"] = as_arguments(values["environment"])
-            values.setdefault("ledger", False)
             config = RunConfig(**values)
         except InputError:
             raise

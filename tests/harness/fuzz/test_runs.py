@@ -12,11 +12,12 @@ import yaml
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
+from safetensors.numpy import load_file
 
 from fuzz.changes import changed_texts, changed_trees, edited, edits
 from fuzz.tally import attempt
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy
+from guiderail.models.policy import FORMAT, Policy, _digest
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -201,10 +202,13 @@ def test_policies_with_bytes_changed(folder, file, changes, flips):
 
 @given(st.data())
 def test_policies_with_entries_changed_that_have_their_digest(folder, data):
-    """Whoever makes such a file on purpose: it is refused, or acts within its limits."""
-    tree = data.draw(changed_trees([DESCRIPTION | {"format": "guiderail policy 1"}]))
+    """A policy forged with a valid digest is refused or acts within its limits."""
+    tree = data.draw(changed_trees([DESCRIPTION | {"format": FORMAT}]))
     Policy(LAYERS, DESCRIPTION).save(folder.path)
-    (folder.path / "policy.json").write_text(json.dumps(tree, default=str))
+    tree = json.loads(json.dumps(tree, default=str))
+    if isinstance(tree, dict):
+        tree["digest"] = _digest(load_file(folder.path / "policy.safetensors"), tree)
+    (folder.path / "policy.json").write_text(json.dumps(tree))
     try_policy("policy, entries changed", folder, None)
 
 

@@ -58,7 +58,7 @@ STUDY = {
     "methods": {"kgrl": {}},
     "seeds": [0, 1, 2],
     "after_episodes": [2],
-    "judged on": [{"episodes": 2}],
+    "eval_set": [{"episodes": 2}],
 }
 PATIENCE = 600.0  # s
 

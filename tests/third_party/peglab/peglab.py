@@ -23,7 +23,7 @@ from guiderail import (
     register_task,
 )
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
-from guiderail.models.policy import Policy
+from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.learner import Learner, register_learner
 
@@ -120,7 +120,7 @@ class HillClimbing(Learner):
     def policy(self, description: Mapping[str, Any]) -> Policy:
         limits = {"action_low": self.space.low.tolist(), "action_high": self.space.high.tolist()}
         layer = (self.best[:, :-1].astype(np.float32), self.best[:, -1].astype(np.float32))
-        return Policy([layer], {"format": "guiderail policy 1", "pool": 1, "squash": "tanh", **limits, **description})
+        return Policy([layer], {"format": FORMAT, "pool": 1, "squash": "tanh", **limits, **description})
 
     def has_diverged(self) -> bool:
         return not np.isfinite(self.best).all()

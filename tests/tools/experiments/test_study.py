@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 import yaml
 
-from guiderail.diagrams.envs.make import resolve
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import import_modules, make_environment
@@ -25,7 +24,6 @@ from guiderail.tools.experiments.study import (
     study_command,
 )
 from guiderail.tools.experiments.sweep import AT_ONCE, NEVER, breaking_point
-from guiderail.tools.learning import older
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import read_table
 from research.studies import study_names, study_path
@@ -38,7 +36,7 @@ BEAD = {
     "methods": {"learner": {}},
     "seeds": [5, 6],
     "after_episodes": [2, 4],
-    "judged on": [{"episodes": 3}],
+    "eval_set": [{"episodes": 3}],
 }
 
 
@@ -61,7 +59,7 @@ def written(folder):
 def test_there_is_a_row_for_every_method_seed_mark_and_what_is_judged_on(tmp_path):
     methods = {"learner": {}, "nothing": {"policy": "zero"}, "anything": {"policy": "uniform_random", "seeds": [9]}}
     judged = [{"episodes": 2}, {"name": "far away", "episodes": 3, "env": {"wall": -0.5}}]
-    rows = run(study(methods=methods, **{"judged on": judged}), tmp_path)
+    rows = run(study(methods=methods, **{"eval_set": judged}), tmp_path)
     expected = [
         *(("learner", seed, mark, name) for seed in (5, 6) for mark in (2, 4) for name in ("held out", "far away")),
         *(("nothing", seed, 0, name) for seed in (5, 6) for name in ("held out", "far away")),
@@ -133,7 +131,7 @@ def test_two_runs_never_share_a_folder(tmp_path):
 
 
 def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
-    run(study(**{"judged on": []}), tmp_path)
+    run(study(**{"eval_set": []}), tmp_path)
     late, expected = run(study(), tmp_path), run(study(), tmp_path / "other")
     assert without_clock(late) == without_clock(expected)
     for mark in (tmp_path / "learner-5" / "after_episodes").iterdir():
@@ -141,13 +139,13 @@ def test_the_policy_of_an_earlier_mark_can_be_judged_later(tmp_path):
             file.unlink()
         mark.rmdir()
     with pytest.raises(InputError, match="its policy of then is gone"):
-        run(study(**{"judged on": [{"episodes": 4}]}), tmp_path)
+        run(study(**{"eval_set": [{"episodes": 4}]}), tmp_path)
 
 
 def test_other_episodes_of_the_same_name_are_not_taken_for_these(tmp_path):
     methods = {"nothing": {"policy": "zero"}}
     near, far = (
-        run(study(methods=methods, **{"judged on": [{"episodes": 3, "env": {"wall": wall}}]}), tmp_path)
+        run(study(methods=methods, **{"eval_set": [{"episodes": 3, "env": {"wall": wall}}]}), tmp_path)
         for wall in (1.0, -0.5)
     )
     assert near["mean_return"].gt(far["mean_return"]).all()
@@ -167,12 +165,12 @@ def test_studies_that_share_a_folder_are_kept_apart_or_refused(tmp_path):
     for changed in ({}, {"seeds": [6]}, {"task": "Twin", "imports": [str(tmp_path / "pearl.py")]}):
         run(study(**(uniform_random | changed)), out)
     assert len(list((out / "anything").glob("held_out-0-*.csv"))) == 3
-    named = {"judged on": [{"episodes": 3, "file": "held_out.csv"}]}
+    named = {"eval_set": [{"episodes": 3, "file": "held_out.csv"}]}
     run(study(**uniform_random, **named), out)
     before = written(out)
     run(study(**uniform_random, **named), out)
     assert written(out) == before
-    for changed in ({"env": {"wall": -0.5}}, {"seeds": [6]}, {"judged on": [{"episodes": 4, "file": "held_out.csv"}]}):
+    for changed in ({"env": {"wall": -0.5}}, {"seeds": [6]}, {"eval_set": [{"episodes": 4, "file": "held_out.csv"}]}):
         with pytest.raises(InputError, match="episodes of another study"):
             run(study(**(uniform_random | named | changed)), out)
     assert written(out) == before
@@ -196,14 +194,6 @@ def test_where_a_method_breaks_lies_on_a_line_between_two_values():
     assert breaking_point([30.0, 20.0, 10.0], [1.0, 0.9, 0.0]) == pytest.approx(20.0)
     assert breaking_point([1.0, 2.0], [0.89, 1.0]) == AT_ONCE
     assert breaking_point([1.0, 2.0], [1.0, 0.9]) == NEVER
-
-
-def test_results_that_are_older_than_an_option_are_of_its_default():
-    assert older.options({"wall": 1.0, "impedance_control": "joint"}) == {"wall": 1.0}
-    assert older.options({"impedance_control": "cartesian"}) == {"impedance_control": "cartesian"}
-    for name, value in older.OPTIONS.items():
-        options = [resolve(task, {}).values for task in older.TASKS]
-        assert [one[name] for one in options if name in one].count(value) == sum(name in one for one in options) > 0
 
 
 def test_a_folder_with_another_run_is_refused_before_anything_is_written(tmp_path):
@@ -231,7 +221,7 @@ def test_the_best_constant_is_the_best_of_its_grid(tmp_path):
 
 def test_sampled_arguments_stay_in_their_range_and_change_every_few_episodes(tmp_path):
     judged = [{"episodes": 5, "every": 2, "sampled": {"wall": [0.2, 0.3]}}]
-    run(study(methods={"nothing": {"policy": "zero"}}, seeds=[0], **{"judged on": judged}), tmp_path)
+    run(study(methods={"nothing": {"policy": "zero"}}, seeds=[0], **{"eval_set": judged}), tmp_path)
     (file,) = (tmp_path / "nothing-0").glob("*.csv")
     rows = read_table(file)
     assert rows["episode"].tolist() == [0, 1, 2, 3, 4]
@@ -246,7 +236,7 @@ def test_a_process_of_its_own_finds_what_this_one_does(tmp_path):
             "task": "NarrowPassage",
             "methods": {"anything": {"policy": "uniform_random"}},
             "seeds": [0],
-            "judged on": [{"episodes": 1}],
+            "eval_set": [{"episodes": 1}],
         }
     )
     one, two = (run_study(declared, tmp_path / str(n), make_engine(processes=n)).drop(columns="folder") for n in (1, 2))
@@ -291,8 +281,8 @@ WRONG = [
         {"after_episodes": [2, 5], "methods": {"one": {"learner": {"episodes": 4}}}},
         "no method learns as long as the mark 5",
     ),
-    ({"task": "NarrowPassage", "judged on": [{"options": {"held_otu": True}}]}, "did you mean held_out"),
-    ({"task": "NarrowPassage", "judged on": [{"options": {"held_out": "far"}}]}, "held_out cannot be 'far'"),
+    ({"task": "NarrowPassage", "eval_set": [{"options": {"held_otu": True}}]}, "did you mean held_out"),
+    ({"task": "NarrowPassage", "eval_set": [{"options": {"held_out": "far"}}]}, "held_out cannot be 'far'"),
     ({"after_episodes": [], "learner": {}}, "how long does learner learn"),
     ({"task": "Beat"}, "did you mean Bead"),
     ({"tsak": "Bead"}, "did you mean task"),
@@ -303,14 +293,14 @@ WRONG = [
     ({"learner": {"preset": "robst"}}, "did you mean robust"),
     ({"learner": {"algorithm": "ppo"}}, "sac, tqc"),
     ({"learner": {"settings": {"batchsize": 3}}}, "batch_size"),
-    ({"judged on": [{"episodes": 0}]}, "judged on"),
-    ({"judged on": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
-    ({"judged on": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
+    ({"eval_set": [{"episodes": 0}]}, "eval_set"),
+    ({"eval_set": [{"env": {"stattion": "arm"}}]}, "no option 'stattion'"),
+    ({"eval_set": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
     ({"folder": "{guidance}-{seed}"}, "it may have {method}, {seed}, {episodes}, {algorithm}"),
     ({"folder": "{method}-{seed"}, "has braces that nothing fills"),
-    ({"judged on": [{"file": "{mark}-{seed}.csv"}]}, "it may have {name}, {mark}, {episodes}, {digest}"),
+    ({"eval_set": [{"file": "{after_episodes}-{seed}.csv"}]}, "it may have {name}, {after_episodes}, {episodes}, {digest}"),
     ({"statistics": ["sucess_rate"]}, "did you mean success_rate"),
-    ({"judged on": [{"episodes": 2}, {"episodes": 3}]}, "called 'held out'"),
+    ({"eval_set": [{"episodes": 2}, {"episodes": 3}]}, "called 'held out'"),
     ({"ratios": [{"of": "mean_force", "method": "learnt", "against": "learner"}]}, "did you mean learner"),
     ({"ratios": [{"of": "mean_fource", "method": "learner", "against": "learner"}]}, "did you mean mean_force"),
 ]
@@ -392,7 +382,7 @@ def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
     """The wall of beads is where they start, or far away, where nothing succeeds."""
     walls = {"quantity": "wall [m]", "at": {0.0: {}, -0.5: {"wall": -0.5}}, "episodes": 2}
     methods = {"nothing": {"policy": "zero", "seeds": [9]}, "anything": {"policy": "uniform_random"}}
-    one = study(methods=methods, sweeps=[walls], **{"judged on": []})
+    one = study(methods=methods, sweeps=[walls], **{"eval_set": []})
     found = study_command(one, tmp_path, make_engine(processes=1))
     rows = read_table(tmp_path / "beads.csv")
     assert rows["eval_set"].tolist() == ["wall [m] 0", "wall [m] -0.5"] * 3
@@ -405,13 +395,13 @@ def test_a_sweep_is_judged_at_each_of_its_values_and_drawn(tmp_path):
 
 def test_a_policy_that_learned_longer_is_judged_by_itself_whatever_the_file_is_called(tmp_path):
     judged = [{"episodes": 2, "file": "held_out-{episodes}-{digest}.csv"}]
-    run(study(after_episodes=[2], seeds=[5], **{"judged on": judged}), tmp_path)
-    run(study(after_episodes=[4], seeds=[5], **{"judged on": judged}), tmp_path)
+    run(study(after_episodes=[2], seeds=[5], **{"eval_set": judged}), tmp_path)
+    run(study(after_episodes=[4], seeds=[5], **{"eval_set": judged}), tmp_path)
     assert len(list((tmp_path / "learner-5").glob("held_out-2-*.csv"))) == 2
     same = [{"episodes": 2, "file": "held_out.csv"}]
-    run(study(after_episodes=[4], seeds=[5], **{"judged on": same}), tmp_path)
+    run(study(after_episodes=[4], seeds=[5], **{"eval_set": same}), tmp_path)
     with pytest.raises(InputError, match="after other training"):
-        run(study(after_episodes=[6], seeds=[5], **{"judged on": same}), tmp_path)
+        run(study(after_episodes=[6], seeds=[5], **{"eval_set": same}), tmp_path)
 
 
 def test_a_part_of_a_study_does_not_take_the_place_of_its_table(tmp_path):

@@ -22,7 +22,7 @@ def test_a_band_is_as_wide_as_the_seeds_differ():
 
 def test_a_sweep_of_one_value_is_drawn(tmp_path):
     study = Study.model_validate(
-        {"name": "one", "task": "Bead", "methods": {"one": {"policy": "zero"}}, "seeds": [0], "judged on": [],
+        {"name": "one", "task": "Bead", "methods": {"one": {"policy": "zero"}}, "seeds": [0], "eval_set": [],
          "sweeps": [{"quantity": "x", "at": {1.0: {}}}]}
     )  # fmt: skip
     found = rows(0.5).assign(eval_set="x 1")

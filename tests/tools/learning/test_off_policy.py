@@ -54,8 +54,8 @@ def test_presets_are_the_tables_of_the_thesis():
     simulation, robot = PRESETS["table_4_1_simulation"], PRESETS["table_4_1_robot"]
     for table, tau, gamma, entropy in ((simulation, 0.02, 0.99, "auto"), (robot, 0.01, 0.995, "auto_0.1")):
         assert (table.learning_rate, table.train_freq, table.gradient_steps) == (1e-3, 8, 8)
-        assert (table.tau, table.gamma, table.entropy) == (tau, gamma, entropy)
-        assert (table.batch_size, table.buffer_size, table.units) == (256, 10**6, (256, 256))
+        assert (table.tau, table.gamma, table.ent_coef) == (tau, gamma, entropy)
+        assert (table.batch_size, table.buffer_size, table.net_arch) == (256, 10**6, (256, 256))
     for name, rate, gamma in (("table_3_2_iiwa", 8e-4, 0.95), ("table_3_2_sara", 1e-3, 0.98)):
         table = PRESETS[name]
         assert (table.learning_rate, table.gamma, table.tau) == (rate, gamma, 0.02)
@@ -264,10 +264,10 @@ def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
     )
     greedy = []
     for episode, success in enumerate([True, True, True, False]):
-        first.begin()
+        first.on_episode_start()
         greedy.append(first.actor().state_dict()["mu.weight"].clone())
         live(first, 8, seed=episode)
-        first.end({"success": int(success)})
+        first.on_episode_end({"success": int(success)})
     arrays, values = first.state()
     second = make(first.preset, seed=9)
     second.restore({key: value.copy() for key, value in arrays.items()}, values)
@@ -290,11 +290,6 @@ def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
 def test_episodes_that_cannot_be_are_refused(settings):
     with pytest.raises(InputError):
         resolve_preset("tqc_contact", "tqc", settings)
-
-
-def test_a_setting_by_its_older_name_is_told_its_name():
-    with pytest.raises(InputError, match="'practise' is called 'greedy_episode_fraction'"):
-        resolve_preset("tqc_contact", "tqc", {"practise": 0.5})
 
 
 def test_an_algorithm_more_is_one_class(monkeypatch):

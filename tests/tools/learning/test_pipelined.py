@@ -52,12 +52,12 @@ def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(f
     before = acting.actor().state_dict()["mu.weight"].clone()
     rng, last = np.random.default_rng(0), {"success": False}
     for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):
-        student.begin()
+        student.on_episode_start()
         for _ in range(6):
             observation, action = rng.uniform(-1, 1, 3).astype(np.float32), student.act(np.zeros(3, np.float32))
-            student.see(Transition(observation, action, 0.0, observation, False, False, {}))
+            student.on_step(Transition(observation, action, 0.0, observation, False, False, {}))
         assert (student.known, student.late) == (known, 0)
-        student.end({"termination": termination, **last})
+        student.on_episode_end({"termination": termination, **last})
         student.submit_episode()
     student.finish()
     assert (student.known, acting.decisions, acting.episodes) == (4, 24, 4)

@@ -4,9 +4,10 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from safetensors.numpy import load_file
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import WITHOUT_DIGEST, Policy
+from guiderail.models.policy import Policy, _digest
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import policy_of
@@ -93,16 +94,6 @@ def test_a_policy_in_which_one_bit_changed_is_refused_in_a_sentence(learner, fil
         Policy.load(tmp_path)
 
 
-def test_a_policy_of_an_earlier_version_has_no_digest(learner, tmp_path):
-    observation = learner_observation(learner, 0)
-    policy = policy_of(learner.model.actor, {"observation_shape": list(observation.shape)})
-    policy.save(tmp_path)
-    values = json.loads((tmp_path / "policy.json").read_text())
-    del values["digest"]
-    (tmp_path / "policy.json").write_text(json.dumps(values | {"format": WITHOUT_DIGEST}))
-    np.testing.assert_array_equal(Policy.load(tmp_path)(observation), policy(observation))
-
-
 WRONG = [
     ("pool", 0), ("observation_shape", [10**13]), ("observation_shape", [-5]), ("observation_shape", [6]),
     ("action_low", [0.0]), ("action_high", [-1.0, -2.0]), ("action_high", [float("nan"), 3.0]),
@@ -120,10 +111,11 @@ def test_a_policy_whose_parts_do_not_fit_together_is_refused_in_a_sentence(entry
     for described, of in ((values | {entry: value}, [*layers[1:]]), (values, layers), (values, [])):
         with pytest.raises(ValueError):
             Policy(of, described)
-    # Whoever writes such a file gives it the digest that it needs.
     stored = json.loads((tmp_path / "policy.json").read_text())
     del stored["digest"]
-    (tmp_path / "policy.json").write_text(json.dumps(stored | {"format": WITHOUT_DIGEST, entry: value}))
+    stored |= {entry: value}
+    stored["digest"] = _digest(load_file(tmp_path / "policy.safetensors"), stored)  # a forged file has a valid digest
+    (tmp_path / "policy.json").write_text(json.dumps(stored))
     with pytest.raises(InputError, match="damaged"):
         Policy.load(tmp_path)
 

@@ -17,7 +17,7 @@ def test_everything_that_decides_a_run_is_in_its_configuration(bead_config, tmp_
     folder = RunFolder(tmp_path / "run")
     folder.create(bead_config)
     text = (tmp_path / "run" / "config.yaml").read_text()
-    for word in ("guidance: skgrl", "hold: 1", "learning_rate:", "seed: 5", "torch:", "drake:"):
+    for word in ("guidance: skgrl", "action_repeat: 1", "learning_rate:", "seed: 5", "torch:", "drake:"):
         assert word in text
 
 
@@ -28,28 +28,6 @@ def test_a_setting_that_a_run_is_older_than_is_off_whatever_its_preset_says_now(
     lines = [line for line in file.read_text().splitlines() if "ez_greedy_until" not in line]
     file.write_text("\n".join(lines))
     assert folder.config().learner == replace(PRESETS["sac_gridclamp"], ez_greedy_until=0)
-
-
-OLD_NAMES = {
-    "constant_episodes": "steady_episodes",
-    "greedy_episode_fraction": "practise",
-    "ez_greedy": "bursts",
-    "ez_greedy_longest": "longest_burst",
-    "ez_greedy_until": "bursts_until",
-    "selection_window": "proven_by",
-}
-
-
-def test_a_run_with_the_older_names_of_its_settings_is_read(bead_config, tmp_path):
-    folder = RunFolder(tmp_path / "run")
-    folder.create(replace(bead_config, preset="sac_gridclamp", learner=PRESETS["sac_gridclamp"]))
-    file = tmp_path / "run" / "config.yaml"
-    text = file.read_text()
-    for new, old in OLD_NAMES.items():
-        assert f"  {new}: " in text
-        text = text.replace(f"  {new}: ", f"  {old}: ")
-    file.write_text(text)
-    assert folder.config().learner == PRESETS["sac_gridclamp"]
 
 
 def test_an_option_that_a_run_is_older_than_does_not_make_it_another(bead_config, tmp_path):
@@ -80,7 +58,7 @@ def test_a_configuration_that_no_learner_can_use_is_refused(bead_config, tmp_pat
         ("seed: 5", "seed: 5\nseeed: 6"),
         ("seed: 5", "seed: 5\nseed: 6"),
         ("learner:", "learner: 3\nold:"),
-        ("hold: 1", "hold: 2001-99-99"),
+        ("action_repeat: 1", "action_repeat: 2001-99-99"),
         ("imports: []", "imports: ['']"),
         ("imports: []", "imports: [..x]"),
         ("imports: []", f"imports: [{'[' * 99}"),

@@ -1,7 +1,7 @@
 """Runs a study of eight runs on two processes, and on a Ray cluster of two machines of which one is lost meanwhile.
 
-    python tests/tools/studies/engines/ray_study.py --out FOLDER         # the narrow passage
-    python tests/tools/studies/engines/ray_study.py --out FOLDER --bead  # half a minute
+    python tests/tools.experiments.engines/ray_study.py --out FOLDER         # the narrow passage
+    python tests/tools.experiments.engines/ray_study.py --out FOLDER --bead  # half a minute
 
 On the cluster a worker is killed in the middle of a run, and then one of the two machines with all its processes. It
 ends with 1 if the study is not complete, or not the same bit for bit. Ray must be installed.
@@ -33,12 +33,12 @@ STUDY = {
     "learner": {"preset": "tqc_fast", "episodes": 3},
     "methods": {"kgrl": {}},
     "seeds": list(range(8)),
-    "judged on": [{"episodes": 2}],
+    "eval_set": [{"episodes": 2}],
 }
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
 BEAD = {
     **{"name": "eight", "task": "Bead", "methods": {"bead": {}}, "seeds": list(range(8))},
-    **{"learner": {"settings": SETTINGS, "episodes": 40}, "judged on": [{"episodes": 2}]},
+    **{"learner": {"settings": SETTINGS, "episodes": 40}, "eval_set": [{"episodes": 2}]},
 }
 REGISTER = f"import sys\nsys.path.insert(0, {str(TESTS / 'tools')!r})\nimport bead\nbead.register()\n"
 PATIENCE = 600.0  # s

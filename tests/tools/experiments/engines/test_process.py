@@ -15,7 +15,7 @@ PARENT = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 from oracles.work import wait
-from guiderail.tools.studies.engines.engine import make_engine
+from guiderail.tools.experiments.engines.engine import make_engine
 if __name__ == "__main__":
     with make_engine("process", 2) as engine:
         list(engine.run(wait, {0: 0, 1: 1}))

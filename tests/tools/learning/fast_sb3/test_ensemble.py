@@ -140,7 +140,7 @@ def test_layers_whose_gradient_is_not_written_out_are_refused():
 def test_learning_does_not_wait_for_pytorchs_compiler(forks):
     code = """
 import sys
-from guiderail.tools.learning.ensemble import EnsembleSac, EnsembleTqc
+from guiderail.tools.learning.fast_sb3.ensemble import EnsembleSac, EnsembleTqc
 from gymnasium import Env, spaces
 class Vector(Env):
     observation_space = action_space = spaces.Box(-1, 1, (2,))
