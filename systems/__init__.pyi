@@ -24,7 +24,7 @@ from .measured_pose import MeasuredPose as MeasuredPose
 from .meshcat_device import MeshcatDevice as MeshcatDevice
 from .mujoco_gantry import DivergedError as DivergedError
 from .mujoco_gantry import MovedBodies as MovedBodies
-from .mujoco_gantry import MujocoRails as MujocoRails
+from .mujoco_gantry import MujocoGantry as MujocoGantry
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
 from .pose_rate_limiter import PoseRateLimiter as PoseRateLimiter

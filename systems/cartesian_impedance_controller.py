@@ -66,18 +66,18 @@ class CartesianImpedanceController(LeafSystem):
         name: CartesianImpedanceController
         input_ports:
         - desired_pose
-        - state
+        - estimated_state
         - command_time (optional)
         output_ports:
-        - torque
+        - generalized_force
         - pose
         - impedance_wrench
         - saturation
-        - holding
+        - command_timed_out
 
-    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``state`` is (2n,), joint
+    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``estimated_state`` is (2n,), joint
     positions and velocities. ``command_time`` is (1,), when ``desired_pose`` was given [s]; unconnected, commands never
-    get stale. ``torque`` is (n,) [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T. ``saturation`` is 1
+    get stale. ``generalized_force`` is (n,) [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T. ``saturation`` is 1
     while the wrench or a motor is at its limit, ``command_timed_out`` 1 while the watchdog holds; both (1,).
     """
 
@@ -118,7 +118,7 @@ class CartesianImpedanceController(LeafSystem):
         self._torque_limits = plant.GetEffortUpperLimits()
 
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
-        self._state_port = self.DeclareVectorInputPort("state", 2 * num_joints)
+        self._estimated_state_port = self.DeclareVectorInputPort("estimated_state", 2 * num_joints)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
         self._watch = CommandWatch(
             self,
@@ -129,12 +129,12 @@ class CartesianImpedanceController(LeafSystem):
             timeout=timeout,
         )
 
-        state = {self._state_port.ticket()}
+        state = {self._estimated_state_port.ticket()}
         self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=state)
         self._law = declare_cache(self, "law", self._calc_law, prerequisites_of_calc=self._watch.tickets | state)
         law = {self._law.ticket()}
-        self._torque_port = self.DeclareVectorOutputPort(
-            "torque", num_joints, self._calc_torque, prerequisites_of_calc=law
+        self._generalized_force_port = self.DeclareVectorOutputPort(
+            "generalized_force", num_joints, self._calc_generalized_force, prerequisites_of_calc=law
         )
         self._pose_port = self.DeclareVectorOutputPort("pose", 6, self._calc_pose, prerequisites_of_calc=state)
         self._impedance_wrench_port = self.DeclareVectorOutputPort(
@@ -143,7 +143,7 @@ class CartesianImpedanceController(LeafSystem):
         self._saturation_port = self.DeclareVectorOutputPort(
             "saturation", 1, self._calc_saturation, prerequisites_of_calc=law
         )
-        self._holding_port = self.DeclareVectorOutputPort(
+        self._command_timed_out_port = self.DeclareVectorOutputPort(
             "command_timed_out", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
         )
 
@@ -151,17 +151,17 @@ class CartesianImpedanceController(LeafSystem):
         """The desired pose of the tool centre, (6,)."""
         return self._desired_pose_port
 
-    def get_state_input_port(self) -> InputPort:
+    def get_estimated_state_input_port(self) -> InputPort:
         """Joint positions and velocities, (2n,) [rad, rad/s]."""
-        return self._state_port
+        return self._estimated_state_port
 
     def get_command_time_input_port(self) -> InputPort:
         """When the desired pose was given, (1,) [s]; optional."""
         return self._command_time_port
 
-    def get_torque_output_port(self) -> OutputPort:
+    def get_generalized_force_output_port(self) -> OutputPort:
         """Joint torques, (n,) [Nm]."""
-        return self._torque_port
+        return self._generalized_force_port
 
     def get_pose_output_port(self) -> OutputPort:
         """The measured pose of the tool centre, (6,)."""
@@ -175,12 +175,12 @@ class CartesianImpedanceController(LeafSystem):
         """1 while the wrench or a motor is at its limit, (1,)."""
         return self._saturation_port
 
-    def get_holding_output_port(self) -> OutputPort:
+    def get_command_timed_out_output_port(self) -> OutputPort:
         """1 while the watchdog holds, (1,)."""
-        return self._holding_port
+        return self._command_timed_out_port
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
-        self._plant.SetPositionsAndVelocities(plant_context, self._state_port.Eval(context))
+        self._plant.SetPositionsAndVelocities(plant_context, self._estimated_state_port.Eval(context))
 
     def _measured_pose(self, context: Context) -> np.ndarray:
         return self._pose_port.Eval(context)
@@ -220,7 +220,7 @@ class CartesianImpedanceController(LeafSystem):
             return np.zeros(self._plant.num_velocities())
         return -self._plant.CalcGravityGeneralizedForces(plant_context)
 
-    def _calc_torque(self, context: Context, output: BasicVector) -> None:
+    def _calc_generalized_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._law.Eval(context).torque)
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:

@@ -70,7 +70,7 @@ class CartesianPositionController(LeafSystem):
         - joint_positions
         - pose
         - stuck
-        - holding
+        - command_timed_out
 
     ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``positions`` is (n,), measured; it is read
     at initialization, and the joint command starts there. ``command_time`` is (1,), when ``desired_pose`` was given
@@ -141,7 +141,7 @@ class CartesianPositionController(LeafSystem):
             "pose", 6, self._calc_pose, prerequisites_of_calc={self._plant_context.ticket()}
         )
         self._stuck_port = self.DeclareStateOutputPort("stuck", self._is_stuck)
-        self._holding_port = self.DeclareStateOutputPort("command_timed_out", self._is_holding)
+        self._command_timed_out_port = self.DeclareStateOutputPort("command_timed_out", self._is_holding)
         self.DeclareInitializationDiscreteUpdateEvent(self._start_at_measured_positions)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 
@@ -169,9 +169,9 @@ class CartesianPositionController(LeafSystem):
         """1 while the desired direction can't be followed, (1,)."""
         return self._stuck_port
 
-    def get_holding_output_port(self) -> OutputPort:
+    def get_command_timed_out_output_port(self) -> OutputPort:
         """1 while the joint command is held, (1,)."""
-        return self._holding_port
+        return self._command_timed_out_port
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
         self._plant.SetPositions(plant_context, self._joint_command(context))

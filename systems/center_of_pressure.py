@@ -21,9 +21,9 @@ class CenterOfPressure(LeafSystem):
         input_ports:
         - wrench
         output_ports:
-        - lever
+        - center_of_pressure
 
-    ``wrench`` (6,) is force and torque about the tool centre [N, Nm]; ``lever`` is (2,) [m].
+    ``wrench`` (6,) is force and torque about the tool centre [N, Nm]; ``center_of_pressure`` is (2,) [m].
     """
 
     def __init__(self, least_force: float):
@@ -39,8 +39,8 @@ class CenterOfPressure(LeafSystem):
             raise InputError(f"the lever of a force needs a least force, positive, not {least_force} N")
         self._least_force = least_force
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
-        self._lever_port = self.DeclareVectorOutputPort(
-            "lever", 2, self._calc_lever, prerequisites_of_calc={self._wrench_port.ticket()}
+        self._center_of_pressure_port = self.DeclareVectorOutputPort(
+            "center_of_pressure", 2, self._calc_center_of_pressure, prerequisites_of_calc={self._wrench_port.ticket()}
         )
 
     def get_wrench_input_port(self) -> InputPort:
@@ -49,7 +49,7 @@ class CenterOfPressure(LeafSystem):
 
     def get_center_of_pressure_output_port(self) -> OutputPort:
         """From the tool centre to where it pushes, (2,) [m]."""
-        return self._lever_port
+        return self._center_of_pressure_port
 
-    def _calc_lever(self, context: Context, output: BasicVector) -> None:
+    def _calc_center_of_pressure(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(center_of_pressure(self._wrench_port.Eval(context), self._least_force))

@@ -26,10 +26,10 @@ class CommandDisturbance(LeafSystem):
 
         name: CommandDisturbance
         input_ports:
-        - sent
+        - command
         - pose
         output_ports:
-        - delivered
+        - delivered_command
 
     All are (n,). ``pose`` is measured, and read at initialization only.
     """
@@ -59,27 +59,27 @@ class CommandDisturbance(LeafSystem):
         self._is_lost = self.DeclareDiscreteState(1)
         self._last = self.DeclareDiscreteState(size)
         self._line = self.DeclareDiscreteState(late * size) if late else None  # the oldest first
-        self._sent_port = self.DeclareVectorInputPort("sent", size)
+        self._command_port = self.DeclareVectorInputPort("command", size)
         self._pose_port = self.DeclareVectorInputPort("pose", size)
         state = {self.discrete_state_ticket(index) for index in (self._is_lost, self._last)}
-        source = self._sent_port.ticket() if self._line is None else self.discrete_state_ticket(self._line)
-        self._delivered_port = self.DeclareVectorOutputPort(
-            "delivered", size, self._calc_delivered, prerequisites_of_calc=state | {source}
+        source = self._command_port.ticket() if self._line is None else self.discrete_state_ticket(self._line)
+        self._delivered_command_port = self.DeclareVectorOutputPort(
+            "delivered_command", size, self._calc_delivered, prerequisites_of_calc=state | {source}
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_sent_input_port(self) -> InputPort:
+    def get_command_input_port(self) -> InputPort:
         """What is commanded, (n,)."""
-        return self._sent_port
+        return self._command_port
 
     def get_pose_input_port(self) -> InputPort:
         """Where the robot is, (n,)."""
         return self._pose_port
 
-    def get_delivered_output_port(self) -> OutputPort:
+    def get_delivered_command_output_port(self) -> OutputPort:
         """What arrives, (n,)."""
-        return self._delivered_port
+        return self._delivered_command_port
 
     def set_seed(self, context: Context, seed: int) -> None:
         """Sets what losses are drawn from; `context` is this system's own."""
@@ -99,7 +99,7 @@ class CommandDisturbance(LeafSystem):
         discrete_state.set_value(self._count, [count])
         discrete_state.set_value(self._last, self._delivered(context))
         if self._line is not None:
-            sent = self._sent_port.Eval(context)
+            sent = self._command_port.Eval(context)
             line = context.get_discrete_state(self._line).value()
             discrete_state.set_value(self._line, np.concatenate([line[len(sent) :], sent]))
         if self._lost > 0.0:
@@ -113,7 +113,7 @@ class CommandDisturbance(LeafSystem):
         if context.get_discrete_state(self._is_lost).value()[0]:
             return last
         if self._line is None:
-            return self._sent_port.Eval(context)
+            return self._command_port.Eval(context)
         return context.get_discrete_state(self._line).value()[: len(last)]
 
     def _calc_delivered(self, context: Context, output: BasicVector) -> None:

@@ -22,7 +22,7 @@ class CommandWatchdog(LeafSystem):
         - command_time (optional)
         output_ports:
         - safe_pose
-        - holding
+        - command_timed_out
 
     ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``command_time`` is (1,),
     when ``desired_pose`` was given [s]; unconnected, commands never get stale. ``command_timed_out`` is (1,): 1 while a pose is
@@ -56,7 +56,7 @@ class CommandWatchdog(LeafSystem):
         self._safe_pose_port = self.DeclareVectorOutputPort(
             "safe_pose", pose_size, self._calc_safe_pose, prerequisites_of_calc=self._watch.tickets
         )
-        self._holding_port = self.DeclareVectorOutputPort(
+        self._command_timed_out_port = self.DeclareVectorOutputPort(
             "command_timed_out", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
         )
 
@@ -76,9 +76,9 @@ class CommandWatchdog(LeafSystem):
         """The commanded pose, or the held one, (O,)."""
         return self._safe_pose_port
 
-    def get_holding_output_port(self) -> OutputPort:
+    def get_command_timed_out_output_port(self) -> OutputPort:
         """1 while a pose is held, (1,)."""
-        return self._holding_port
+        return self._command_timed_out_port
 
     def _measured_pose(self, context: Context) -> np.ndarray:
         return self._pose_port.Eval(context)

@@ -24,10 +24,10 @@ class ContactDetector(LeafSystem):
         - contact_results
         output_ports:
         - collision
-        - touched
+        - has_collided
         - contact_force
 
-    ``contact_results`` is the plant's. ``collision`` is (1,): 1 while they are in contact; ``touched`` is (1,): 1 from
+    ``contact_results`` is the plant's. ``collision`` is (1,): 1 while they are in contact; ``has_collided`` is (1,): 1 from
     the first contact on; ``contact_force`` is (1,), the norm of the largest force between the two sets [N]. Point
     contact and hydroelastic contact both count.
     """
@@ -59,7 +59,7 @@ class ContactDetector(LeafSystem):
         self._contact_results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         self._collision, self._touched, self._contact_force = (self.DeclareDiscreteState(1) for _ in range(3))
         self._collision_port = self.DeclareStateOutputPort("collision", self._collision)
-        self._touched_port = self.DeclareStateOutputPort("touched", self._touched)
+        self._has_collided_port = self.DeclareStateOutputPort("has_collided", self._touched)
         self._contact_force_port = self.DeclareStateOutputPort("contact_force", self._contact_force)
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -72,9 +72,9 @@ class ContactDetector(LeafSystem):
         """1 while they are in contact, (1,)."""
         return self._collision_port
 
-    def get_touched_output_port(self) -> OutputPort:
+    def get_has_collided_output_port(self) -> OutputPort:
         """1 from the first contact of the episode on, (1,)."""
-        return self._touched_port
+        return self._has_collided_port
 
     def get_contact_force_output_port(self) -> OutputPort:
         """The largest force between the two sets, (1,) [N]."""

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, DiscreteValues, EventStatus, Inpu
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
-Law = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+GuidanceFunction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 class FunctionGuidanceSystem(LeafSystem):
@@ -35,7 +35,7 @@ class FunctionGuidanceSystem(LeafSystem):
     outputs are state: no input feeds through, so that a station's measured pose can close the loop.
     """
 
-    def __init__(self, law: Law, action_size: int, pose_size: int, wrench_size: int, period: float):
+    def __init__(self, law: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
         """
         Args:
             law: (action, pose, wrench) to a desired pose, a pure function: a reset can't restore a memory of its own.

@@ -1,4 +1,4 @@
-"""Watches whoever stands by at a robot, to stop it where commands stop."""
+"""Monitor of the heartbeat of a robot-side safety monitor."""
 
 import numpy as np
 from pydrake.common.value import Value
@@ -16,99 +16,98 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, Heartbeat
 from guiderail.systems.support.sampling import check_period
 
-# Entries of the state: the number of the last word, NaN before the first; and for how long there was no new one.
-_NUMBER, _SILENCE = range(2)
-
 
 class HeartbeatMonitor(LeafSystem):
-    """Adds to the faults of a robot's status that its deputy has stopped it, or has fallen silent.
+    """Raise a fault when the robot-side safety monitor reports a stop or its heartbeat times out.
 
-    A deputy that was never heard is not missed.
+    No fault is raised before the first heartbeat, so that a robot without a safety monitor can be used.
 
     .. pydrake_system::
 
         name: HeartbeatMonitor
         input_ports:
-        - word
+        - heartbeat
         - status_fault
         output_ports:
         - fault
 
-    ``word`` is an abstract value: the newest `Heartbeat`, or None. ``status_fault`` and ``fault`` are (1,), codes of
-    `Fault`; one of the status comes first.
+    ``heartbeat`` is abstract: the newest `Heartbeat`, or None. ``status_fault`` and ``fault`` are (1,), codes of
+    `Fault`; a status fault takes precedence.
     """
 
-    def __init__(self, *, period: float, command_timeout: float):
-        """
+    def __init__(self, *, period: float, timeout: float):
+        """Construct the monitor.
+
         Args:
-            period: at which is checked [s], positive.
-            patience: for how long a deputy may say nothing [s], positive.
+            period: Sampling period [s], positive.
+            timeout: Largest accepted age of a heartbeat [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         check_period(period)
-        if not 0.0 < command_timeout < np.inf:
-            raise InputError(f"the time for which a deputy may say nothing must be positive, not {command_timeout} s")
-        self._period, self._patience = period, command_timeout
-        self._word_port = self.DeclareAbstractInputPort("word", Value[object]())
+        if not 0.0 < timeout < np.inf:
+            raise InputError(f"the heartbeat timeout must be positive, not {timeout} s")
+        self._period, self._timeout = period, timeout
+        self._heartbeat_port = self.DeclareAbstractInputPort("heartbeat", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
-        self._memory = self.DeclareDiscreteState([np.nan, 0.0])
+        # [sequence number of the newest heartbeat, NaN before the first; time since that heartbeat in s]
+        self._state = self.DeclareDiscreteState([np.nan, 0.0])
         self._fault_port = self.DeclareVectorOutputPort(
             "fault",
             1,
             self._calc_fault,
             prerequisites_of_calc={
-                self._word_port.ticket(),
+                self._heartbeat_port.ticket(),
                 self._status_fault_port.ticket(),
-                self.discrete_state_ticket(self._memory),
+                self.discrete_state_ticket(self._state),
             },
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._forget)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_word_input_port(self) -> InputPort:
-        """The deputy's newest word, an abstract `Heartbeat`; any other object is none."""
-        return self._word_port
+    def get_heartbeat_input_port(self) -> InputPort:
+        """Return the port of the newest `Heartbeat`; any other object counts as none."""
+        return self._heartbeat_port
 
     def get_status_fault_input_port(self) -> InputPort:
-        """What is wrong with the status, (1,)."""
+        """Return the port of the status fault, (1,), a code of `Fault`."""
         return self._status_fault_port
 
     def get_fault_output_port(self) -> OutputPort:
-        """What is wrong with the status or the deputy, (1,): a code of `Fault`."""
+        """Return the port of the combined fault, (1,), a code of `Fault`."""
         return self._fault_port
 
-    def is_heard(self, context: Context) -> bool:
-        """Whether there was a word, and the last one is not too long ago."""
-        return self._word(context) is not None and not self._is_silent(context)
+    def is_alive(self, context: Context) -> bool:
+        """Return True if a heartbeat has been received and has not timed out."""
+        return self._heartbeat(context) is not None and not self._has_timed_out(context)
 
-    def _is_silent(self, context: Context) -> bool:
-        word = self._word(context)
-        number, silence = context.get_discrete_state(self._memory).value()
-        return word is not None and word.number == number and silence > self._patience
+    def _heartbeat(self, context: Context) -> Heartbeat | None:
+        value = self._heartbeat_port.Eval(context)
+        return value if isinstance(value, Heartbeat) else None
 
-    def _word(self, context: Context) -> Heartbeat | None:
-        found = self._word_port.Eval(context)
-        return found if isinstance(found, Heartbeat) else None
+    def _has_timed_out(self, context: Context) -> bool:
+        heartbeat = self._heartbeat(context)
+        last_sequence, age = context.get_discrete_state(self._state).value()
+        return heartbeat is not None and heartbeat.sequence == last_sequence and age > self._timeout
 
-    def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value([np.nan, 0.0])
         return EventStatus.Succeeded()
 
-    def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        word = self._word(context)
-        number, silence = context.get_discrete_state(self._memory).value()
-        if word is not None and word.number != number:
-            discrete_state.set_value([word.number, 0.0])
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        heartbeat = self._heartbeat(context)
+        last_sequence, age = context.get_discrete_state(self._state).value()
+        if heartbeat is not None and heartbeat.sequence != last_sequence:
+            discrete_state.set_value([heartbeat.sequence, 0.0])
         else:
-            discrete_state.set_value([number, silence + self._period])
+            discrete_state.set_value([last_sequence, age + self._period])
         return EventStatus.Succeeded()
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         fault = float(self._status_fault_port.Eval(context)[0])
-        word = self._word(context)
-        if fault == Fault.NONE and word is not None and (word.is_acting or self._is_silent(context)):
+        heartbeat = self._heartbeat(context)
+        if fault == Fault.NONE and heartbeat is not None and (heartbeat.is_stopping or self._has_timed_out(context)):
             fault = float(Fault.MONITOR_STOP)
         output.SetAtIndex(0, fault)

@@ -30,8 +30,8 @@ class _Command:
 class LcNsKmpSystem(LeafSystem):
     """Predicts the command of a linearly constrained null-space primitive (`LcNsKmp`) at every control step.
 
-        output = LC-NS-KMP(step, gain · null_space_action)             KGRL, equation 4.21
-        output = LC-NS-KMP(step, gain · null_space_action, history)    sKGRL, equation 5.1
+        command = LC-NS-KMP(step, gain · null_space_action)             KGRL, equation 4.21
+        command = LC-NS-KMP(step, gain · null_space_action, history)    sKGRL, equation 5.1
 
     .. pydrake_system::
 
@@ -41,14 +41,14 @@ class LcNsKmpSystem(LeafSystem):
         - history (where P > 0)
         - history_length (where there are primitives with shorter histories)
         output_ports:
-        - output
+        - command
         - constraint_violation
         - fallback
 
     ``null_space_action`` (O,) is the policy's, in [−1, 1] per output, held for a control step. ``history`` (P*O,) is
     row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the length of its
     history (`HistoryLengthSchedule`); each is given the newest part of ``history``, so that whichever is selected
-    begins where the last command ended. ``output`` (O,) is the command. ``constraint_violation`` (1,) is max(c − G y)
+    begins where the last command ended. ``command`` (O,) is the command. ``constraint_violation`` (1,) is max(c − G y)
     of that command: negative is slack, `UNCONSTRAINED` where there is no constraint. ``fallback`` (1,) is 1 where no
     window within the constraints was found: then it is what is nearest to the last command within its own step's.
 
@@ -119,8 +119,8 @@ class LcNsKmpSystem(LeafSystem):
         prerequisites |= {port.ticket() for port in (self._history_port, self._history_length_port) if port is not None}
         self._command = declare_cache(self, "command", self._calc_command, prerequisites_of_calc=prerequisites)
         command = {self._command.ticket()}
-        self._output_port = self.DeclareVectorOutputPort(
-            "output", outputs, self._calc_output, prerequisites_of_calc=command
+        self._command_port = self.DeclareVectorOutputPort(
+            "command", outputs, self._calc_output, prerequisites_of_calc=command
         )
         self._constraint_violation_port = self.DeclareVectorOutputPort(
             "constraint_violation", 1, self._calc_constraint_violation, prerequisites_of_calc=command
@@ -165,7 +165,7 @@ class LcNsKmpSystem(LeafSystem):
 
     def get_command_output_port(self) -> OutputPort:
         """The command, (O,)."""
-        return self._output_port
+        return self._command_port
 
     def get_constraint_violation_output_port(self) -> OutputPort:
         """max(c − G y) of the command, (1,)."""

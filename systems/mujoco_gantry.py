@@ -69,7 +69,7 @@ class _Nominal(NamedTuple):
     geom_solref: np.ndarray
 
 
-class MujocoRails(LeafSystem):
+class MujocoGantry(LeafSystem):
     """Steps a MuJoCo model whose first six joints are x, y, z, Rz, Ry, Rx of a tool in a target frame T.
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y

@@ -29,7 +29,7 @@ class PoseRateLimiter(LeafSystem):
         input_ports:
         - desired_pose
         - pose
-        - authority
+        - blend_factor
         output_ports:
         - limited_pose
 
@@ -54,7 +54,7 @@ class PoseRateLimiter(LeafSystem):
         self._step, self._angular_step = speed * period, angular_speed * period
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
-        self._authority_port = self.DeclareVectorInputPort("authority", 1)
+        self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
         self._last = self.DeclareDiscreteState(6)
         self._limited_pose_port = self.DeclareVectorOutputPort(
             "limited_pose",
@@ -63,7 +63,7 @@ class PoseRateLimiter(LeafSystem):
             prerequisites_of_calc={
                 self._desired_pose_port.ticket(),
                 self._pose_port.ticket(),
-                self._authority_port.ticket(),
+                self._blend_factor_port.ticket(),
                 self.discrete_state_ticket(self._last),
             },
         )
@@ -78,16 +78,16 @@ class PoseRateLimiter(LeafSystem):
         """The measured pose, (6,)."""
         return self._pose_port
 
-    def get_authority_input_port(self) -> InputPort:
+    def get_blend_factor_input_port(self) -> InputPort:
         """0 while the arm stands by, (1,)."""
-        return self._authority_port
+        return self._blend_factor_port
 
     def get_limited_pose_output_port(self) -> OutputPort:
         """Where the arm is told to be, (6,)."""
         return self._limited_pose_port
 
     def _limited_pose(self, context: Context) -> np.ndarray:
-        if self._authority_port.Eval(context)[0] <= 0.0:
+        if self._blend_factor_port.Eval(context)[0] <= 0.0:
             return self._pose_port.Eval(context)
         last = context.get_discrete_state(self._last).value()
         desired = self._desired_pose_port.Eval(context)

@@ -27,9 +27,9 @@ class SensorDisturbance(LeafSystem):
 
         name: SensorDisturbance
         input_ports:
-        - measured
+        - measurement
         output_ports:
-        - disturbed
+        - disturbed_measurement
 
     Both are (n,), in the sensor's units.
     """
@@ -58,10 +58,10 @@ class SensorDisturbance(LeafSystem):
         self._count = self.DeclareDiscreteState(1)
         self._newest = self.DeclareDiscreteState(size)  # n
         self._late = self.DeclareDiscreteState(delay * size) if delay else None  # the oldest first
-        self._measured_port = self.DeclareVectorInputPort("measured", size)
-        source = self._measured_port.ticket() if self._late is None else self.discrete_state_ticket(self._late)
-        self._disturbed_port = self.DeclareVectorOutputPort(
-            "disturbed",
+        self._measurement_port = self.DeclareVectorInputPort("measurement", size)
+        source = self._measurement_port.ticket() if self._late is None else self.discrete_state_ticket(self._late)
+        self._disturbed_measurement_port = self.DeclareVectorOutputPort(
+            "disturbed_measurement",
             size,
             self._calc_disturbed,
             prerequisites_of_calc={source, self.discrete_state_ticket(self._newest), self.all_parameters_ticket()},
@@ -69,13 +69,13 @@ class SensorDisturbance(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
-    def get_measured_input_port(self) -> InputPort:
+    def get_measurement_input_port(self) -> InputPort:
         """What the sensor should say, (n,)."""
-        return self._measured_port
+        return self._measurement_port
 
-    def get_disturbed_output_port(self) -> OutputPort:
+    def get_disturbed_measurement_output_port(self) -> OutputPort:
         """What it says, (n,)."""
-        return self._disturbed_port
+        return self._disturbed_measurement_port
 
     def set_error(self, context: Context, scale: np.ndarray, bias: np.ndarray, seed: int) -> None:
         """Sets s and b, (n,) each, and what the noise is drawn from; `context` is this system's own."""
@@ -99,13 +99,13 @@ class SensorDisturbance(LeafSystem):
             discrete_state.set_value(self._newest, drawn)
         if self._late is not None:
             late = context.get_discrete_state(self._late).value()
-            newest = self._measured_port.Eval(context)
+            newest = self._measurement_port.Eval(context)
             discrete_state.set_value(self._late, np.concatenate([late[len(newest) :], newest]))
         return EventStatus.Succeeded()
 
     def _calc_disturbed(self, context: Context, output: BasicVector) -> None:
         if self._late is None:
-            measured = self._measured_port.Eval(context)
+            measured = self._measurement_port.Eval(context)
         else:
             measured = context.get_discrete_state(self._late).value()[: len(self._noise)]
         scale, bias = (context.get_numeric_parameter(index).value() for index in (self._scale, self._bias))

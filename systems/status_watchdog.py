@@ -14,7 +14,7 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
-from guiderail.models.control.joint_status import Fault, Heard, JointStatus, StatusLimits, judge_status
+from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 from guiderail.systems.support.caching import declare_cache
 from guiderail.systems.support.sampling import check_period
 
@@ -49,7 +49,7 @@ class _Verdict:
 class StatusWatchdog(LeafSystem):
     """Judges every status of a robot, passes the last sound one on, and says what is wrong.
 
-    `judge_status` names the fault. A fault is reported until statuses have been sound for the settling time, so that
+    `check_status` names the fault. A fault is reported until statuses have been sound for the settling time, so that
     after a start, or after a driver's restart, nobody acts on the first one already. The two clocks are synchronized
     when the first status comes, after that by the statuses that come soonest, slowly where all come later, and anew
     after a fault or a silence: then the next status is judged by the one that was at fault, if its numbers were sound.
@@ -65,14 +65,14 @@ class StatusWatchdog(LeafSystem):
         - status
         - clock (optional)
         output_ports:
-        - state
+        - estimated_state
         - external_torque
         - fault
         - age
         - is_new
 
     ``status`` is an abstract value: the newest `JointStatus`, or None. ``clock`` is (1,), the time on the wall at this
-    check [s]; unconnected, each check is a period after the one before. ``state`` is (2n,), positions and velocities
+    check [s]; unconnected, each check is a period after the one before. ``estimated_state`` is (2n,), positions and velocities
     [rad, rad/s], and ``external_torque`` (n,) [Nm], both of the last sound status and zero before it. ``fault`` is
     (1,), a code of `Fault`. ``age`` is (1,), how old the last sound status is, by the soonest that came [s], and
     ``is_new`` (1,) is 1 at the check at which it came.
@@ -105,8 +105,8 @@ class StatusWatchdog(LeafSystem):
         }
         self._verdict = declare_cache(self, "verdict", self._judge, prerequisites_of_calc=tickets)
         verdict = {self._verdict.ticket()}
-        self._state_port = self.DeclareVectorOutputPort(
-            "state", 2 * num_joints, self._calc_state, prerequisites_of_calc=verdict
+        self._estimated_state_port = self.DeclareVectorOutputPort(
+            "estimated_state", 2 * num_joints, self._calc_estimated_state, prerequisites_of_calc=verdict
         )
         self._external_torque_port = self.DeclareVectorOutputPort(
             "external_torque", num_joints, self._calc_external_torque, prerequisites_of_calc=verdict
@@ -127,9 +127,9 @@ class StatusWatchdog(LeafSystem):
         """The time on the wall, (1,) [s]; optional."""
         return self._clock_port
 
-    def get_state_output_port(self) -> OutputPort:
+    def get_estimated_state_output_port(self) -> OutputPort:
         """Positions and velocities of the last sound status, (2n,) [rad, rad/s]."""
-        return self._state_port
+        return self._estimated_state_port
 
     def get_external_torque_output_port(self) -> OutputPort:
         """External torques of the last sound status, (n,) [Nm]."""
@@ -163,14 +163,14 @@ class StatusWatchdog(LeafSystem):
         found = self._status_port.Eval(context)
         status = found if isinstance(found, JointStatus) else None
         memory, values = self._memory_of(context), context.get_discrete_state(self._last).value()
-        last = Heard(float(memory[_TIME]), float(memory[_OFFSET]), values)
+        last = LastStatus(float(memory[_TIME]), float(memory[_OFFSET]), values)
         believed = context.get_discrete_state(self._believed).value().copy()
         now, is_known = self._now(context), not np.isfinite(memory[_DOUBTED_AT])
-        known = Heard(float(memory[_KNOWN_TIME]), float(memory[_KNOWN_OFFSET]), believed)
+        known = LastStatus(float(memory[_KNOWN_TIME]), float(memory[_KNOWN_OFFSET]), believed)
         if status is not None and not is_known and self._agrees(status, known, now):
             last, is_known = known, True
-        fault = judge_status(status, last, now, self._limits)
-        if not fault and now - memory[_CLOCK] > self._limits.max_gap:
+        fault = check_status(status, last, now, self._limits)
+        if not fault and now - memory[_CLOCK] > self._limits.max_check_interval:
             fault = Fault.DEADLINE_MISSED
         since = memory[_KNOWN_TIME] + memory[_KNOWN_OFFSET]
         age = max(now - since, 0.0) if np.isfinite(since) else now
@@ -185,10 +185,10 @@ class StatusWatchdog(LeafSystem):
             age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0
         return _Verdict(fault, is_new, is_believed, believed, age, last.offset)
 
-    def _agrees(self, status: JointStatus, known: Heard, now: float) -> bool:
+    def _agrees(self, status: JointStatus, known: LastStatus, now: float) -> bool:
         """Whether a status is sound and fresh by what was known."""
         is_fresh = status.time > known.time and now - (status.time + known.offset) <= _FRESH * self._limits.max_age
-        return is_fresh and judge_status(status, known, now, self._limits) == Fault.NONE
+        return is_fresh and check_status(status, known, now, self._limits) == Fault.NONE
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._memory, _FORGOTTEN)
@@ -218,16 +218,16 @@ class StatusWatchdog(LeafSystem):
         memory[_TOLD] = self._clock_port.Eval(context)[0] if self._clock_port.HasValue(context) else np.nan
         if verdict.fault:
             memory[_FAULT], memory[_FAULT_AT] = verdict.fault, now
-        elif memory[_CLOCK] - memory[_FAULT_AT] > self._limits.settling:
+        elif memory[_CLOCK] - memory[_FAULT_AT] > self._limits.settling_time:
             memory[_FAULT] = Fault.NONE
         if verdict.fault in _DOUBTFUL:
             memory[_DOUBTED_AT] = now
-        elif memory[_CLOCK] - memory[_DOUBTED_AT] > self._limits.settling:
+        elif memory[_CLOCK] - memory[_DOUBTED_AT] > self._limits.settling_time:
             memory[_DOUBTED_AT] = np.nan
         discrete_state.set_value(self._memory, memory)
         return EventStatus.Succeeded()
 
-    def _calc_state(self, context: Context, output: BasicVector) -> None:
+    def _calc_estimated_state(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._verdict.Eval(context).believed[: 2 * self._num_joints])
 
     def _calc_external_torque(self, context: Context, output: BasicVector) -> None:

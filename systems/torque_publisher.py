@@ -18,9 +18,9 @@ class TorquePublisher(LeafSystem):
         name: TorquePublisher
         input_ports:
         - torque
-        - sending
+        - is_sending
 
-    ``torque`` is (n,) [Nm]. ``sending`` is (1,): nothing goes out while it is 0.
+    ``torque`` is (n,) [Nm]. ``is_sending`` is (1,): nothing goes out while it is 0.
     """
 
     def __init__(
@@ -49,18 +49,18 @@ class TorquePublisher(LeafSystem):
             raise InputError(f"torques are sent to at least one joint, not {num_joints}")
         self._lcm, self._channel, self._encode = lcm, channel, encode
         self._torque_port = self.DeclareVectorInputPort("torque", num_joints)
-        self._sending_port = self.DeclareVectorInputPort("sending", 1)
+        self._is_sending_port = self.DeclareVectorInputPort("is_sending", 1)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
 
     def get_torque_input_port(self) -> InputPort:
         """What is sent, (n,) [Nm]."""
         return self._torque_port
 
-    def get_sending_input_port(self) -> InputPort:
+    def get_is_sending_input_port(self) -> InputPort:
         """0 while nothing is sent, (1,)."""
-        return self._sending_port
+        return self._is_sending_port
 
     def _publish(self, context: Context) -> EventStatus:
-        if self._sending_port.Eval(context)[0] > 0.0:
+        if self._is_sending_port.Eval(context)[0] > 0.0:
             self._lcm.Publish(self._channel, self._encode(context.get_time(), self._torque_port.Eval(context)))
         return EventStatus.Succeeded()

@@ -16,7 +16,7 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import FAULTS, Fault, damping_torque
+from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault, damping_torque
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
 from guiderail.systems.support.sampling import check_period
 
@@ -72,7 +72,7 @@ class SafetyLimits:
             raise InputError(f"a workspace from {self.lower} to {self.upper} holds nothing")
 
 
-OLDEST_SPEED = 0.1  # [s] after which nobody knows how fast an arm is
+MAX_VELOCITY_AGE = 0.1  # [s] after which nobody knows how fast an arm is
 
 
 class TorqueSafetyLimiter(LeafSystem):
@@ -97,7 +97,7 @@ class TorqueSafetyLimiter(LeafSystem):
         name: TorqueSafetyLimiter
         input_ports:
         - torque
-        - state
+        - estimated_state
         - external_torque
         - wrench
         - pose
@@ -105,21 +105,21 @@ class TorqueSafetyLimiter(LeafSystem):
         - status_fault
         - status_age
         - status_is_new
-        - holding
+        - command_timed_out
         output_ports:
         - safe_torque
         - fault
-        - phase
-        - authority
-        - sending
+        - arm_state
+        - blend_factor
+        - is_sending
         - not_following
 
-    ``torque`` and ``safe_torque`` are (n,) [Nm], ``state`` (2n,), ``external_torque`` (n,) [Nm], ``wrench`` (6,), force
+    ``torque`` and ``safe_torque`` are (n,) [Nm], ``estimated_state`` (2n,), ``external_torque`` (n,) [Nm], ``wrench`` (6,), force
     first. ``pose`` and ``desired_pose`` are (6,), of which the positions are watched. ``status_fault``, ``status_age``
     and ``status_is_new`` are (1,), a `StatusWatchdog`'s. ``command_timed_out`` is (1,): 1 while a command watchdog holds.
 
-    ``fault`` is (1,), a code of `Fault`: why the arm is stopped, or 0. ``phase`` is (1,), a number of `Phase`, and
-    ``blend_factor`` (1,). ``sending`` is (1,): 1 while commands may go out. ``not_following`` is (1,): 1 while the arm
+    ``fault`` is (1,), a code of `Fault`: why the arm is stopped, or 0. ``arm_state`` is (1,), a number of `ArmState`, and
+    ``blend_factor`` (1,). ``is_sending`` is (1,): 1 while commands may go out. ``not_following`` is (1,): 1 while the arm
     isn't told to go where it is commanded, as it is stopped, takes over, or a command watchdog holds.
     """
 
@@ -144,7 +144,7 @@ class TorqueSafetyLimiter(LeafSystem):
         self._torque_limits = np.array(limits.torque)
 
         self._torque_port = self.DeclareVectorInputPort("torque", num_joints)
-        self._state_port = self.DeclareVectorInputPort("state", 2 * num_joints)
+        self._estimated_state_port = self.DeclareVectorInputPort("estimated_state", 2 * num_joints)
         self._external_torque_port = self.DeclareVectorInputPort("external_torque", num_joints)
         self._wrench_port = self.DeclareVectorInputPort("wrench", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
@@ -152,7 +152,7 @@ class TorqueSafetyLimiter(LeafSystem):
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._status_is_new_port = self.DeclareVectorInputPort("status_is_new", 1)
-        self._holding_port = self.DeclareVectorInputPort("command_timed_out", 1)
+        self._command_timed_out_port = self.DeclareVectorInputPort("command_timed_out", 1)
         self._memory = self.DeclareDiscreteState(4)
         self._given = self.DeclareDiscreteState(num_joints)  # momentum since the last status [Nms]
 
@@ -160,7 +160,7 @@ class TorqueSafetyLimiter(LeafSystem):
         measured = {
             port.ticket()
             for port in (
-                self._state_port,
+                self._estimated_state_port,
                 self._external_torque_port,
                 self._wrench_port,
                 self._pose_port,
@@ -168,7 +168,7 @@ class TorqueSafetyLimiter(LeafSystem):
             )
         }
         self._plant_context = declare_plant_context(
-            self, plant, self._set_plant_state, prerequisites_of_calc={self._state_port.ticket()}
+            self, plant, self._set_plant_state, prerequisites_of_calc={self._estimated_state_port.ticket()}
         )
         self._found = declare_cache(
             self,
@@ -187,22 +187,27 @@ class TorqueSafetyLimiter(LeafSystem):
             prerequisites_of_calc=found
             | memory
             | fault
-            | {self._torque_port.ticket(), self._state_port.ticket()}
+            | {self._torque_port.ticket(), self._estimated_state_port.ticket()}
             | {self._status_age_port.ticket(), self._status_is_new_port.ticket()}
             | {self.discrete_state_ticket(self._given)},
         )
         self._fault_port = self.DeclareVectorOutputPort(
             "fault", 1, self._calc_fault, prerequisites_of_calc=found | memory
         )
-        self._phase_port = self.DeclareVectorOutputPort("phase", 1, self._calc_phase, prerequisites_of_calc=memory)
-        self._authority_port = self.DeclareVectorOutputPort(
-            "authority", 1, self._calc_authority, prerequisites_of_calc=memory
+        self._arm_state_port = self.DeclareVectorOutputPort(
+            "arm_state", 1, self._calc_phase, prerequisites_of_calc=memory
         )
-        self._sending_port = self.DeclareVectorOutputPort(
-            "sending", 1, self._calc_sending, prerequisites_of_calc=memory | fault
+        self._blend_factor_port = self.DeclareVectorOutputPort(
+            "blend_factor", 1, self._calc_authority, prerequisites_of_calc=memory
+        )
+        self._is_sending_port = self.DeclareVectorOutputPort(
+            "is_sending", 1, self._calc_sending, prerequisites_of_calc=memory | fault
         )
         self._not_following_port = self.DeclareVectorOutputPort(
-            "not_following", 1, self._calc_not_following, prerequisites_of_calc=memory | {self._holding_port.ticket()}
+            "not_following",
+            1,
+            self._calc_not_following,
+            prerequisites_of_calc=memory | {self._command_timed_out_port.ticket()},
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._forget)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -211,9 +216,9 @@ class TorqueSafetyLimiter(LeafSystem):
         """The wanted torques, (n,) [Nm]."""
         return self._torque_port
 
-    def get_state_input_port(self) -> InputPort:
+    def get_estimated_state_input_port(self) -> InputPort:
         """Joint positions and velocities, (2n,) [rad, rad/s]."""
-        return self._state_port
+        return self._estimated_state_port
 
     def get_external_torque_input_port(self) -> InputPort:
         """With which the surroundings load the joints, (n,) [Nm]."""
@@ -243,9 +248,9 @@ class TorqueSafetyLimiter(LeafSystem):
         """1 where a status has just come, (1,)."""
         return self._status_is_new_port
 
-    def get_holding_input_port(self) -> InputPort:
+    def get_command_timed_out_input_port(self) -> InputPort:
         """1 while a command watchdog holds, (1,)."""
-        return self._holding_port
+        return self._command_timed_out_port
 
     def get_safe_torque_output_port(self) -> OutputPort:
         """What may be sent, (n,) [Nm]."""
@@ -255,17 +260,17 @@ class TorqueSafetyLimiter(LeafSystem):
         """Why the arm is stopped, (1,): a code of `Fault`."""
         return self._fault_port
 
-    def get_phase_output_port(self) -> OutputPort:
+    def get_arm_state_output_port(self) -> OutputPort:
         """What the arm does, (1,): a number of `ArmState`."""
-        return self._phase_port
+        return self._arm_state_port
 
-    def get_authority_output_port(self) -> OutputPort:
+    def get_blend_factor_output_port(self) -> OutputPort:
         """The share of the wanted torques, (1,), from 0 to 1."""
-        return self._authority_port
+        return self._blend_factor_port
 
-    def get_sending_output_port(self) -> OutputPort:
+    def get_is_sending_output_port(self) -> OutputPort:
         """1 while commands may go out, (1,)."""
-        return self._sending_port
+        return self._is_sending_port
 
     def get_not_following_output_port(self) -> OutputPort:
         """1 while the arm isn't told to go where it is commanded, (1,)."""
@@ -293,11 +298,11 @@ class TorqueSafetyLimiter(LeafSystem):
             )
         found = self._found.Eval(context)
         if found:
-            raise InputError(f"the arm can't go on yet: {FAULTS[found]}")
+            raise InputError(f"the arm can't go on yet: {FAULT_DESCRIPTIONS[found]}")
         context.SetDiscreteState(self._memory, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
-        self._plant.SetPositionsAndVelocities(plant_context, self._state_port.Eval(context))
+        self._plant.SetPositionsAndVelocities(plant_context, self._estimated_state_port.Eval(context))
 
     def _memory_of(self, context: Context) -> np.ndarray:
         return context.get_discrete_state(self._memory).value()
@@ -311,23 +316,23 @@ class TorqueSafetyLimiter(LeafSystem):
         # Asked this way round, what is no number is never within a limit.
         if not self._status_age_port.Eval(context)[0] <= np.inf:
             return Fault.STALE
-        state = self._state_port.Eval(context)
+        state = self._estimated_state_port.Eval(context)
         if not np.isfinite(state).all():
             return Fault.NOT_FINITE
         if not (np.abs(state[n:]) <= limits.velocity).all():
-            return Fault.VELOCITY
+            return Fault.VELOCITY_LIMIT
         places = [self._pose_port.Eval(context)[:3]]
         if self._memory_of(context)[_PHASE] in (ArmState.RAMPING, ArmState.RUNNING):
             places.append(self._desired_pose_port.Eval(context)[:3])
         for place in places:
             if not ((place >= limits.lower) & (place <= limits.upper)).all():
-                return Fault.WORKSPACE
+                return Fault.WORKSPACE_LIMIT
         if not np.linalg.norm(self._wrench_port.Eval(context)[:3]) <= limits.force:
-            return Fault.FORCE
+            return Fault.FORCE_LIMIT
         if not (np.abs(self._external_torque_port.Eval(context)) <= limits.external_torque).all():
-            return Fault.EXTERNAL_TORQUE
+            return Fault.EXTERNAL_TORQUE_LIMIT
         if not np.isfinite(self._torque_port.Eval(context)).all():
-            return Fault.TORQUE
+            return Fault.TORQUE_NOT_FINITE
         return Fault.NONE
 
     def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -391,22 +396,22 @@ class TorqueSafetyLimiter(LeafSystem):
         is_new = self._status_is_new_port.Eval(context)[0] > 0.0
         return np.zeros(self._num_joints) if is_new else context.get_discrete_state(self._given).value().copy()
 
-    def _damping_torque(self, context: Context, damped: float) -> np.ndarray:
-        """What takes the speed away that was seen last, `damped` being for how long the arm has been damped [s].
+    def _damping_torque(self, context: Context, elapsed: float) -> np.ndarray:
+        """What takes the speed away that was seen last, `elapsed` being for how long the arm has been damped [s].
 
         Nothing where that speed was old when the damping began: whoever was held up himself knows no speed, and
         somebody else may have stopped the arm meanwhile. Nothing either where it, its age or the posture is no number.
         """
         age = float(self._status_age_port.Eval(context)[0])
-        state = self._state_port.Eval(context)
-        if (np.isfinite(damped) and not age - damped <= OLDEST_SPEED) or not np.isfinite(state).all():
+        state = self._estimated_state_port.Eval(context)
+        if (np.isfinite(elapsed) and not age - elapsed <= MAX_VELOCITY_AGE) or not np.isfinite(state).all():
             return np.zeros(self._num_joints)
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
         v = state[self._num_joints :]
-        if np.isfinite(damped):
+        if np.isfinite(elapsed):
             v = v + np.linalg.solve(M, self._given_until_now(context))
-        damped = min(age, damped)
-        return damping_torque(M, v, self._limits.decay_time, period=self._period, damped=damped)
+        elapsed = min(age, elapsed)
+        return damping_torque(M, v, self._limits.decay_time, period=self._period, elapsed=elapsed)
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
         phase, fault, _, _ = self._memory_of(context)
@@ -427,5 +432,5 @@ class TorqueSafetyLimiter(LeafSystem):
         output.SetAtIndex(0, float(is_sending))
 
     def _calc_not_following(self, context: Context, output: BasicVector) -> None:
-        holds = self._holding_port.Eval(context)[0] > 0.0
+        holds = self._command_timed_out_port.Eval(context)[0] > 0.0
         output.SetAtIndex(0, float(holds or self._memory_of(context)[_PHASE] != ArmState.RUNNING))

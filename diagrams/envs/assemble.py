@@ -270,7 +270,7 @@ def build_task_diagram(
         "wrench": station.get_wrench_output_port(),
         "saturation": station.get_saturation_output_port(),
         "collision": too_much.get_output_port(),
-        "command_timed_out": station.get_holding_output_port(),
+        "command_timed_out": station.get_command_timed_out_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
     taken = {*exported, *SAID, *RECORDED}

@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, Law
+from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, GuidanceFunction
 
 
 class FunctionGuidance(Guidance):
@@ -16,7 +16,7 @@ class FunctionGuidance(Guidance):
     Nothing is constrained by it: ``constraint_violation`` says by how much the law left the task's constraints.
     """
 
-    def __init__(self, known: PriorKnowledge, law: Law, action_size: int):
+    def __init__(self, known: PriorKnowledge, law: GuidanceFunction, action_size: int):
         """
         Args:
             known: for the control period, the station's sizes and the task's constraints.

@@ -17,7 +17,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.hardware.driver import MICROSECOND, STATUS_PERIOD, Driver
 from guiderail.diagrams.hardware.monitor import word_channel
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import MISSED
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
 
 TAKEN = "_TAKEN"  # what the channel is called on which a status's receiver answers a simulated robot
 REPEAT = 0.05  # [s] of wall clock, after which a simulated robot repeats a status that wasn't answered
@@ -347,7 +347,7 @@ def serve_in_real_time(
         simulator.AdvanceTo(step * driver.period)
         attend()
         behind = (time.monotonic() - started) * rate - step * driver.period
-        if behind > MISSED * driver.period and not has_said:
+        if behind > MAX_MISSED_MESSAGES * driver.period and not has_said:
             say(
                 f"this machine is too slow, or too busy, for a simulated robot whose clock goes at {rate:g} of the "
                 f"wall's: it is {behind:.2f} s behind; give a smaller --rate, or --lockstep"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.models.control.joint_status import UNREADABLE, JointStatus
+from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 
 MICROSECOND = 1e-6  # [s]
 STATUS_PERIOD = CONTROL_PERIOD / 4  # [s]: 5 ms, what drivers on LCM have; a control period is a multiple to the bit
@@ -48,14 +48,14 @@ class Driver:
     period: float = STATUS_PERIOD
 
     def decode(self, message: bytes) -> JointStatus:
-        """What a message says; `UNREADABLE` where it can't be read."""
+        """What a message says; `MALFORMED_STATUS` where it can't be read."""
         try:
             status = self.status_type.decode(message)
             positions, velocities, external = (
                 np.array(getattr(status, name), dtype=float) for name in self.status_fields
             )
         except (ValueError, struct.error, OverflowError):
-            return UNREADABLE
+            return MALFORMED_STATUS
         return JointStatus(status.utime * MICROSECOND, positions, velocities, self.external_torque_sign * external)
 
     def decode_command(self, message: bytes) -> np.ndarray | None:

@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.lcm import SerializerInterface
 
 from guiderail.diagrams.hardware.driver import Driver
-from guiderail.models.control.joint_status import MISSED, Heartbeat, JointStatus, damping_torque
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Heartbeat, JointStatus, damping_torque
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimits
 
 _WORD = struct.Struct(">q?")
@@ -79,7 +79,7 @@ class SafetyMonitor:
         """
         self.duty = MonitorState.IDLE
         self._lcm, self._driver, self._plant, self._limits = lcm, driver, plant, limits
-        self._silence = MISSED * driver.period if silence is None else silence
+        self._silence = MAX_MISSED_MESSAGES * driver.period if silence is None else silence
         self._context = plant.CreateDefaultContext()
         self._now = self._commanded_at = self._since = -np.inf
         self._has_torque = False

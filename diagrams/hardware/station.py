@@ -37,7 +37,7 @@ from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.parsing import follow_directives
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.control.joint_status import MISSED, StatusLimits
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, StatusLimits
 from guiderail.models.robots.iiwa import IIWA14
 from guiderail.models.robots.panda import PANDA
 from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector, Robot, find_robot
@@ -169,7 +169,7 @@ class HardwareStation(Station):
     output                 size   meaning
     =====================  =====  =====================================================================================
     `fault`                1      why the arm is stopped: a code of `Fault`
-    `phase`                1      what it does: a number of `ArmState`
+    `arm_state`            1      what it does: a number of `ArmState`
     `position_measured`    n      of the joints [rad]
     `velocity_estimated`   n      [rad/s]
     `state_estimated`      2n     both
@@ -237,7 +237,7 @@ class HardwareStation(Station):
         )
         # A deputy speaks as often as the robot; it may be late by as much again.
         self._deputy = deputy = builder.AddNamedSystem(
-            "deputy", HeartbeatMonitor(period=period, command_timeout=2.0 * MISSED * period)
+            "deputy", HeartbeatMonitor(period=period, timeout=2.0 * MAX_MISSED_MESSAGES * period)
         )
         positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(num_joints, 2 * num_joints)))
         velocities = builder.AddNamedSystem("velocities", MatrixGain(np.eye(num_joints, 2 * num_joints, num_joints)))
@@ -259,35 +259,35 @@ class HardwareStation(Station):
             "command_publisher",
             TorquePublisher(bus, driver.command_channel, driver.encode, num_joints, period=period),
         )
-        state, external_torque = status.get_state_output_port(), status.get_external_torque_output_port()
+        state, external_torque = status.get_estimated_state_output_port(), status.get_external_torque_output_port()
         pose = controller.get_pose_output_port()
         for source, target in (
             (subscriber.get_output_port(), status.get_status_input_port()),
             (state, positions.get_input_port()),
             (state, velocities.get_input_port()),
-            (state, controller.get_state_input_port()),
+            (state, controller.get_estimated_state_input_port()),
             (positions.get_output_port(), wrench.get_positions_input_port()),
             (external_torque, wrench.get_external_torque_input_port()),
             (pose, watchdog.get_pose_input_port()),
             (watchdog.get_safe_pose_output_port(), ramp.get_desired_pose_input_port()),
             (pose, ramp.get_pose_input_port()),
-            (guard.get_authority_output_port(), ramp.get_authority_input_port()),
+            (guard.get_blend_factor_output_port(), ramp.get_blend_factor_input_port()),
             (ramp.get_limited_pose_output_port(), controller.get_desired_pose_input_port()),
             (controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port()),
-            (controller.get_torque_output_port(), guard.get_torque_input_port()),
-            (state, guard.get_state_input_port()),
+            (controller.get_generalized_force_output_port(), guard.get_torque_input_port()),
+            (state, guard.get_estimated_state_input_port()),
             (external_torque, guard.get_external_torque_input_port()),
             (wrench.get_wrench_output_port(), guard.get_wrench_input_port()),
             (pose, guard.get_pose_input_port()),
             (watchdog.get_safe_pose_output_port(), guard.get_desired_pose_input_port()),
             (status.get_fault_output_port(), deputy.get_status_fault_input_port()),
-            (words.get_output_port(), deputy.get_word_input_port()),
+            (words.get_output_port(), deputy.get_heartbeat_input_port()),
             (deputy.get_fault_output_port(), guard.get_status_fault_input_port()),
             (status.get_age_output_port(), guard.get_status_age_input_port()),
             (status.get_is_new_output_port(), guard.get_status_is_new_input_port()),
-            (watchdog.get_holding_output_port(), guard.get_holding_input_port()),
+            (watchdog.get_command_timed_out_output_port(), guard.get_command_timed_out_input_port()),
             (guard.get_safe_torque_output_port(), publisher.get_torque_input_port()),
-            (guard.get_sending_output_port(), publisher.get_sending_input_port()),
+            (guard.get_is_sending_output_port(), publisher.get_is_sending_input_port()),
         ):
             builder.Connect(source, target)
         export_station_ports(
@@ -301,7 +301,7 @@ class HardwareStation(Station):
             command_timed_out=guard.get_not_following_output_port(),
         )
         builder.ExportOutput(guard.get_fault_output_port(), "fault")
-        builder.ExportOutput(guard.get_phase_output_port(), "phase")
+        builder.ExportOutput(guard.get_arm_state_output_port(), "arm_state")
         for name, port in (
             ("position_measured", positions.get_output_port()),
             ("velocity_estimated", velocities.get_output_port()),
@@ -316,9 +316,9 @@ class HardwareStation(Station):
         """Why the arm is stopped, (1,): a code of `Fault`."""
         return self.GetOutputPort("fault")
 
-    def get_phase_output_port(self):
+    def get_arm_state_output_port(self):
         """What the arm does, (1,): a number of `ArmState`."""
-        return self.GetOutputPort("phase")
+        return self.GetOutputPort("arm_state")
 
     def start(self, simulator: Simulator) -> None:
         """Initializes a simulator that runs this station: waits for the robot, and holds where it is.
@@ -357,7 +357,7 @@ class HardwareStation(Station):
 
     def has_safety_monitor(self, context: Context) -> bool:
         """Whether somebody stands by at the robot, and still speaks; `context` is this station's own."""
-        return self._deputy.is_heard(self.GetSubsystemContext(self._deputy, context))
+        return self._deputy.is_alive(self.GetSubsystemContext(self._deputy, context))
 
     def copy_state_from(self, context: Context, before: Context) -> None:
         """Goes on as another station of the same arm left off: nothing is waited for, and the arm is not let go.

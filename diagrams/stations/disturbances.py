@@ -112,13 +112,18 @@ class DisturbedStation(Station):
             "wrench", SensorDisturbance(period, np.repeat(d.wrench_noise, 3), d.wrench_delay)
         )
         self._pose = pose = builder.AddNamedSystem("pose", SensorDisturbance(period, np.zeros(POSE_SIZE)))
-        builder.Connect(commands.get_delivered_output_port(), station.get_desired_pose_input_port())
+        builder.Connect(commands.get_delivered_command_output_port(), station.get_desired_pose_input_port())
         builder.Connect(station.get_pose_output_port(), commands.get_pose_input_port())
-        builder.Connect(station.get_wrench_output_port(), wrench.get_measured_input_port())
-        builder.Connect(station.get_pose_output_port(), pose.get_measured_input_port())
+        builder.Connect(station.get_wrench_output_port(), wrench.get_measurement_input_port())
+        builder.Connect(station.get_pose_output_port(), pose.get_measurement_input_port())
         outputs = {name: station.GetOutputPort(name) for name in OUTPUTS}
-        outputs |= {"pose": pose.get_disturbed_output_port(), "wrench": wrench.get_disturbed_output_port()}
-        export_station_ports(builder, commands.get_sent_input_port(), station.get_command_time_input_port(), **outputs)
+        outputs |= {
+            "pose": pose.get_disturbed_measurement_output_port(),
+            "wrench": wrench.get_disturbed_measurement_output_port(),
+        }
+        export_station_ports(
+            builder, commands.get_command_input_port(), station.get_command_time_input_port(), **outputs
+        )
         for name in SIMULATION_PORTS:
             builder.ExportOutput(station.GetOutputPort(name), name)
         builder.BuildInto(self)

@@ -209,7 +209,7 @@ def _add_joint_control(
         wrench=wrench,
         contact_force=monitor.get_contact_force_output_port(),
         saturation=monitor.get_saturation_output_port(),
-        command_timed_out=watchdog.get_holding_output_port(),
+        command_timed_out=watchdog.get_command_timed_out_output_port(),
     )
 
 

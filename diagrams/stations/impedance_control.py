@@ -85,7 +85,7 @@ def add_impedance_control(
     controller, monitor = add_controller(
         builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity
     )
-    builder.Connect(state, controller.get_state_input_port())
+    builder.Connect(state, controller.get_estimated_state_input_port())
     builder.Connect(controller.get_impedance_wrench_output_port(), monitor.get_impedance_wrench_input_port())
     export_station_ports(
         builder,
@@ -95,6 +95,6 @@ def add_impedance_control(
         wrench=wrench,
         contact_force=monitor.get_contact_force_output_port(),
         saturation=controller.get_saturation_output_port(),
-        command_timed_out=controller.get_holding_output_port(),
+        command_timed_out=controller.get_command_timed_out_output_port(),
     )
-    return controller.get_torque_output_port()
+    return controller.get_generalized_force_output_port()

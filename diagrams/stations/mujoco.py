@@ -28,7 +28,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects.surfaces import Cylinder, Hull, Surface
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
-from guiderail.systems.mujoco_gantry import MovedBodies, MujocoRails, mujoco_engine
+from guiderail.systems.mujoco_gantry import MovedBodies, MujocoGantry, mujoco_engine
 
 if TYPE_CHECKING:
     import mujoco
@@ -203,7 +203,7 @@ class MujocoStation(Station):
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
         surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
-        gantry = MujocoRails(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
+        gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
         self.gantry = builder.AddNamedSystem("gantry", gantry)
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
         monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
@@ -222,7 +222,7 @@ class MujocoStation(Station):
             wrench=gantry.get_wrench_output_port(),
             contact_force=monitor.get_contact_force_output_port(),
             saturation=monitor.get_saturation_output_port(),
-            command_timed_out=watchdog.get_holding_output_port(),
+            command_timed_out=watchdog.get_command_timed_out_output_port(),
         )
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.ExportOutput(gantry.get_body_poses_output_port(), "body_poses")

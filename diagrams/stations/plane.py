@@ -143,7 +143,7 @@ class PlaneStation(Station):
             wrench=mean_force.get_force_output_port(),
             contact_force=mean_force.get_magnitude_output_port(),
             saturation=excess.get_output_port(),
-            command_timed_out=watchdog.get_holding_output_port(),
+            command_timed_out=watchdog.get_command_timed_out_output_port(),
         )
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)

@@ -125,7 +125,7 @@ class PouringStation(Station):
         - wrench
         - contact_force
         - saturation
-        - holding
+        - command_timed_out
         - tip_in_mug
         - balls_in_mug
         - balls_in_thermos
@@ -226,14 +226,14 @@ class PouringStation(Station):
             wrench=sensor.get_wrench_output_port(),
             contact_force=watch.get_contact_force_output_port(),
             saturation=controller.get_stuck_output_port(),
-            command_timed_out=controller.get_holding_output_port(),
+            command_timed_out=controller.get_command_timed_out_output_port(),
         )
         for name, system in seen:
             builder.AddNamedSystem(name, system)
             builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
             builder.ExportOutput(system.get_relative_poses_output_port(), name)
         builder.ExportOutput(watch.get_collision_output_port(), "collision")
-        builder.ExportOutput(watch.get_touched_output_port(), "touched")
+        builder.ExportOutput(watch.get_has_collided_output_port(), "touched")
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.BuildInto(self)
 

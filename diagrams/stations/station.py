@@ -149,7 +149,7 @@ class Station(Diagram):
         """1 while the controller is at a limit, (1,)."""
         return self.GetOutputPort("saturation")
 
-    def get_holding_output_port(self):
+    def get_command_timed_out_output_port(self):
         """1 while the last safe pose is held, (1,)."""
         return self.GetOutputPort("command_timed_out")
 

@@ -1,4 +1,4 @@
-"""What a robot's driver says of its joints, whether it may be believed, and what may stop an arm."""
+"""Joint status of a robot arm: messages, plausibility checks, fault codes and damping torques."""
 
 from __future__ import annotations
 
@@ -10,30 +10,34 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 
+MAX_MISSED_MESSAGES = 6  # consecutive status messages that may be missing before the arm is stopped
+
 
 def damping_torque(
-    M: np.ndarray, v: np.ndarray, decay_time: float, *, period: float, damped: float = 0.0
+    M: np.ndarray, v: np.ndarray, decay_time: float, *, period: float, elapsed: float = 0.0
 ) -> np.ndarray:
-    """τ = −M(q) v exp(−t / T) (1 − exp(−h / T)) / h, which takes away all joints' speed with the decay time T.
+    """Compute the torque that damps all joint velocities with one decay time.
 
-    Held for each period h, these torques add up to exactly the momentum that the arm had: where its speed is not seen
-    any more, nothing is driven backwards by one that is long gone.
+        τ = −M(q) v exp(−t / T) (1 − exp(−h / T)) / h
+
+    Each torque is held for a period h. The impulses add up to exactly the momentum M v, so a stale velocity measurement
+    cannot drive a joint backwards.
 
     Args:
-        M: mass matrix, (n, n).
-        v: joint velocities as they were, (n,) [rad/s].
+        M: Mass matrix, (n, n).
+        v: Joint velocities when damping began, (n,) [rad/s].
         decay_time: T [s].
-        period: h, for which a torque is held [s].
-        damped: t, for how long the arm has been damped since it had these velocities [s].
+        period: h [s].
+        elapsed: t, the time since damping began [s].
+
+    Returns:
+        Joint torques, (n,) [Nm].
     """
-    return -(M @ v) * (np.exp(-damped / decay_time) * -np.expm1(-period / decay_time) / period)
-
-
-MISSED = 6  # messages in a row without which nobody goes on
+    return -(M @ v) * (np.exp(-elapsed / decay_time) * -np.expm1(-period / decay_time) / period)
 
 
 class Fault(IntEnum):
-    """Why an arm stops. The first that holds counts."""
+    """Reason for stopping the arm, in order of precedence."""
 
     NONE = 0
     NO_STATUS = 1
@@ -45,46 +49,48 @@ class Fault(IntEnum):
     NOT_FINITE = 7
     POSITION_JUMP = 8
     VELOCITY_JUMP = 9
-    VELOCITY = 10
-    WORKSPACE = 11
-    FORCE = 12
-    EXTERNAL_TORQUE = 13
-    TORQUE = 14
+    VELOCITY_LIMIT = 10
+    WORKSPACE_LIMIT = 11
+    FORCE_LIMIT = 12
+    EXTERNAL_TORQUE_LIMIT = 13
+    TORQUE_NOT_FINITE = 14
     USER_STOP = 15
     DEADLINE_MISSED = 16
     MONITOR_STOP = 17
 
 
-FAULTS = {
-    Fault.NONE: "none",
-    Fault.NO_STATUS: "no status has come, or not for long enough",
-    Fault.STALE: "the status is old: it stopped, or comes late",
-    Fault.OUT_OF_ORDER: "a status is much older than the one before it: the robot's clock was set back",
-    Fault.FUTURE: "a status is from the future: the robot's clock has jumped",
-    Fault.MALFORMED: "a status can't be read",
-    Fault.WRONG_SIZE: "a status is of another number of joints",
-    Fault.NOT_FINITE: "a status holds numbers that are none",
-    Fault.POSITION_JUMP: "a joint's position has jumped",
-    Fault.VELOCITY_JUMP: "a joint's velocity has jumped",
-    Fault.VELOCITY: "a joint is too fast",
-    Fault.WORKSPACE: "the tool, or where it is told to go, is outside of the workspace",
-    Fault.FORCE: "the force on the tool is too great",
-    Fault.EXTERNAL_TORQUE: "the surroundings load a joint too much",
-    Fault.TORQUE: "the wanted torques are no numbers",
-    Fault.USER_STOP: "somebody asked for it",
-    Fault.DEADLINE_MISSED: "this program was held up, and sent nothing for too long",
-    Fault.MONITOR_STOP: "the deputy at the robot has stopped it, or is gone",
+FAULT_DESCRIPTIONS = {
+    Fault.NONE: "no fault",
+    Fault.NO_STATUS: "no status message received, or too few",
+    Fault.STALE: "the newest status message is too old",
+    Fault.OUT_OF_ORDER: "a status message is older than its predecessor: the robot's clock was set back",
+    Fault.FUTURE: "a status message is in the future: the robot's clock has jumped",
+    Fault.MALFORMED: "a status message cannot be decoded",
+    Fault.WRONG_SIZE: "a status message has the wrong number of joints",
+    Fault.NOT_FINITE: "a status message contains NaN or infinity",
+    Fault.POSITION_JUMP: "a joint position changed faster than the joint can move",
+    Fault.VELOCITY_JUMP: "a joint velocity changed faster than the joint can accelerate",
+    Fault.VELOCITY_LIMIT: "a joint exceeds its velocity limit",
+    Fault.WORKSPACE_LIMIT: "the tool or its commanded pose is outside the workspace",
+    Fault.FORCE_LIMIT: "the force on the tool exceeds its limit",
+    Fault.EXTERNAL_TORQUE_LIMIT: "an external joint torque exceeds its limit",
+    Fault.TORQUE_NOT_FINITE: "a commanded torque is NaN or infinite",
+    Fault.USER_STOP: "stop requested by the user",
+    Fault.DEADLINE_MISSED: "the controller missed its deadline and sent no command in time",
+    Fault.MONITOR_STOP: "the safety monitor stopped the arm, or its heartbeat timed out",
 }
-"""Each fault in words."""
+"""Description of each fault, for messages."""
 
 
 @dataclass(frozen=True)
 class JointStatus:
-    """A status as it came.
+    """Decoded status message of a robot driver; neither sizes nor values have been checked.
 
     Attributes:
-        time: of the robot's clock [s]; NaN where the message could not be read.
-        positions, velocities, external_torque: (n,) [rad, rad/s, Nm], of whatever size and values came.
+        time: Time stamp by the robot's clock [s]; NaN if the message could not be decoded.
+        positions: Joint positions, (n,) [rad].
+        velocities: Joint velocities, (n,) [rad/s].
+        external_torque: External joint torques, (n,) [Nm].
     """
 
     time: float
@@ -93,56 +99,56 @@ class JointStatus:
     external_torque: np.ndarray
 
     def __deepcopy__(self, memo: object) -> JointStatus:
-        """Itself: Drake copies values all the time, and nobody writes into this one."""
+        """Return the same immutable object, because Drake copies abstract values often."""
         return self
 
     @property
     def is_readable(self) -> bool:
-        """Whether the message could be read."""
+        """True if the message could be decoded."""
         return bool(np.isfinite(self.time))
 
     def values(self) -> np.ndarray:
-        """Positions, velocities and external torques in one vector."""
+        """Return positions, velocities and external torques as one vector, (3n,)."""
         return np.concatenate([self.positions, self.velocities, self.external_torque])
 
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """What a robot's deputy says with every status.
+    """Heartbeat message of a robot-side safety monitor, sent with every status message.
 
     Attributes:
-        number: another one each time.
-        is_acting: whether it is stopping the arm.
+        sequence: Sequence number, different in each message.
+        is_stopping: True while the monitor stops the arm.
     """
 
-    number: int
-    is_acting: bool
+    sequence: int
+    is_stopping: bool
 
     def __deepcopy__(self, memo: object) -> Heartbeat:
-        """Itself: nobody writes into this one."""
+        """Return the same immutable object."""
         return self
 
 
-UNREADABLE = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
-"""What stands for a message that could not be read."""
+MALFORMED_STATUS = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
+"""Status that stands for a message that could not be decoded."""
 
 
 @dataclass(frozen=True)
 class StatusLimits:
-    """What a status must keep to.
+    """Plausibility limits of status messages.
 
     Args:
-        velocity: of each joint, beyond which nothing moves (n,) [rad/s], positive: what positions may change by.
-        max_age: beyond which a status is stale [s], positive. Some of them may be lost on the way, or overtaken.
-        max_lead: by which a status may be ahead of this clock [s], positive.
-        position_jump: beyond what the velocity explains [rad], positive.
-        velocity_jump: from one status to the next, and beyond what the positions' change explains [rad/s], positive; a
-            collision is not slower than 1.
-        settling: for how long statuses must have been sound before they are believed [s], not negative: the time for
-            which a driver that has just been started wants no commands.
-        clock_drift: of the two clocks against each other [s/s], not negative: slower changes are no fault.
-        max_gap: between two checks, by the clock on the wall, beyond which this program itself was held up for too
-            long [s], positive.
+        velocity: Velocity limit of each joint, which bounds the change of its position (n,) [rad/s], positive.
+        max_age: Age above which a status is stale [s], positive. Messages may be lost or reordered within it.
+        max_lead: Largest time by which a status may be ahead of the local clock [s], positive.
+        position_jump: Largest position change beyond `velocity` times the time between two messages [rad], positive.
+        velocity_jump: Largest velocity change between two messages, and largest difference between velocity and
+            difference quotient of the positions [rad/s], positive; a collision causes changes up to 1.
+        settling_time: Time for which messages must have been valid before they are used [s], not negative. A driver
+            that has just started accepts no commands during this time.
+        clock_drift: Largest drift between the two clocks [s/s], not negative; slower changes are no fault.
+        max_check_interval: Largest wall-clock time between two checks before a missed deadline is reported [s],
+            positive.
     """
 
     velocity: tuple[float, ...]
@@ -150,33 +156,33 @@ class StatusLimits:
     max_lead: float = 0.03
     position_jump: float = 0.02
     velocity_jump: float = 1.5
-    settling: float = 0.25
+    settling_time: float = 0.25
     clock_drift: float = 1e-3
-    max_gap: float = 0.03
+    max_check_interval: float = 0.03
 
     def __post_init__(self) -> None:
         positive = (*self.velocity, self.max_age, self.max_lead, self.position_jump, self.velocity_jump)
-        positive += (self.max_gap,)
+        positive += (self.max_check_interval,)
         if not self.velocity or not all(0.0 < value < np.inf for value in positive):
             raise InputError("the limits of a robot's status must be positive")
-        if not all(0.0 <= value < np.inf for value in (self.settling, self.clock_drift)):
+        if not all(0.0 <= value < np.inf for value in (self.settling_time, self.clock_drift)):
             raise InputError("a robot's settling time and its clock's drift must be finite and not negative")
 
     @classmethod
     def at_rate(cls, velocity: Sequence[float], period: float) -> StatusLimits:
-        """The limits for a driver that speaks once in `period` [s]: some messages in a row may be lost or late."""
-        silence = MISSED * period
-        return cls(tuple(velocity), max_age=silence, max_lead=silence, max_gap=silence)
+        """Return limits for a driver that sends a status every `period` [s] and may miss `MAX_MISSED_MESSAGES`."""
+        timeout = MAX_MISSED_MESSAGES * period
+        return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout)
 
 
 @dataclass(frozen=True)
-class Heard:
-    """What is remembered of the last readable status.
+class LastStatus:
+    """Last readable status, with which the next one is compared.
 
     Attributes:
-        time: of the robot's clock [s]; NaN where there was none yet.
-        offset: from the robot's clock to this one [s].
-        values: as `JointStatus.values`, (3n,).
+        time: Time stamp by the robot's clock [s]; NaN before the first status.
+        offset: Offset from the robot's clock to the local clock [s].
+        values: `JointStatus.values`, (3n,).
     """
 
     time: float
@@ -184,14 +190,14 @@ class Heard:
     values: np.ndarray
 
 
-def judge_status(status: JointStatus | None, last: Heard, now: float, limits: StatusLimits) -> Fault:
-    """What is wrong with a status that comes after another.
+def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
+    """Compare a status with its predecessor and return the first fault, or `Fault.NONE`.
 
     Args:
-        status: the newest; None where none has come.
-        last: what is remembered.
-        now: of this clock [s].
-        limits: what it must keep to.
+        status: Newest status; None before the first message.
+        last: Last readable status.
+        now: Local time [s].
+        limits: Plausibility limits.
     """
     if status is None:
         return Fault.NO_STATUS
@@ -213,17 +219,17 @@ def judge_status(status: JointStatus | None, last: Heard, now: float, limits: St
     if age > limits.max_age:
         return Fault.STALE
     if status.time <= last.time:
-        return Fault.NONE  # it comes again, or was overtaken on its way: nothing is made of it
+        return Fault.NONE  # a repeated or reordered message, which is dropped
+    elapsed = status.time - last.time
     change = np.abs(values - last.values)
-    reachable = limits.position_jump + np.array(limits.velocity) * (status.time - last.time)
+    reachable = limits.position_jump + np.array(limits.velocity) * elapsed
     if (change[:num_joints] > reachable).any():
         return Fault.POSITION_JUMP
     if (change[num_joints : 2 * num_joints] > limits.velocity_jump).any():
         return Fault.VELOCITY_JUMP
-    # A speed with which nothing moves would be damped all the same, and so drive the arm.
-    elapsed = status.time - last.time
+    # A velocity without motion would be damped too, which would drive the arm.
     if 0.0 < elapsed <= limits.max_age:
-        moving = (status.positions - last.values[:num_joints]) / elapsed
-        if (np.abs(moving - status.velocities) > limits.velocity_jump).any():
+        difference_quotient = (status.positions - last.values[:num_joints]) / elapsed
+        if (np.abs(difference_quotient - status.velocities) > limits.velocity_jump).any():
             return Fault.VELOCITY_JUMP
     return Fault.NONE

@@ -116,7 +116,7 @@ def test_the_limits_of_a_robot_are_those_that_the_page_names():
     from guiderail.diagrams.hardware.station import EXTERNAL_SHARE, TORQUE_SHARE, VELOCITY_SHARE, HardwareStation
     from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
     from guiderail.models.common.units import MM
-    from guiderail.models.control.joint_status import MISSED
+    from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
     from guiderail.models.objects.insertion import COLLISION_FORCE
     from guiderail.tools.hardware.sim_driver import START
 
@@ -127,13 +127,13 @@ def test_the_limits_of_a_robot_are_those_that_the_page_names():
     load = station.load_of_force(station.controller_plant.solve(START, station.controller_plant.posture)).max()
     age = f"{status.max_age / MM:.0f} ms"
     said = {
-        "age of a status": f"{MISSED} periods: {age} |",
+        "age of a status": f"{MAX_MISSED_MESSAGES} periods: {age} |",
         "clock of statuses": f"{status.max_lead / MM:.0f} ms behind the last one, or ahead |",
         "jump of a position": f"{status.position_jump} rad ",
         "jump of a velocity": f"{status.velocity_jump} rad/s",
-        "this program's own delay": f"{status.max_gap / MM:.0f} ms ",
+        "this program's own delay": f"{status.max_check_interval / MM:.0f} ms ",
         "the deputy": f"{age} without a command; a robot's clock that goes back by {age}; "
-        f"{2 * MISSED * station.period / MM:.0f} ms without",
+        f"{2 * MAX_MISSED_MESSAGES * station.period / MM:.0f} ms without",
         "a joint's speed": f"{VELOCITY_SHARE:.0%} of its limit".replace("%", " %"),
         "place of the tool, and of where it is sent": f"±{limits.upper[0]} m beside, −{-limits.lower[2]} to "
         f"{limits.upper[2]} m above",

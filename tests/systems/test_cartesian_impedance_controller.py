@@ -67,8 +67,12 @@ class FreeArm:
                 stiffness_frame=frame,
             )
         )
-        builder.Connect(self.plant.get_state_output_port(self.arm.model), self.controller.get_state_input_port())
-        builder.Connect(self.controller.get_torque_output_port(), self.plant.get_actuation_input_port(self.arm.model))
+        builder.Connect(
+            self.plant.get_state_output_port(self.arm.model), self.controller.get_estimated_state_input_port()
+        )
+        builder.Connect(
+            self.controller.get_generalized_force_output_port(), self.plant.get_actuation_input_port(self.arm.model)
+        )
         self.simulator = Simulator(builder.Build())
         self.context = self.simulator.get_mutable_context()
         self.plant_context = self.plant.GetMyMutableContextFromRoot(self.context)
@@ -97,7 +101,7 @@ class FreeArm:
         port.FixValue(self.plant_context, Value([applied]))
 
     def torque(self):
-        return self.controller.get_torque_output_port().Eval(self.controller_context)
+        return self.controller.get_generalized_force_output_port().Eval(self.controller_context)
 
     def advance(self, seconds, watch=None):
         end = self.context.get_time() + seconds
@@ -212,7 +216,7 @@ def test_a_mass_dropped_on_it_is_caught_within_limits():
 def test_when_commands_stop_the_last_sound_pose_is_held():
     arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
-    command_timed_out = arm.controller.get_holding_output_port()
+    command_timed_out = arm.controller.get_command_timed_out_output_port()
     safe = start + [0.01, 0, 0, 0, 0, 0]
     arm.command(safe, time=0.0)
     arm.advance(0.05)
@@ -302,9 +306,13 @@ def test_ports_and_feedthrough():
     system = CartesianImpedanceController(
         model, arm.target, arm.tool_centre, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7)), period=0.005
     )
-    assert [system.get_input_port(i).get_name() for i in range(3)] == ["desired_pose", "state", "command_time"]
+    assert [system.get_input_port(i).get_name() for i in range(3)] == [
+        "desired_pose",
+        "estimated_state",
+        "command_time",
+    ]
     assert [system.get_output_port(i).get_name() for i in range(5)] == [
-        "torque",
+        "generalized_force",
         "pose",
         "impedance_wrench",
         "saturation",

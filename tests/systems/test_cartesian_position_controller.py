@@ -62,7 +62,7 @@ class Commanded:
 
     @property
     def command_timed_out(self):
-        return self.system.get_holding_output_port().Eval(self.context)[0]
+        return self.system.get_command_timed_out_output_port().Eval(self.context)[0]
 
 
 def test_starts_where_the_arm_is(arm):

@@ -20,7 +20,7 @@ def delivered(steps=12, seed=0, **options):
     pose = builder.AddSystem(ConstantVectorSource([POSE]))
     line = builder.AddSystem(CommandDisturbance(1, PERIOD, **options))
     builder.Connect(ramp.get_output_port(), action_repeat.get_input_port())
-    builder.Connect(action_repeat.get_output_port(), line.get_sent_input_port())
+    builder.Connect(action_repeat.get_output_port(), line.get_command_input_port())
     builder.Connect(pose.get_output_port(), line.get_pose_input_port())
     simulator = Simulator(builder.Build())
     context = line.GetMyMutableContextFromRoot(simulator.get_mutable_context())
@@ -29,7 +29,7 @@ def delivered(steps=12, seed=0, **options):
     found = []
     for step in range(1, steps + 1):
         simulator.AdvanceTo(step * PERIOD)  # before the events of that instant: command step − 1
-        found.append(line.get_delivered_output_port().Eval(context)[0])
+        found.append(line.get_delivered_command_output_port().Eval(context)[0])
     return np.array(found)
 
 

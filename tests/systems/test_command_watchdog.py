@@ -33,7 +33,7 @@ class SupervisedTraining:
 
     def check(self, pose, command_timed_out):
         np.testing.assert_array_equal(self.system.get_safe_pose_output_port().Eval(self.context), pose)
-        assert self.system.get_holding_output_port().Eval(self.context) == [command_timed_out]
+        assert self.system.get_command_timed_out_output_port().Eval(self.context) == [command_timed_out]
 
 
 def test_a_valid_command_passes_at_once():

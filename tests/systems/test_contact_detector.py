@@ -63,7 +63,7 @@ def drop(x, height=0.05, sampled=False, hydroelastic=False, duration=0.3):
     simulator.Initialize()
     ports = (
         watch.get_collision_output_port(),
-        watch.get_touched_output_port(),
+        watch.get_has_collided_output_port(),
         watch.get_contact_force_output_port(),
     )
     seen = []

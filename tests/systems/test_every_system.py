@@ -69,7 +69,7 @@ def built():
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.CenterOfPressure(0.5),
         systems.ContactDetector(plant, [body], [other], PERIOD),
-        systems.HeartbeatMonitor(period=PERIOD, command_timeout=1.0),
+        systems.HeartbeatMonitor(period=PERIOD, timeout=1.0),
         systems.PoseRateLimiter(period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),

@@ -27,7 +27,7 @@ def names(system, kind):
 def test_ports():
     system = LcNsKmpSystem(primitive(), None, PERIOD)
     assert names(system, "input") == ["null_space_action", "history"]
-    assert names(system, "output") == ["output", "constraint_violation", "fallback"]
+    assert names(system, "output") == ["command", "constraint_violation", "fallback"]
     assert system.get_history_input_port().size() == 6
     assert system.get_command_output_port().size() == 2
     without = LcNsKmpSystem(primitive(history=0), None, PERIOD)

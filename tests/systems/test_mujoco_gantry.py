@@ -12,7 +12,7 @@ from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
-from guiderail.systems import MovedBodies, MujocoRails
+from guiderail.systems import MovedBodies, MujocoGantry
 
 FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # high above the jack
 
@@ -108,4 +108,4 @@ def test_what_makes_no_sense_is_refused(station, period, constant):
     plant = station.plant
     moved = MovedBodies(*(plant.GetBodyByName(name) for name in ("jack", "tool_centre", "plug")))
     with pytest.raises(InputError):
-        MujocoRails(station.gantry.model, plant, moved, BncWorkcell().X_WT, period, constant)
+        MujocoGantry(station.gantry.model, plant, moved, BncWorkcell().X_WT, period, constant)

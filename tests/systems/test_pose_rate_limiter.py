@@ -16,7 +16,7 @@ class Ramped:
         context = self.simulator.get_mutable_context()
         self.desired = self.system.get_desired_pose_input_port().FixValue(context, desired)
         self.pose = self.system.get_pose_input_port().FixValue(context, MEASURED)
-        self.blend_factor = self.system.get_authority_input_port().FixValue(context, [blend_factor])
+        self.blend_factor = self.system.get_blend_factor_input_port().FixValue(context, [blend_factor])
         self.simulator.Initialize()
 
     def go(self, steps=1):

@@ -16,14 +16,14 @@ def readings(seed=0, scale=1.0, bias=0.0, **options):
     builder = DiagramBuilder()
     ramp = builder.AddSystem(TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 10.0], [[0.0, 10.0]])))
     sensor = builder.AddSystem(SensorDisturbance(PERIOD, **{"noise": np.zeros(1), **options}))
-    builder.Connect(ramp.get_output_port(), sensor.get_measured_input_port())
+    builder.Connect(ramp.get_output_port(), sensor.get_measurement_input_port())
     simulator = Simulator(builder.Build())
     context = sensor.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     sensor.set_error(context, np.full(1, scale), np.full(1, bias), seed)
     found = []
     for step in range(1, 9):
         simulator.AdvanceTo(step * PERIOD)
-        found.append(sensor.get_disturbed_output_port().Eval(context)[0])
+        found.append(sensor.get_disturbed_measurement_output_port().Eval(context)[0])
     return np.array(found)
 
 
@@ -54,16 +54,16 @@ def test_an_initialization_begins_anew():
     sensor = SensorDisturbance(PERIOD, np.ones(2), delay=3)
     simulator = Simulator(sensor)
     context = simulator.get_mutable_context()
-    measured = sensor.get_measured_input_port().FixValue(context, np.full(2, 5.0))
+    measured = sensor.get_measurement_input_port().FixValue(context, np.full(2, 5.0))
     episodes = []
     for value in (5.0, 7.0):
         measured.GetMutableData().set_value(np.full(2, value))
         context.SetTime(0.0)
         simulator.Initialize()
-        readings = [sensor.get_disturbed_output_port().Eval(context).copy()]
+        readings = [sensor.get_disturbed_measurement_output_port().Eval(context).copy()]
         for step in range(3):
             simulator.AdvanceTo((step + 0.5) * PERIOD)
-            readings.append(sensor.get_disturbed_output_port().Eval(context) - value * (step == 2))
+            readings.append(sensor.get_disturbed_measurement_output_port().Eval(context) - value * (step == 2))
         episodes.append(readings)
     np.testing.assert_array_equal(episodes[0][0], 0.0)
     np.testing.assert_allclose(episodes[1], episodes[0], atol=1e-12)

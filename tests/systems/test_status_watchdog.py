@@ -6,7 +6,7 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import FAULTS, UNREADABLE, Fault, JointStatus, StatusLimits
+from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, MALFORMED_STATUS, Fault, JointStatus, StatusLimits
 from guiderail.systems.status_watchdog import StatusWatchdog
 
 PERIOD = 1.0 / 256.0
@@ -38,7 +38,7 @@ class SupervisedTraining:
         return found
 
     def settle(self):
-        for _ in range(round(LIMITS.settling / PERIOD) + 3):
+        for _ in range(round(LIMITS.settling_time / PERIOD) + 3):
             self.check(self.sound())
         assert self.fault == Fault.NONE
         return self
@@ -49,7 +49,7 @@ class SupervisedTraining:
 
     @property
     def state(self):
-        return self.system.get_state_output_port().Eval(self.context).copy()
+        return self.system.get_estimated_state_output_port().Eval(self.context).copy()
 
     @property
     def age(self):
@@ -68,7 +68,7 @@ def test_passes_on_what_is_sound_at_once():
 def test_believes_nobody_before_the_settling_time():
     watched = SupervisedTraining()
     assert watched.check(None) == Fault.NO_STATUS
-    faults = [watched.check(watched.sound()) for _ in range(round(LIMITS.settling / PERIOD))]
+    faults = [watched.check(watched.sound()) for _ in range(round(LIMITS.settling_time / PERIOD))]
     assert set(faults) == {Fault.NO_STATUS}
     watched.settle()
 
@@ -76,7 +76,7 @@ def test_believes_nobody_before_the_settling_time():
 WRONG = {
     Fault.OUT_OF_ORDER: lambda sound: replace(sound, time=sound.time - 1.0),
     Fault.FUTURE: lambda sound: replace(sound, time=sound.time + 1.0),
-    Fault.MALFORMED: lambda sound: UNREADABLE,
+    Fault.MALFORMED: lambda sound: MALFORMED_STATUS,
     Fault.WRONG_SIZE: lambda sound: replace(sound, velocities=np.zeros(3)),
     Fault.NOT_FINITE: lambda sound: replace(sound, external_torque=np.array([np.nan, 0.0])),
     Fault.POSITION_JUMP: lambda sound: replace(sound, positions=sound.positions + [0.0, 0.05]),
@@ -98,7 +98,7 @@ def test_names_the_fault_believes_nothing_of_it_and_recovers(fault):
         steps += 1
         watched.check(watched.sound())
         assert np.abs(watched.state).max() < 0.2
-    assert LIMITS.settling <= steps * PERIOD <= LIMITS.settling + 4 * PERIOD
+    assert LIMITS.settling_time <= steps * PERIOD <= LIMITS.settling_time + 4 * PERIOD
     watched.check(watched.sound())
     np.testing.assert_array_equal(watched.state, replace_time(watched).values()[:4])
 
@@ -145,7 +145,7 @@ def test_the_robots_clock_may_start_anew():
     watched = SupervisedTraining().settle()
     assert watched.check(replace(watched.sound(), time=1.0)) == Fault.OUT_OF_ORDER
     start = watched.step
-    for _ in range(round(LIMITS.settling / PERIOD) + 3):
+    for _ in range(round(LIMITS.settling_time / PERIOD) + 3):
         watched.check(replace(watched.sound(), time=1.0 + (watched.step - start + 1) * PERIOD))
     assert watched.fault == Fault.NONE
 
@@ -157,7 +157,7 @@ def test_an_initialization_forgets():
 
 
 def test_every_fault_is_in_words():
-    assert set(FAULTS) == set(Fault)
+    assert set(FAULT_DESCRIPTIONS) == set(Fault)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_every_fault_is_in_words():
         {"velocity": ()},
         {"max_age": 0.0},
         {"position_jump": np.nan},
-        *({name: value} for name in ("settling", "clock_drift") for value in (-1.0, np.nan, np.inf)),
+        *({name: value} for name in ("settling_time", "clock_drift") for value in (-1.0, np.nan, np.inf)),
     ],
 )
 def test_refuses_limits_that_make_no_sense(wrong):
@@ -216,7 +216,7 @@ def test_by_the_clock_on_the_wall_a_status_that_stops_is_stale_however_few_check
     watched = WithClock().settle()
     last = watched.sound()
     watched.check(last)
-    gap = 0.7 * LIMITS.max_gap
+    gap = 0.7 * LIMITS.max_check_interval
     assert [watched.check(last, gap) for _ in range(2)] == [Fault.NONE, Fault.STALE]
     assert watched.age == pytest.approx(2.0 * gap + PERIOD)  # at the next check
 
@@ -239,7 +239,7 @@ def test_what_comes_soonest_tells_how_late_all_others_are():
     last = watched.sound()
     while watched.check(last) != Fault.STALE:
         pass
-    for _ in range(2 * round(LIMITS.settling / PERIOD)):
+    for _ in range(2 * round(LIMITS.settling_time / PERIOD)):
         watched.check(delayed(1.2))
     assert watched.fault == Fault.NONE
     for _ in range(20):
@@ -260,9 +260,9 @@ def test_a_single_status_that_is_a_little_early_makes_no_other_late():
 
 def test_the_limits_follow_from_the_rate():
     limits = StatusLimits.at_rate((1.0, 2.0), 0.005)
-    assert (limits.max_age, limits.max_lead, limits.max_gap) == (0.03, 0.03, 0.03)
+    assert (limits.max_age, limits.max_lead, limits.max_check_interval) == (0.03, 0.03, 0.03)
     with pytest.raises(InputError):
-        StatusLimits((1.0,), max_gap=0.0)
+        StatusLimits((1.0,), max_check_interval=0.0)
 
 
 def test_a_speed_with_which_nothing_moves_is_never_believed():
@@ -330,11 +330,11 @@ def test_another_clock_is_not_believed_before_it_has_settled_whatever_else_goes_
         status = watched.sound()
         return replace(status, time=status.time - 1.0, velocities=status.velocities + 0.05)
 
-    for step in range(round(0.9 * LIMITS.settling / PERIOD)):
+    for step in range(round(0.9 * LIMITS.settling_time / PERIOD)):
         watched.check(WRONG[between](set_back()) if step == 3 else set_back())
         np.testing.assert_array_equal(watched.state[2:], 0.1)
         assert watched.age > 0.0
-    for _ in range(round(LIMITS.settling / PERIOD)):
+    for _ in range(round(LIMITS.settling_time / PERIOD)):
         watched.check(set_back())
     assert watched.fault == Fault.NONE
     np.testing.assert_allclose(watched.state[2:], 0.15)
@@ -347,11 +347,11 @@ def test_a_position_that_has_jumped_and_stays_is_not_believed_before_it_has_sett
     def slipped():
         return replace(watched.sound(), positions=watched.sound().positions + [2.5, 0.0])
 
-    for _ in range(round(0.9 * LIMITS.settling / PERIOD)):
+    for _ in range(round(0.9 * LIMITS.settling_time / PERIOD)):
         watched.check(slipped())
         assert watched.state[0] < 1.0
         assert watched.fault == Fault.POSITION_JUMP
-    for _ in range(round(0.2 * LIMITS.settling / PERIOD)):
+    for _ in range(round(0.2 * LIMITS.settling_time / PERIOD)):
         watched.check(slipped())
     assert watched.fault == Fault.NONE
     assert watched.state[0] > 2.5
@@ -361,7 +361,7 @@ def test_the_ports_have_the_sizes_that_they_say():
     system = StatusWatchdog(LIMITS, period=PERIOD)
     ports = [system.get_output_port(i) for i in range(system.num_output_ports())]
     assert {port.get_name(): port.size() for port in ports} == {
-        **{"state": 4, "external_torque": 2, "fault": 1, "age": 1, "is_new": 1}
+        **{"estimated_state": 4, "external_torque": 2, "fault": 1, "age": 1, "is_new": 1}
     }
     assert system.get_clock_input_port().size() == 1
 
@@ -371,7 +371,7 @@ def test_new_is_what_is_believed_and_was_not_there_before():
     is_new = watched.system.get_is_new_output_port()
     sound = watched.sound()
     jumped = WRONG[Fault.POSITION_JUMP](sound)
-    for status, expected in ((sound, 1.0), (None, 0.0), (UNREADABLE, 0.0), (jumped, 0.0), (sound, 1.0)):
+    for status, expected in ((sound, 1.0), (None, 0.0), (MALFORMED_STATUS, 0.0), (jumped, 0.0), (sound, 1.0)):
         watched.port.GetMutableData().set_value(status or object())
         assert is_new.Eval(watched.context)[0] == expected
     watched.check(sound)
@@ -395,7 +395,7 @@ def test_statuses_that_fall_behind_one_after_another_stay_stale():
             queue.append(watched.sound())
             watched.check(queue[0])
         queue.pop(0)
-    for _ in range(2 * round(LIMITS.settling / PERIOD)):
+    for _ in range(2 * round(LIMITS.settling_time / PERIOD)):
         queue.append(watched.sound())
         assert watched.check(queue.pop(0)) == Fault.STALE
 
@@ -405,7 +405,7 @@ def test_after_a_silence_the_clocks_are_synchronized_anew():
     last = watched.sound()
     for _ in range(round(3.0 * LIMITS.max_age / PERIOD)):
         watched.check(last)
-    for _ in range(round(LIMITS.settling / PERIOD) + 3):
+    for _ in range(round(LIMITS.settling_time / PERIOD) + 3):
         sound = watched.sound()
         watched.check(replace(sound, time=sound.time - 1.2 * LIMITS.max_age))
     assert watched.fault == Fault.NONE

@@ -22,7 +22,7 @@ def test_sends_once_a_period_while_it_may_and_nothing_otherwise():
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_torque_input_port().FixValue(context, [1.0, -2.0])
-    sending = system.get_sending_input_port().FixValue(context, [0.0])
+    sending = system.get_is_sending_input_port().FixValue(context, [0.0])
     simulator.AdvanceTo(4 * PERIOD)
     lcm.HandleSubscriptions(0)
     assert heard == []

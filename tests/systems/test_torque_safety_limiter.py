@@ -9,7 +9,7 @@ from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.robots.robot import DEFAULT_ROBOT, find_robot
-from guiderail.systems.torque_safety_limiter import OLDEST_SPEED, ArmState, SafetyLimits, TorqueSafetyLimiter
+from guiderail.systems.torque_safety_limiter import MAX_VELOCITY_AGE, ArmState, SafetyLimits, TorqueSafetyLimiter
 
 PERIOD = 1.0 / 256.0
 n = 7
@@ -36,7 +36,7 @@ class Guarded:
         self.context = self.simulator.get_mutable_context()
         ok = {
             "torque": WANTED,
-            "state": [*POSTURE, *SPEED],
+            "estimated_state": [*POSTURE, *SPEED],
             "external_torque": np.zeros(n),
             "wrench": np.zeros(6),
             "pose": np.zeros(6),
@@ -51,7 +51,7 @@ class Guarded:
         if running:
             self.simulator.Initialize()
             self.go(LIMITS.ramp_time + 4 * PERIOD)
-            assert self.phase == ArmState.RUNNING
+            assert self.arm_state == ArmState.RUNNING
 
     def set(self, **values):
         for name, value in values.items():
@@ -65,8 +65,8 @@ class Guarded:
         return self.system.GetOutputPort(port).Eval(self.context).copy()
 
     @property
-    def phase(self):
-        return ArmState(int(self["phase"][0]))
+    def arm_state(self):
+        return ArmState(int(self["arm_state"][0]))
 
     @property
     def fault(self):
@@ -83,7 +83,7 @@ class Guarded:
 def test_passes_on_what_is_wanted_while_all_is_well(plant):
     guarded = Guarded(plant)
     np.testing.assert_array_equal(guarded["safe_torque"], WANTED)
-    assert (guarded.fault, guarded["sending"][0], guarded["not_following"][0]) == (Fault.NONE, 1.0, 0.0)
+    assert (guarded.fault, guarded["is_sending"][0], guarded["not_following"][0]) == (Fault.NONE, 1.0, 0.0)
 
 
 def test_sends_nothing_before_the_status_is_sound_and_then_takes_over_gradually(plant):
@@ -91,15 +91,15 @@ def test_sends_nothing_before_the_status_is_sound_and_then_takes_over_gradually(
     guarded.set(status_fault=[Fault.NO_STATUS])
     guarded.simulator.Initialize()
     guarded.go(0.5)
-    assert guarded.phase == ArmState.WAITING
-    assert guarded["sending"][0] == 0.0
+    assert guarded.arm_state == ArmState.WAITING
+    assert guarded["is_sending"][0] == 0.0
     np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
     guarded.set(status_fault=[0.0])
     shares = []
-    while guarded.phase != ArmState.RUNNING:
+    while guarded.arm_state != ArmState.RUNNING:
         guarded.go(PERIOD)
-        share = guarded["authority"][0]
-        if guarded.phase == ArmState.RAMPING:
+        share = guarded["blend_factor"][0]
+        if guarded.arm_state == ArmState.RAMPING:
             shares.append(share)
             assert guarded["not_following"][0] == 1.0
             expected = np.clip(share * WANTED + (1.0 - share) * guarded.damping(), -20.0, 20.0)
@@ -110,11 +110,11 @@ def test_sends_nothing_before_the_status_is_sound_and_then_takes_over_gradually(
 
 WRONG = {
     Fault.STALE: {"status_fault": [Fault.STALE]},
-    Fault.VELOCITY: {"state": [*POSTURE, *SPEED[:-1], -1.01]},
-    Fault.WORKSPACE: {"pose": [0.0, 0.0, 0.31, 0.0, 0.0, 0.0]},
-    Fault.FORCE: {"wrench": [40.0, 0.0, -50.0, 0.0, 0.0, 0.0]},
-    Fault.EXTERNAL_TORQUE: {"external_torque": [0.0] * 6 + [-10.1]},
-    Fault.TORQUE: {"torque": [*WANTED[:-1], np.nan]},
+    Fault.VELOCITY_LIMIT: {"estimated_state": [*POSTURE, *SPEED[:-1], -1.01]},
+    Fault.WORKSPACE_LIMIT: {"pose": [0.0, 0.0, 0.31, 0.0, 0.0, 0.0]},
+    Fault.FORCE_LIMIT: {"wrench": [40.0, 0.0, -50.0, 0.0, 0.0, 0.0]},
+    Fault.EXTERNAL_TORQUE_LIMIT: {"external_torque": [0.0] * 6 + [-10.1]},
+    Fault.TORQUE_NOT_FINITE: {"torque": [*WANTED[:-1], np.nan]},
 }
 
 
@@ -127,42 +127,42 @@ def test_stops_at_once_says_why_and_goes_on_only_when_told(plant, fault):
     assert not np.isclose(guarded["safe_torque"], WANTED).any()
     guarded.go(2 * PERIOD)
     guarded.set(**{name: guarded.ok[name] for name in WRONG[fault]})
-    assert (guarded.phase, guarded.fault) == (ArmState.DAMPING, fault)
+    assert (guarded.arm_state, guarded.fault) == (ArmState.DAMPING, fault)
     np.testing.assert_allclose(guarded["safe_torque"], np.clip(guarded.damping(), -20.0, 20.0), atol=1e-12)
     with pytest.raises(InputError, match="is damping"):
         guarded.system.resume(guarded.context)
     guarded.go(LIMITS.damping_time)
-    assert (guarded.phase, guarded.fault) == (ArmState.OFF, fault)
+    assert (guarded.arm_state, guarded.fault) == (ArmState.OFF, fault)
     np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
     guarded.go(1.0)
-    assert guarded.phase == ArmState.OFF
+    assert guarded.arm_state == ArmState.OFF
     guarded.system.resume(guarded.context)
-    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (ArmState.RAMPING, Fault.NONE, 0.0)
+    assert (guarded.arm_state, guarded.fault, guarded["blend_factor"][0]) == (ArmState.RAMPING, Fault.NONE, 0.0)
     guarded.go(LIMITS.ramp_time + 2 * PERIOD)
-    assert guarded.phase == ArmState.RUNNING
+    assert guarded.arm_state == ArmState.RUNNING
 
 
 def test_is_not_told_to_leave_the_workspace(plant):
     guarded = Guarded(plant)
     guarded.set(desired_pose=[0.21, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert guarded.fault == Fault.WORKSPACE
+    assert guarded.fault == Fault.WORKSPACE_LIMIT
 
 
 POSITION, VELOCITY = [*([np.nan] * n), *SPEED], [*POSTURE, *([np.nan] * n)]
 NO_NUMBER = {
-    "torque": ({"torque": np.full(n, np.nan)}, Fault.TORQUE),
-    "positions": ({"state": POSITION}, Fault.NOT_FINITE),
-    "velocities": ({"state": VELOCITY}, Fault.NOT_FINITE),
-    "infinite velocity": ({"state": [*POSTURE, *SPEED[:-1], np.inf]}, Fault.NOT_FINITE),
-    "external_torque": ({"external_torque": np.full(n, np.nan)}, Fault.EXTERNAL_TORQUE),
-    "wrench": ({"wrench": np.full(6, np.nan)}, Fault.FORCE),
-    "pose": ({"pose": np.full(6, np.nan)}, Fault.WORKSPACE),
-    "desired_pose": ({"desired_pose": np.full(6, np.nan)}, Fault.WORKSPACE),
+    "torque": ({"torque": np.full(n, np.nan)}, Fault.TORQUE_NOT_FINITE),
+    "positions": ({"estimated_state": POSITION}, Fault.NOT_FINITE),
+    "velocities": ({"estimated_state": VELOCITY}, Fault.NOT_FINITE),
+    "infinite velocity": ({"estimated_state": [*POSTURE, *SPEED[:-1], np.inf]}, Fault.NOT_FINITE),
+    "external_torque": ({"external_torque": np.full(n, np.nan)}, Fault.EXTERNAL_TORQUE_LIMIT),
+    "wrench": ({"wrench": np.full(6, np.nan)}, Fault.FORCE_LIMIT),
+    "pose": ({"pose": np.full(6, np.nan)}, Fault.WORKSPACE_LIMIT),
+    "desired_pose": ({"desired_pose": np.full(6, np.nan)}, Fault.WORKSPACE_LIMIT),
     "status_age": ({"status_age": [np.nan]}, Fault.STALE),
 }
 
 
-@pytest.mark.parametrize("authority", ["none", "some", "all"])
+@pytest.mark.parametrize("blend_factor", ["none", "some", "all"])
 @pytest.mark.parametrize("what", NO_NUMBER)
 def test_what_is_no_number_is_within_no_limit_and_what_is_sent_is_one(plant, what, blend_factor):
     """Whether the arm waits, takes over or runs, when it stops and until it is off."""
@@ -180,17 +180,19 @@ def test_what_is_no_number_is_within_no_limit_and_what_is_sent_is_one(plant, wha
         guarded.go(PERIOD)
         assert np.isfinite(guarded["safe_torque"]).all()
         assert guarded.fault == fault
-    assert guarded.phase == (ArmState.WAITING if blend_factor == "none" else ArmState.OFF)
+    assert guarded.arm_state == (ArmState.WAITING if blend_factor == "none" else ArmState.OFF)
 
 
-@pytest.mark.parametrize("wrong", [{"state": POSITION}, {"state": VELOCITY}, {"status_age": [np.nan]}])
+@pytest.mark.parametrize(
+    "wrong", [{"estimated_state": POSITION}, {"estimated_state": VELOCITY}, {"status_age": [np.nan]}]
+)
 def test_a_speed_that_nobody_knows_is_not_damped(plant, wrong):
     guarded = Guarded(plant)
     guarded.set(status_fault=[Fault.NOT_FINITE], **wrong)
     for _ in range(3):
         np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
         guarded.go(PERIOD)
-    assert guarded.phase == ArmState.DAMPING
+    assert guarded.arm_state == ArmState.DAMPING
 
 
 def test_torques_that_come_out_as_no_numbers_are_none(plant):
@@ -206,9 +208,9 @@ def test_does_not_go_on_while_something_is_wrong(plant):
     guarded = Guarded(plant)
     guarded.set(status_fault=[Fault.NOT_FINITE])
     guarded.go(1.0)
-    with pytest.raises(InputError, match="numbers that are none"):
+    with pytest.raises(InputError, match="NaN or infinity"):
         guarded.system.resume(guarded.context)
-    assert guarded.phase == ArmState.OFF
+    assert guarded.arm_state == ArmState.OFF
 
 
 def test_never_sends_more_than_the_limits(plant):
@@ -221,7 +223,7 @@ def test_never_sends_more_than_the_limits(plant):
 def test_damping_takes_away_exactly_what_the_arm_had_and_was_given_since(plant, before):
     """Where no status comes, the speed is that of the last one for ever: what is taken away in all is its momentum."""
     guarded, load = Guarded(plant), np.full(n, 0.5)
-    guarded.set(state=[*POSTURE, *(0.1 * SPEED)], external_torque=load)
+    guarded.set(estimated_state=[*POSTURE, *(0.1 * SPEED)], external_torque=load)
     guarded.go(PERIOD)
     given, taken = np.zeros(n), np.zeros(n)
     for age in range(before):
@@ -248,10 +250,10 @@ def test_a_robot_that_was_started_anew_is_not_driven_by_the_speed_that_it_had(pl
         guarded.set(status_fault=[float(status_fault)])
         guarded.go(PERIOD)
     assert guarded["safe_torque"].any() == has_torque
-    assert guarded.phase == (ArmState.DAMPING if has_torque else ArmState.OFF)
+    assert guarded.arm_state == (ArmState.DAMPING if has_torque else ArmState.OFF)
 
 
-@pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (OLDEST_SPEED, True), (0.2, False)])
+@pytest.mark.parametrize(("age", "has_torque"), [(0.08, True), (MAX_VELOCITY_AGE, True), (0.2, False)])
 def test_a_speed_of_long_ago_is_not_damped(plant, age, has_torque):
     """Whoever was held up himself: somebody else may have stopped the arm meanwhile."""
     guarded = Guarded(plant)
@@ -278,25 +280,25 @@ def test_a_silent_robot_is_sent_no_torque_and_then_nothing(plant):
     sent = []
     for _ in range(round(0.5 / PERIOD)):
         guarded.go(PERIOD)
-        sent.append(guarded["safe_torque"] if guarded["sending"][0] else None)
+        sent.append(guarded["safe_torque"] if guarded["is_sending"][0] else None)
     last = [torque for torque in sent if torque is not None][-5:]
     np.testing.assert_array_equal(last, 0.0)
     assert sent[-1] is None
     guarded.set(status_fault=[0.0])
-    np.testing.assert_array_equal(guarded["sending"], 1.0)
+    np.testing.assert_array_equal(guarded["is_sending"], 1.0)
     np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
 
 
 def test_stops_when_asked(plant):
     guarded = Guarded(plant)
     guarded.system.stop(guarded.context)
-    assert (guarded.phase, guarded.fault, guarded["authority"][0]) == (ArmState.DAMPING, Fault.USER_STOP, 0.0)
+    assert (guarded.arm_state, guarded.fault, guarded["blend_factor"][0]) == (ArmState.DAMPING, Fault.USER_STOP, 0.0)
     with pytest.raises(InputError):
         guarded.system.resume(guarded.context)
     guarded.go(LIMITS.damping_time + 2 * PERIOD)
-    assert guarded.phase == ArmState.OFF
+    assert guarded.arm_state == ArmState.OFF
     guarded.system.stop(guarded.context)
-    assert (guarded.phase, guarded.fault) == (ArmState.OFF, Fault.USER_STOP)
+    assert (guarded.arm_state, guarded.fault) == (ArmState.OFF, Fault.USER_STOP)
 
 
 def test_an_arm_that_was_never_taken_over_is_stopped_without_a_word(plant):
@@ -305,12 +307,12 @@ def test_an_arm_that_was_never_taken_over_is_stopped_without_a_word(plant):
     guarded.set(status_fault=[Fault.NO_STATUS])
     guarded.simulator.Initialize()
     guarded.go(10 * PERIOD)
-    assert guarded.phase == ArmState.WAITING
+    assert guarded.arm_state == ArmState.WAITING
     guarded.system.stop(guarded.context)
-    assert (guarded.phase, guarded.fault) == (ArmState.OFF, Fault.USER_STOP)
+    assert (guarded.arm_state, guarded.fault) == (ArmState.OFF, Fault.USER_STOP)
     for _ in range(100):
         guarded.go(PERIOD)
-        assert guarded["sending"][0] == 0.0
+        assert guarded["is_sending"][0] == 0.0
         np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
 
 
@@ -360,7 +362,7 @@ def test_refuses_an_arm_that_the_limits_do_not_fit(plant):
 def test_what_is_exactly_at_a_limit_is_within_it_and_of_the_wrench_the_force_counts(plant):
     guarded = Guarded(plant)
     for at_limit in (
-        {"state": [*POSTURE, *[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]]},
+        {"estimated_state": [*POSTURE, *[1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0]]},
         {"pose": [*LIMITS.lower, 9.0, 9.0, 9.0], "desired_pose": [*LIMITS.upper, 9.0, 9.0, 9.0]},
         {"pose": [*LIMITS.upper, 9.0, 9.0, 9.0], "desired_pose": [*LIMITS.lower, 9.0, 9.0, 9.0]},
         {"wrench": [0.0, -60.0, 0.0, 99.0, 99.0, 99.0]},
@@ -374,7 +376,7 @@ def test_outputs_have_the_sizes_that_they_say_and_depend_at_once_on_no_more(plan
     system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD)
     outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
     assert {port.get_name(): port.size() for port in outputs} == {
-        **{"safe_torque": n, "fault": 1, "phase": 1, "authority": 1, "sending": 1, "not_following": 1}
+        **{"safe_torque": n, "fault": 1, "arm_state": 1, "blend_factor": 1, "is_sending": 1, "not_following": 1}
     }
     at_once = {
         port.get_name(): {
@@ -384,20 +386,20 @@ def test_outputs_have_the_sizes_that_they_say_and_depend_at_once_on_no_more(plan
         }
         for port in outputs
     }
-    measured = {"state", "external_torque", "wrench", "pose", "desired_pose", "torque"}
+    measured = {"estimated_state", "external_torque", "wrench", "pose", "desired_pose", "torque"}
     assert at_once == {
         "safe_torque": measured | {"status_fault", "status_age", "status_is_new"},
         "fault": measured | {"status_fault", "status_age"},
-        "phase": set(),
-        "authority": set(),
-        "sending": {"status_fault"},
+        "arm_state": set(),
+        "blend_factor": set(),
+        "is_sending": {"status_fault"},
         "not_following": {"command_timed_out"},
     }
 
 
 def test_before_it_is_initialized_it_waits_and_sends_nothing(plant):
     guarded = Guarded(plant, running=False)
-    assert (guarded.phase, guarded["sending"][0], guarded["not_following"][0]) == (ArmState.WAITING, 0.0, 1.0)
+    assert (guarded.arm_state, guarded["is_sending"][0], guarded["not_following"][0]) == (ArmState.WAITING, 0.0, 1.0)
     np.testing.assert_array_equal(guarded["safe_torque"], 0.0)
 
 
@@ -405,10 +407,10 @@ def test_while_it_takes_over_it_damps_the_speed_that_is_seen_and_nothing_that_it
     guarded = Guarded(plant, running=False)
     guarded.simulator.Initialize()
     guarded.go(LIMITS.ramp_time / 2)
-    assert guarded.phase == ArmState.RAMPING
+    assert guarded.arm_state == ArmState.RAMPING
     guarded.set(status_age=[PERIOD], status_is_new=[0.0])
     guarded.go(PERIOD)
-    share = guarded["authority"][0]
+    share = guarded["blend_factor"][0]
     expected = share * WANTED + (1.0 - share) * guarded.damping(age=PERIOD)
     np.testing.assert_allclose(guarded["safe_torque"], np.clip(expected, -20.0, 20.0), atol=1e-12)
 
@@ -416,4 +418,4 @@ def test_while_it_takes_over_it_damps_the_speed_that_is_seen_and_nothing_that_it
 def test_while_a_watchdog_holds_the_arm_is_not_following(plant):
     guarded = Guarded(plant)
     guarded.set(command_timed_out=[1.0])
-    assert (guarded.phase, guarded["not_following"][0]) == (ArmState.RUNNING, 1.0)
+    assert (guarded.arm_state, guarded["not_following"][0]) == (ArmState.RUNNING, 1.0)

@@ -24,7 +24,7 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.control.joint_status import FAULTS, Fault
+from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault
 from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.step_log import ledger_file, table, write_ledger
@@ -42,7 +42,7 @@ SIGNALS = {
     "fallback": 1,
     "commanded_violation": 1,
     "fault": 1,
-    "phase": 1,
+    "arm_state": 1,
 }
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
 WARM_UP = 0.1  # [s], less than a driver's hold-off
@@ -167,15 +167,15 @@ class SkillExecutor:
         station, root = self._acting()
         self._pace.advance(self._simulator, station, self._steps)
         context = station.GetMyContextFromRoot(root)
-        phase, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("phase", "fault"))
+        arm_state, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("arm_state", "fault"))
         force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
-        if phase in (ArmState.DAMPING, ArmState.OFF):
-            return Outcome(Fault(fault), FAULTS[Fault(fault)], len(self.trace))
+        if arm_state in (ArmState.DAMPING, ArmState.OFF):
+            return Outcome(Fault(fault), FAULT_DESCRIPTIONS[Fault(fault)], len(self.trace))
         if self._is_stopped():
-            return Outcome(Fault.USER_STOP, FAULTS[Fault.USER_STOP], len(self.trace))
+            return Outcome(Fault.USER_STOP, FAULT_DESCRIPTIONS[Fault.USER_STOP], len(self.trace))
         if force > limit:
             return Outcome(
-                Fault.FORCE, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", len(self.trace)
+                Fault.FORCE_LIMIT, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", len(self.trace)
             )
         return None
 
@@ -183,14 +183,14 @@ class SkillExecutor:
         station, context = self._station, self._simulator.get_mutable_context()
         desired = station.get_desired_pose_input_port()
         ready = 0.0
-        while station.get_phase_output_port().Eval(context)[0] != ArmState.RUNNING:
+        while station.get_arm_state_output_port().Eval(context)[0] != ArmState.RUNNING:
             desired.FixValue(context, here)
             ready += self._skill.control_period
             if (stopped := self._step()) is not None:
                 return stopped
             if ready > 5.0:
                 fault = Fault(int(station.get_fault_output_port().Eval(context)[0]))
-                return Outcome(fault, f"could not take over: {FAULTS[fault]}", 0)
+                return Outcome(fault, f"could not take over: {FAULT_DESCRIPTIONS[fault]}", 0)
         for pose in crawl(here, self._start, self._skill.control_period):
             desired.FixValue(context, pose)
             if (stopped := self._step()) is not None:

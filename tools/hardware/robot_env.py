@@ -18,7 +18,7 @@ from guiderail.diagrams.hardware.clock import Clock, MessageCounter
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
-from guiderail.models.control.joint_status import FAULTS, Fault
+from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.preflight import LISTENING, Check, check_robot
 from guiderail.tools.hardware.slow_motion import back, crawl, distance, is_near
@@ -36,7 +36,7 @@ class RobotStoppedError(Exception):
     """The arm is being stopped: a limit, a fault or a person."""
 
     def __init__(self, fault: Fault):
-        super().__init__(FAULTS[fault])
+        super().__init__(FAULT_DESCRIPTIONS[fault])
         self.fault = fault
 
 
@@ -223,8 +223,8 @@ class RobotEnv(GuidedEnv):
     def _advance(self) -> None:
         self._pass(self._steps)
         mine = self._mine
-        phase, fault = (int(self._acting.GetOutputPort(name).Eval(mine)[0]) for name in ("phase", "fault"))
-        if phase in (ArmState.DAMPING, ArmState.OFF):
+        arm_state, fault = (int(self._acting.GetOutputPort(name).Eval(mine)[0]) for name in ("arm_state", "fault"))
+        if arm_state in (ArmState.DAMPING, ArmState.OFF):
             raise RobotStoppedError(Fault(fault))
         if self._keys.stops():
             self._acting.stop(self._root)
@@ -294,15 +294,15 @@ class RobotEnv(GuidedEnv):
     def _take_over(self) -> None:
         """Until the arm follows."""
         self._elsewhere_acts()
-        if self._elsewhere.get_phase_output_port().Eval(self._mine)[0] == ArmState.WAITING:
+        if self._elsewhere.get_arm_state_output_port().Eval(self._mine)[0] == ArmState.WAITING:
             self._pace.begin()  # nothing was sent yet: how long nobody listened is no gap between statuses
         here, waited = self.pose, 0.0
-        while self._elsewhere.get_phase_output_port().Eval(self._mine)[0] != ArmState.RUNNING:
+        while self._elsewhere.get_arm_state_output_port().Eval(self._mine)[0] != ArmState.RUNNING:
             self._command(here)
             waited += self.task.control_period
             if waited > PATIENCE:
                 fault = Fault(int(self._elsewhere.get_fault_output_port().Eval(self._mine)[0]))
-                raise InputError(f"the arm can't be taken over: {FAULTS[fault]}")
+                raise InputError(f"the arm can't be taken over: {FAULT_DESCRIPTIONS[fault]}")
 
     def _try(self, motion: Callable[[], Any]) -> None:
         """Does it until nothing stops the arm meanwhile."""
@@ -321,14 +321,14 @@ class RobotEnv(GuidedEnv):
 
     def _resume(self) -> None:
         """Asks, and goes on, if the arm is at rest."""
-        if self._acting.get_phase_output_port().Eval(self._mine)[0] != ArmState.OFF:
+        if self._acting.get_arm_state_output_port().Eval(self._mine)[0] != ArmState.OFF:
             return
         fault = Fault(int(self._acting.get_fault_output_port().Eval(self._mine)[0]))
-        self._go_on(FAULTS[fault])
+        self._go_on(FAULT_DESCRIPTIONS[fault])
         # Nobody listened while the person thought: what is judged is a status of now, once statuses are believed again,
         # which those of an arm that was moved meanwhile are only after the settling time.
         self._pace.begin()
-        self._pass(self._steps + math.ceil(self._acting.status_limits.settling / self._acting.period))
+        self._pass(self._steps + math.ceil(self._acting.status_limits.settling_time / self._acting.period))
         self._keys.take_back()
         self._find_the_way()
         if self._acting is self._elsewhere:

@@ -22,7 +22,7 @@ from guiderail.diagrams.hardware.driver import STATUS_PERIOD
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import MISSED
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
 
 
 class Told:
@@ -216,7 +216,7 @@ def test_a_word_that_is_none_answers_nothing():
     assert serve(simulator, within, lcm, IIWA_DRIVER, 2 * STATUS_PERIOD, 0.01) == 0.0
 
 
-@pytest.mark.parametrize(("periods", "says"), [(MISSED - 1, False), (MISSED + 1, True)])
+@pytest.mark.parametrize(("periods", "says"), [(MAX_MISSED_MESSAGES - 1, False), (MAX_MISSED_MESSAGES + 1, True)])
 def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch, periods, says):
     said, wall = [], [0.0]
     monkeypatch.setattr("guiderail.diagrams.hardware.clock.time.monotonic", lambda: wall[0])

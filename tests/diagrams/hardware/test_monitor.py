@@ -9,7 +9,7 @@ from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor, wor
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, safety_limits
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
-from guiderail.models.control.joint_status import MISSED
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
 
 PERIOD = IIWA_DRIVER.period
 MOVING = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.1, -0.1])
@@ -62,7 +62,7 @@ def test_damps_within_the_limits_where_commands_stop_then_says_no_torque_and_fal
         bus.status()
         bus.command([1.0] * 7)
     bus.heard.clear()
-    bus.status(steps=MISSED)
+    bus.status(steps=MAX_MISSED_MESSAGES)
     assert bus.heard == []
     bus.status(velocities=10.0 * MOVING, steps=2)
     assert bus.deputy.duty == MonitorState.DAMPING
@@ -85,7 +85,7 @@ def test_goes_on_to_the_end_where_commands_come_back_and_says_so(known):
     bus = Bus(known)
     bus.status()
     bus.command([1.0] * 7)
-    bus.status(steps=MISSED + 2)
+    bus.status(steps=MAX_MISSED_MESSAGES + 2)
     acting = bus.words[-1]
     assert acting[-1] == 1
     for _ in range(5):
@@ -119,7 +119,7 @@ def test_what_is_no_sound_message_neither_moves_it_nor_ends_it(known):
     bus.status(joint_velocity_estimated=[np.nan] * 7)
     bus.status(num_joints=3, **{name: [0.0] * 3 for name in lcmt_iiwa_status.__slots__[2:]})
     assert len(bus.words) == said
-    bus.status(steps=MISSED)
+    bus.status(steps=MAX_MISSED_MESSAGES)
     assert bus.deputy.duty == MonitorState.DAMPING
 
 
@@ -145,7 +145,7 @@ def test_a_robots_clock_that_goes_back_does_not_make_it_wait(known):
     bus.status()
     bus.command([1.0] * 7)
     bus.time = 3.0
-    bus.status(steps=MISSED + 3)
+    bus.status(steps=MAX_MISSED_MESSAGES + 3)
     assert bus.deputy.duty == MonitorState.DAMPING
     bus.time = 1.0
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
@@ -156,7 +156,7 @@ def test_statuses_that_overtake_each_other_do_not_make_it_wait(known):
     bus = Bus(known)
     bus.status()
     bus.command([1.0] * 7)
-    for _ in range(MISSED):
+    for _ in range(MAX_MISSED_MESSAGES):
         for ahead in (2, 0):  # the second of two comes first
             bus.status(utime=round((bus.time + ahead * PERIOD) * 1e6))
     assert bus.deputy.duty == MonitorState.DAMPING

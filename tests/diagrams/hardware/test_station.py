@@ -55,7 +55,7 @@ class OneProcess:
 
     @property
     def phase(self):
-        return ArmState(int(self["phase"][0]))
+        return ArmState(int(self["arm_state"][0]))
 
     @property
     def fault(self):
@@ -238,7 +238,7 @@ def test_another_station_takes_over_without_letting_go():
     for step in range(1, 40):
         both.robot_simulator.AdvanceTo(time + step * PERIOD)
         simulator.AdvanceTo(step * PERIOD)
-        assert (other.get_phase_output_port().Eval(context)[0], other.get_fault_output_port().Eval(context)[0]) == (
+        assert (other.get_arm_state_output_port().Eval(context)[0], other.get_fault_output_port().Eval(context)[0]) == (
             2,
             0,
         )
@@ -315,7 +315,7 @@ def test_a_deputy_is_heard_in_a_larger_diagram_too():
 def test_all_stations_have_the_same_ports():
     stations = [GantryStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, DrakeLcm("memq://"))]
     simulated_only = {"query", "body_poses"}
-    robots_own = {"fault", "phase"} | {f"iiwa.{name}" for name in ALIASES}
+    robots_own = {"fault", "arm_state"} | {f"iiwa.{name}" for name in ALIASES}
     for station in stations:
         inputs = {station.get_input_port(i).get_name(): station.get_input_port(i).size() for i in range(2)}
         assert inputs == {"desired_pose": 6, "command_time": 1}

@@ -153,7 +153,7 @@ def test_pulled_to_its_full_length_an_arm_does_not_jerk():
     nearly = np.array([-0.24, -1.4, 0.3, -2.0, -1.57, 0.0])
     start = held.put(nearly)
     controller = held.station.GetSubsystemByName("controller")
-    torque = controller.get_torque_output_port()
+    torque = controller.get_generalized_force_output_port()
     context = controller.GetMyContextFromRoot(held.context)
     torques = []
     for step in range(600):

@@ -121,7 +121,7 @@ class Bus:
     @property
     def phase(self) -> ArmState:
         """What the station does."""
-        return ArmState(int(self.station.get_phase_output_port().Eval(self.simulator.get_context())[0]))
+        return ArmState(int(self.station.get_arm_state_output_port().Eval(self.simulator.get_context())[0]))
 
     @property
     def fault(self) -> Fault:

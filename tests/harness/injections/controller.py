@@ -32,7 +32,7 @@ def main(url: str, rate: float) -> None:
             angle = 2.0 * np.pi * context.get_time()
             side = 0.01 * np.array([np.cos(angle), np.sin(angle)])
             desired.FixValue(context, START + [*side, 0.0, 0.15 * np.sin(angle), 0.0, 0.0])
-            if station.get_phase_output_port().Eval(context)[0] == ArmState.OFF:
+            if station.get_arm_state_output_port().Eval(context)[0] == ArmState.OFF:
                 with contextlib.suppress(InputError):  # while something is wrong still
                     station.resume(context)
             pace.advance(simulator, station, 1)

@@ -9,12 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from drake import lcmt_iiwa_status
 
-from guiderail.models.control.joint_status import MISSED, Fault
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
 
 from . import bus as buses
 from .bus import PERIOD, Bus, changed, passes
 
-TOLERATED, STOPS = (MISSED - 2) * PERIOD, (MISSED + 2) * PERIOD  # [s]: shorter is borne, longer stops the arm
+TOLERATED, STOPS = (
+    (MAX_MISSED_MESSAGES - 2) * PERIOD,
+    (MAX_MISSED_MESSAGES + 2) * PERIOD,
+)  # [s]: shorter is borne, longer stops the arm
 JOINT_FIELDS = tuple(lcmt_iiwa_status.__slots__[2:])
 MEASURED = ("joint_position_measured", "joint_velocity_estimated", "joint_torque_external")
 

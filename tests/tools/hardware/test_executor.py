@@ -57,7 +57,7 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
     assert (outcome.words, outcome.steps, outcome.exit_code) == ("done", 20, 0)
     begin = operation._start
     np.testing.assert_allclose(operation.trace.measured[0][:3], begin[:3], atol=3e-3)
-    assert (operation.trace.signals["phase"] == 2).all()
+    assert (operation.trace.signals["arm_state"] == 2).all()
     context = pace.simulator.get_context()
     velocities = pace.robot.plant.GetVelocities(pace.robot.plant.GetMyContextFromRoot(context))
     assert np.abs(velocities).max() < 0.01
@@ -144,7 +144,7 @@ def test_too_much_force_ends_it(operated):
     operation, _ = operated()
     operation._task.collision = type(operation._task.collision)("contact_force", 0.01)
     outcome = operation.run(print)
-    assert (outcome.fault, outcome.exit_code) == (Fault.FORCE, 1)
+    assert (outcome.fault, outcome.exit_code) == (Fault.FORCE_LIMIT, 1)
     assert "more than the task's" in outcome.words
 
 

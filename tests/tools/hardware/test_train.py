@@ -101,7 +101,7 @@ def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_pat
     env.keys.wants_pause = True
     found = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", acting=lambda env: still)
     assert (found["episodes"], found["success_rate"]) == (2, 0.0)
-    assert (env.asked, env.keys.wants_pause) == (["somebody asked for it"], False)  # after the first, and once
+    assert (env.asked, env.keys.wants_pause) == (["stop requested by the user"], False)  # after the first, and once
     rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
     assert rows["termination"].tolist() == ["time_limit"] * 2
     with pytest.raises(InputError, match="already exists"):
@@ -142,14 +142,14 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     env.step(np.zeros(2))
     env.keys.press()
     _, _, _, truncated, info = env.step(np.zeros(2))
-    assert (truncated, info["termination"], info["stopped"]) == (True, "stopped", "somebody asked for it")
+    assert (truncated, info["termination"], info["stopped"]) == (True, "stopped", "stop requested by the user")
     velocities = env.pace.robot.plant.GetVelocities(
         env.pace.robot.plant.GetMyContextFromRoot(env.pace.simulator.get_context())
     )
     assert np.abs(velocities).max() < 0.01
     assert env.asked == []
     env.reset()
-    assert env.asked == ["somebody asked for it"]
+    assert env.asked == ["stop requested by the user"]
 
 
 def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decision_that_was_cut(monkeypatch):
@@ -253,8 +253,8 @@ def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch
     env.keys.press()
     env.step(np.zeros(2))
     env.reset()
-    assert env.asked == ["somebody asked for it"]
-    assert env._acting.get_phase_output_port().Eval(env._mine)[0] == ArmState.RUNNING
+    assert env.asked == ["stop requested by the user"]
+    assert env._acting.get_arm_state_output_port().Eval(env._mine)[0] == ArmState.RUNNING
 
 
 def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypatch):
@@ -317,7 +317,7 @@ def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(e
 def test_what_stops_a_reset_stops_no_more_than_that(env):
     env.pace.happens = {env.pace.step + 20: env.keys.press}
     env.reset()
-    assert env.asked == ["somebody asked for it"]
+    assert env.asked == ["stop requested by the user"]
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
