@@ -503,7 +503,8 @@ def worlds() -> str:
     """What stations work on, and the signals that they have."""
     from pydrake.systems.framework import PortDataType
 
-    from guiderail.diagrams.envs.make import make_station, resolve
+    from guiderail.diagrams.envs.config import EnvConfig
+    from guiderail.diagrams.envs.make import make_station
     from guiderail.diagrams.stations import station as station_ports
     from guiderail.diagrams.stations.registry import STATIONS, stations_for
     from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
@@ -524,7 +525,7 @@ def worlds() -> str:
     page += table(["port", "size", "what it is"], rows)
     tasks = {TASKS.get(name).workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
     for kind, task in tasks.items():
-        world = resolve(task, {}).task.workcell()
+        world = EnvConfig.resolve(task, {}).make_task().workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
         page += f"`{type(world).__module__}.{type(world).__name__}`.\n\n"
         if kind == "workcell":
@@ -538,7 +539,7 @@ def worlds() -> str:
         for name in stations_for(kind):
             if not STATIONS.get(name).is_simulated:
                 continue
-            station = make_station(resolve(task, {"station": name}))
+            station = make_station(EnvConfig.resolve(task, {"station": name}).make_task())
             ports = (station.get_output_port(index) for index in range(station.num_output_ports()))
             sizes = {one.get_name(): one.size() for one in ports if one.get_data_type() == PortDataType.kVectorValued}
             rows.append((code(name), ", ".join(f"`{port}` {size}" for port, size in sizes.items())))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from guiderail.diagrams.envs.make import known
+from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
 from guiderail.diagrams.tasks.insertion import FARTHEST
 from guiderail.models.common.errors import InputError
@@ -207,7 +207,7 @@ def _strength(method: Method, action_dims: tuple[int, ...], action_scale: float)
         return {}
     # Built once more, only for its primitive: what the environment would explore with at κ = 1.
     histories = {key: value for key, value in method.environment.items() if key in ("history", "history_variance")}
-    skill = known(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
+    skill = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
     assert skill is not None
     indices = np.array(action_dims)
     if method.guidance == "residual":  # the same for all outputs of a unit, whose deviations differ

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from guiderail.diagrams.envs.config import STANDARD
+from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.units import MM

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.diagrams.envs.make import known, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.certificate import checker
 from guiderail.models.certificate.adversary import QUANTITIES, Adversary
@@ -74,12 +75,12 @@ def certify_skill(
         if not Path(of).is_dir():
             raise InputError("say where the certificate of a task goes with --out")
         out = Path(of) / "certificate"
-    demonstrated = known(task, **options).demonstrations
+    demonstrated = make_prior_knowledge(task, **options).demonstrations
     assert demonstrated is not None  # both kinds of guidance need them
     acted = guidance != "kmp"
     primitive = demonstrated.primitive(history=guidance == "skgrl", constrained=acted)
     # A reset goes by what was demonstrated, whatever via-points the primitive passes through.
-    start = primitive.constraints.nearest(resolve(task, options).task.reference().means[0])
+    start = primitive.constraints.nearest(EnvConfig.resolve(task, options).make_task().reference().means[0])
     within = _declared_start(task, options, len(start)) if start_within is None else np.full(len(start), start_within)
     if not (np.isfinite(within).all() and (within >= 0.0).all()):
         raise InputError(f"the robot begins within a distance that is not negative, not {within.min()}")
@@ -168,7 +169,7 @@ def corrected_steps(skill: SharedControlTemplate, certified: Certified) -> np.nd
 
 def _declared_start(task: str, options: Mapping[str, Any], size: int) -> np.ndarray:
     """(O,), how far beside its start the environment's history may begin: a reset's draw, and a pose's error."""
-    declared = resolve(task, options).task.start_within()
+    declared = EnvConfig.resolve(task, options).make_task().start_within()
     try:
         within = np.array(np.broadcast_to(declared, size), dtype=float)
     except (TypeError, ValueError):

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
 import guiderail.diagrams  # noqa: F401 (registers the environments)
-from guiderail.diagrams.envs.config import Options, validated
+from guiderail.diagrams.envs.options import Options, validate_options
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_envs, register_task_folder
 from guiderail.models.common.errors import InputError, brief
@@ -174,9 +174,9 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
         InputError: for an unknown task, or an argument that it does not take.
     """
     if task in TASKS.names():
-        from guiderail.diagrams.envs.make import resolve  # Drake takes a second, and a list of names should not
+        from guiderail.diagrams.envs.config import EnvConfig  # Drake takes a second, and a list of names should not
 
-        return resolve(task, arguments).values
+        return EnvConfig.resolve(task, arguments).options
     options = task_options(task)
     for name, value in arguments.items():
         if name not in options:
@@ -194,7 +194,7 @@ def check_reset(task: str, options: Mapping[str, Any]) -> None:
         InputError: for an unknown option, or a value of another kind or out of range.
     """
     if task in TASKS.names():
-        validated(TASKS.get(task).Reset, options, f"a reset of {task}")
+        validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
 
 
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,9 +13,9 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
-from guiderail.diagrams.envs.config import validated
 from guiderail.diagrams.envs.env import RECORDED, SAID
 from guiderail.diagrams.envs.observation import Observation, affine
+from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
@@ -63,14 +63,12 @@ def add_ledger(
 HALF_TURN_MARGIN = 0.1  # [rad] what actions and contact turn a motion further by
 
 
-def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidance: Mapping[str, Any]) -> PriorKnowledge:
-    """What a task knows, for guidance on a station.
+def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
+    """Return the prior knowledge that a task provides to guidance on a station.
 
     Args:
-        task: the declaration.
-        station: for its period and sizes.
-        primitive: options of `PrimitiveConfig` by name.
-        guidance: the kind of guidance's own options by name.
+        task: Task, with the options of its primitive and its guidance.
+        station: Station, for its period and sizes.
 
     Raises:
         InputError: if the reference trajectory has another clock than the station, or turns to where the station's
@@ -79,7 +77,7 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
     provides = task.provides()
     skill = None
     if "demonstrations" in provides:
-        options = dict(primitive)
+        options = task.config.part("primitive")
         reference = through(task.reference(), options.pop("via_points", ()), options.get("inverse_length", 2.0))
         _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
@@ -98,7 +96,7 @@ def known_of(task: Task, station: Station, primitive: Mapping[str, Any], guidanc
         demonstrations=skill,
         template=task.template() if "template" in provides else None,
         approach=task.approach() if "approach" in provides else None,
-        options=guidance,
+        options=task.config.part("guidance"),
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
     )
@@ -187,7 +185,7 @@ class Loop:
         self.builder = builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
         self.guidance = builder.AddNamedSystem("guidance", guidance)
-        check_guidance_ports(guidance, station.pose_size, station.wrench_size, task.choice.guidance)
+        check_guidance_ports(guidance, station.pose_size, station.wrench_size, task.config.guidance)
         builder.Connect(station.get_pose_output_port(), guidance.GetInputPort("pose"))
         builder.Connect(station.get_wrench_output_port(), guidance.GetInputPort("wrench"))
         builder.Connect(guidance.GetOutputPort("desired_pose"), station.get_desired_pose_input_port())
@@ -244,7 +242,7 @@ def build_task_diagram(
     terms = task.reward_terms(guidance.GetInputPort("action").size())
     reward = builder.AddNamedSystem("reward", RewardSystem(terms, task.name))
     rewarded = {name: size for term in terms for name, size in term.inputs.items()}
-    signals.connect(reward, rewarded, f"reward {task.choice.reward!r} of {task.name}")
+    signals.connect(reward, rewarded, f"reward {task.config.reward!r} of {task.name}")
 
     too_much = builder.AddNamedSystem("collision", affine(np.eye(1), [-task.collision.above]))
     builder.Connect(signals.get(task.collision.signal, f"the ledger of {task.name}"), too_much.get_input_port())
@@ -289,7 +287,7 @@ def build_task_diagram(
         _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
-    displaces = GUIDANCE.get(task.choice.guidance).displaces  # what a symmetry of the task takes an action for
+    displaces = GUIDANCE.get(task.config.guidance).displaces  # what a symmetry of the task takes an action for
     return TaskDiagram(
         diagram=diagram,
         control_period=period,
@@ -297,7 +295,7 @@ def build_task_diagram(
         observation_space=loop.space,
         reward_terms=reward.term_names,
         ledger_fields=SafetyLedger.FIELDS,
-        randomize=randomizes(task, station, guidance),
+        randomize=make_randomize(task, station, guidance),
         push=_push(station) if task.pushable else None,
         query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
         symmetry=task.symmetry() if displaces else None,
@@ -351,7 +349,7 @@ def build_skill_diagram(
     if not isinstance(policy, System):
         port = loop.observation
         seen_as = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
-        policy = PolicySystem(policy, seen_as, action.size(), task.choice.action_repeat * station.control_period)
+        policy = PolicySystem(policy, seen_as, action.size(), task.config.action_repeat * station.control_period)
     builder.AddNamedSystem("policy", policy)
     seen, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
     if seen.size() != loop.observation.size() or acts.size() != action.size():
@@ -370,7 +368,9 @@ def build_skill_diagram(
         _add_picture(builder, task, station)
     diagram = builder.Build()
     diagram.set_name(f"{task.name.replace('/', '_')}_skill")
-    return SkillDiagram(diagram, station.control_period, task.num_steps, randomizes(task, station, guidance), meshcat)
+    return SkillDiagram(
+        diagram, station.control_period, task.num_steps, make_randomize(task, station, guidance), meshcat
+    )
 
 
 def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
@@ -397,11 +397,13 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
     return violations
 
 
-def randomizes(task: Task, station: Station, guidance: Diagram) -> Any:
+def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
     """What draws an episode's conditions and writes them into the root context: `TaskDiagram.randomize`."""
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
-        drawn = task.reset(station, guidance, context, rng, validated(task.Reset, options, f"a reset of {task.name}"))
+        drawn = task.reset(
+            station, guidance, context, rng, validate_options(task.Reset, options, f"a reset of {task.name}")
+        )
         if not isinstance(drawn, Mapping):
             raise InputError(
                 f"reset of {task.name} returns what it drew by name, {{}} where it drew nothing, not {brief(drawn)}"

@@ -1,144 +1,237 @@
-"""Options of environments and resets: declared with their type and range, and refused in a sentence."""
+"""Configuration of an environment: resolved and validated once, then passed on as one immutable object."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeVar
+import os
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
-import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
-
+from guiderail.diagrams.envs.options import (
+    STANDARD,
+    CommonOptions,
+    Options,
+    PrimitiveOptions,
+    TemplateOptions,
+    check_choice,
+    validate_options,
+)
+from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind, check_guidance, possible_guidance
+from guiderail.diagrams.stations.disturbances import Disturbances
+from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
+from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
+from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 
-STANDARD = "standard"
-"""The difficulty of every task unless another one is asked for."""
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Configuration of an environment, every option validated and every default filled in.
+
+    Attributes:
+        task: Name of the task.
+        guidance: Name of the guidance.
+        station: Name of the station.
+        reward: Name of the reward.
+        observation: Name of the observation.
+        difficulty: Name of the difficulty.
+        action_repeat: Control steps per action.
+        parts: All other options by the part that they configure: "task", "station", "primitive", "template",
+            "guidance" and "disturbances".
+    """
+
+    task: str
+    guidance: str
+    station: str
+    reward: str
+    observation: str
+    difficulty: str
+    action_repeat: int
+    parts: Mapping[str, Options] = field(hash=False)
+
+    @classmethod
+    def resolve(cls, task: str, options: Mapping[str, Any] | None = None) -> EnvConfig:
+        """Validate the options of a task's environment and fill in the defaults.
+
+        The same options are resolved once in a process. Resolving the `options` of a configuration returns an equal one.
+
+        Args:
+            task: Name of the task, or path of a task folder.
+            options: Options by name, as `gymnasium.make` takes them. Later ones override earlier ones: the task's
+                defaults, those of the difficulty, these.
+
+        Raises:
+            InputError: If a task, an option or a word is unknown, a value is out of range, or two do not go together.
+        """
+        if task not in TASKS.names() and is_task_folder(task):
+            task = register_task_folder(task)
+        task_class, options = TASKS.get(task), dict(options or {})
+        key = _cache_key(task_class, options)
+        config, *kinds = _RESOLVED.get(key, (None,))
+        if config is None or kinds != [config.guidance_kind, config.station_kind]:
+            config = _resolve(task_class, options)
+            if len(_RESOLVED) >= _MAX_RESOLVED:
+                _RESOLVED.clear()
+            entry = (config, config.guidance_kind, config.station_kind)
+            _RESOLVED[key] = _RESOLVED[_cache_key(task_class, config.options)] = entry
+        return config
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> EnvConfig:
+        """Return the configuration of plain values, as `to_dict` returns and a YAML file holds them.
+
+        Raises:
+            InputError: As `resolve`, or if the task's name is missing.
+        """
+        options = dict(values)
+        if "task" not in options:
+            raise InputError("the configuration of an environment names no task: add one, such as task: NarrowPassage")
+        return cls.resolve(options.pop("task"), options)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the task's name and all options as plain values: lists instead of tuples."""
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in self.options.items()}
+        return {"task": self.task, **plain}
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """All options by name, as `gymnasium.make` takes them."""
+        common = {name: getattr(self, name) for name in CommonOptions.model_fields}
+        return common | {name: value for part in self.parts for name, value in self.part(part).items()}
+
+    def part(self, name: str) -> dict[str, Any]:
+        """Return the options of one part by name."""
+        model = self.parts[name]
+        return {option: getattr(model, option) for option in type(model).model_fields}
+
+    @property
+    def guidance_kind(self) -> GuidanceKind:
+        """Registered kind of the guidance."""
+        return GUIDANCE.get(self.guidance)
+
+    @property
+    def station_kind(self) -> StationKind:
+        """Registered kind of the station."""
+        return STATIONS.get(self.station)
+
+    def make_task(self) -> Task:
+        """Return a new instance of the task; its hidden offsets are not yet sampled."""
+        return TASKS.get(self.task)(self)
 
 
-class Options(BaseModel):
-    """Options by name; what is not declared is refused, and so is a number that is none."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True)
-
-
-def _listed(value: Any) -> Any:
-    """What a shell or an array gives for several numbers, as a list."""
-    if isinstance(value, str):
-        return [part for part in value.split(",") if part.strip()]
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def _no_truth(value: Any) -> Any:
-    """True is no number."""
-    if isinstance(value, bool | np.bool_):
-        raise ValueError("it is a number")
-    return value.item() if isinstance(value, np.number) else value
-
-
-Integer = Annotated[int, BeforeValidator(_no_truth)]
-Number = Annotated[float, BeforeValidator(_no_truth)]
-Integers = Annotated[tuple[Integer, ...], BeforeValidator(_listed)]
-Numbers = Annotated[tuple[Number, ...], BeforeValidator(_listed)]
-
-
-class PrimitiveOptions(Options):
-    """Of every guidance made of demonstrations; see `PrimitiveConfig`."""
-
-    action_scale: Number = Field(1.0, gt=0, description="κ: a constant action of ±1 ends √3 κ standard deviations away")
-    action_dims: Integers | None = Field(
-        None, description="the outputs that an action moves, by number; none named: all"
-    )
-    history: Integer = Field(10, ge=1, le=1000, description="P, past outputs that sKGRL's motion passes through")
-    history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], how exactly it does")
-    history_source: Literal["commanded", "measured"] = Field("commanded", description="what counts as the past")
-    adaptive_history: bool = Field(False, description="whether the history shrinks in contact")
-    gains: Numbers | None = Field(None, description="raw null-space units per action, instead of those from κ")
-    horizon: Integer = Field(40, ge=0, le=1000, description="H, future points at which constraints are kept")
-    lambda_: Number = Field(6.0, ge=0, description="λ of problem 4.5")
-    beta: Number = Field(6.0, gt=0, description="β of problem 4.5")
-    inverse_length: Number = Field(2.0, gt=0, description="of the kernel")
-    via_points: Numbers = Field(
-        (), description="what the mean passes through: a control step and an output each, one after another"
-    )
-    solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="of the constrained primitive's QP")
-
-
-class TemplateOptions(Options):
-    """Of every guidance made of a shared control template."""
-
-    active_constraints: bool | None = Field(
-        None, description="whether commands stay inside the template's active constraints; with sct only unless given"
-    )
-
-
-class ResetOptions(Options):
-    """Of every reset."""
-
-    held_out: bool = Field(False, description="draw from conditions that training never draws")
-
-
-Model = TypeVar("Model", bound=BaseModel)
-
-
-def validated(model: type[Model], values: Mapping[str, Any], whose: str) -> Model:
-    """The options of a model, checked and converted.
+def option_models(task: type[Task], guidance: str, station: str) -> dict[str, type[Options]]:
+    """Return the models of all options of an environment by part; "common" are those of every environment.
 
     Raises:
-        InputError: for an unknown name, a value of another kind or one out of range.
+        InputError: If the guidance or the station is unknown, or the task lacks what the guidance requires.
     """
-    unknown = [name for name in values if name not in model.model_fields]
-    if unknown:
-        raise InputError(f"{whose} has no option {brief(unknown[0])}: {did_you_mean(unknown[0], model.model_fields)}")
+    kind = check_guidance(guidance, task.provides(), task.name)
+    return {
+        "common": CommonOptions,
+        "task": task.Options,
+        "station": STATIONS.get(station).options or Options,
+        "primitive": PrimitiveOptions if "demonstrations" in task.provides() else Options,
+        "template": TemplateOptions if "template" in task.provides() else Options,
+        "guidance": kind.options or Options,
+        "disturbances": Disturbances if task.workcell_kind == "workcell" else Options,
+    }
+
+
+_RESOLVED: dict[Hashable, Any] = {}
+_MAX_RESOLVED = 512  # entries before the cache is emptied
+
+
+def _cache_key(task: type[Task], options: Mapping[str, Any]) -> Hashable:
+    """Return a key that is equal for the same options of the same task; a new one if an option is not comparable.
+
+    The registered names and the working directory belong to it because defaults and relative paths depend on them.
+    """
     try:
-        return model(**values)
-    except ValidationError as error:
-        raise InputError(_sentence(error.errors()[0], values)) from None
+        values = tuple(sorted((name, _freeze(value)) for name, value in options.items()))
+        key = (task, values, tuple(GUIDANCE.names()), tuple(STATIONS.names()), os.getcwd())
+        hash(key)
+    except (TypeError, OSError):
+        return object()
+    return key
 
 
-def choose(name: str, value: Any, choices: list[str], whose: str) -> str:
-    """One of several words.
+def _freeze(value: Any) -> tuple[str, Any]:
+    """Return a plain value with its type, because True, 1 and 1.0 are equal.
 
     Raises:
-        InputError: if it is none of them.
+        TypeError: If the value is not plain.
     """
-    if value not in choices:
-        raise InputError(f"{whose} has no {name} {brief(value)}: {did_you_mean(value, choices)}")
-    return str(value)
+    if isinstance(value, list | tuple):
+        return "list", tuple(_freeze(entry) for entry in value)
+    if value is not None and type(value) not in (bool, int, float, str):
+        raise TypeError
+    return type(value).__name__, repr(value)
 
 
-def described(model: type[BaseModel] | None) -> list[dict[str, Any]]:
-    """The options of a model for a list: name, type, default, range and words."""
-    if model is None:
-        return []
-    properties = model.model_json_schema()["properties"]
-    rows = []
-    for name, field in model.model_fields.items():
-        schema = properties[name]
-        bounds = {
-            key: schema[key] for key in ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum") if key in schema
-        }
-        kinds = [schema] if "type" in schema or "enum" in schema else schema.get("anyOf", [])
-        row = {
-            "name": name,
-            "type": " or ".join(str(kind.get("type", "any")) for kind in kinds),
-            "default": field.default,
-        }
-        choices = schema.get("enum")
-        rows.append(row | ({"choices": choices} if choices else {}) | bounds | {"description": field.description or ""})
-    return rows
+def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
+    name = task.name
+    stations = stations_for(task.workcell_kind)
+    if not stations:
+        kinds = {STATIONS.get(station).world for station in STATIONS.names()}
+        raise InputError(
+            f"no station works on a workcell of the kind {brief(task.workcell_kind)}, which {name} has: "
+            f"{did_you_mean(task.workcell_kind, kinds)}"
+        )
+    guidance = possible_guidance(task.provides())
+    if not guidance:
+        raise InputError(f"no guidance can be built for {name}: write its reference(), template() or approach()")
+    difficulty = check_choice("difficulty", options.get("difficulty", STANDARD), list(task.difficulties), name)
+    merged = {
+        "guidance": guidance[0],
+        "station": stations[0],
+        "reward": task.rewards[0],
+        "observation": task.observations[0],
+        **task.defaults,
+        **task.difficulties[difficulty],
+        **options,
+    }
+    check_choice("station", merged["station"], stations, name)
+    check_choice("reward", merged["reward"], list(task.rewards), name)
+    check_choice("observation", merged["observation"], list(task.observations), name)
+
+    models = option_models(task, merged["guidance"], merged["station"])
+    known = {option for model in models.values() for option in model.model_fields}
+    _check_declared_options(task, known)
+    _check_given_options(task, stations, options, known)
+    parts: dict[str, Any] = {
+        part: validate_options(
+            model, {option: merged[option] for option in model.model_fields if option in merged}, name
+        )
+        for part, model in models.items()
+    }
+    common = parts.pop("common")
+    config = EnvConfig(name, **{option: getattr(common, option) for option in CommonOptions.model_fields}, parts=parts)
+    config.make_task()  # its constructor refuses options that do not go together
+    return config
 
 
-def _sentence(error: Any, values: Mapping[str, Any]) -> str:
-    """What pydantic found, in a sentence that names the option and the remedy."""
-    name = str(error["loc"][0])
-    value, kind, context = values.get(name), error["type"], error.get("ctx", {})
-    if kind == "literal_error":
-        choices = [word.strip().strip("'") for word in context["expected"].replace(" or ", ", ").split(",")]
-        return f"there is no {name} {brief(value)}: {did_you_mean(value, choices)}"
-    bounds = {"greater_than": "more than", "greater_than_equal": "at least", "less_than": "less than"}
-    bounds["less_than_equal"] = "at most"
-    if kind in bounds:
-        (bound,) = context.values()
-        return f"{name} must be {bounds[kind]} {bound:g}, not {brief(value)}"
-    message = str(error["msg"]).removeprefix("Value error, ")
-    return f"{name} cannot be {brief(value)}: {message[:1].lower()}{message[1:]}"
+def _check_declared_options(task: type[Task], known: set[str]) -> None:
+    """Refuse a default or a difficulty that sets an option which the task has with no guidance on no station."""
+    for context, settings in {"defaults": task.defaults, **task.difficulties}.items():
+        for option in set(settings) - known:
+            anywhere = {
+                each
+                for guidance in possible_guidance(task.provides())
+                for station in stations_for(task.workcell_kind)
+                for model in option_models(task, guidance, station).values()
+                for each in model.model_fields
+            }
+            if option not in anywhere:
+                raise InputError(
+                    f"{context} of {task.name} sets no option {brief(option)}: {did_you_mean(option, anywhere)}"
+                )
+
+
+def _check_given_options(task: type[Task], stations: list[str], options: Mapping[str, Any], known: set[str]) -> None:
+    unknown = sorted(set(options) - known)
+    if not unknown:
+        return
+    elsewhere = [name for name in stations if unknown[0] in (STATIONS.get(name).options or Options).model_fields]
+    remedy = f"it is one of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
+    raise InputError(f"{task.name} has no option {brief(unknown[0])} here: {remedy}")

@@ -12,7 +12,7 @@ from guiderail.models.common.registry import Registry
 if TYPE_CHECKING:
     from pydrake.systems.framework import Diagram
 
-    from guiderail.diagrams.envs.config import Options
+    from guiderail.diagrams.envs.options import Options
     from guiderail.diagrams.guidance.prior import PriorKnowledge
 
 REQUIREMENTS = {

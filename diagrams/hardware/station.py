@@ -19,7 +19,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 from pydrake.systems.lcm import LcmInterfaceSystem, LcmSubscriberSystem, SerializerInterface
 from pydrake.systems.primitives import MatrixGain
 
-from guiderail.diagrams.envs.config import Number, Options
+from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.hardware.bus import open_bus
 from guiderail.diagrams.hardware.driver import MICROSECOND, Driver
 from guiderail.diagrams.hardware.monitor import WordSerializer, word_channel

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field, field_validator
 from pydrake.systems.framework import Context, DiagramBuilder
 
-from guiderail.diagrams.envs.config import Integer, Number, Numbers, Options
+from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     OUTPUTS,

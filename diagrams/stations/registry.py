@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from guiderail.models.common.registry import Registry
 
 if TYPE_CHECKING:
-    from guiderail.diagrams.envs.config import Options
+    from guiderail.diagrams.envs.options import Options
     from guiderail.diagrams.stations.station import Station
 
 

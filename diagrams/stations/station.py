@@ -42,7 +42,7 @@ from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, Multibod
 from pydrake.multibody.tree import Frame, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
 
-from guiderail.diagrams.envs.config import Number, Options
+from guiderail.diagrams.envs.options import Number, Options
 from guiderail.diagrams.envs.task_diagram import round_period
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.errors import InputError, brief

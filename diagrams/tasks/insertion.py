@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import Field, field_validator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
-from guiderail.diagrams.envs.config import Numbers, ResetOptions
 from guiderail.diagrams.envs.observation import affine
+from guiderail.diagrams.envs.options import Numbers, ResetOptions
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import HiddenOffsets
 from guiderail.diagrams.tasks.task import Task

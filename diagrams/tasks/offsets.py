@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, field_validator
 
-from guiderail.diagrams.envs.config import Numbers, Options
+from guiderail.diagrams.envs.options import Numbers, Options
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import POSE_SIZE

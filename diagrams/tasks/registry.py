@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from guiderail.diagrams.envs.config import STANDARD, Options, ResetOptions
+from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import ConstantVectorSource
 
-from guiderail.diagrams.envs import config as declared
+from guiderail.diagrams.envs import options as option_models
 from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_plane
@@ -22,6 +22,9 @@ from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.config import EnvConfig
 
 
 class EpisodeConstant:
@@ -58,25 +61,6 @@ class Threshold:
     above: float = 0.0
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What every environment is made with.
-
-    Attributes:
-        guidance, station, reward, observation, difficulty: words.
-        hold: control steps per decision.
-        values: all options, those of the task too, by name.
-    """
-
-    guidance: str
-    station: str
-    reward: str
-    observation: str
-    difficulty: str
-    action_repeat: int
-    values: Mapping[str, Any] = field(default_factory=dict)
-
-
 class Task(ABC):
     """What is done, in what world, for what reward, and how an episode begins and ends.
 
@@ -89,7 +73,7 @@ class Task(ABC):
         workcell_kind: the kind of world, "workcell" unless given: only stations that are registered for it can be used.
         Options: the model of the task's own options, a subclass of `guiderail.Options`.
         Reset: the model of the options of a reset, a subclass of `guiderail.ResetOptions`.
-        rewards: names that `reward=` chooses from; the first one unless given. `choice.reward` is the chosen one.
+        rewards: names that `reward=` chooses from; the first one unless given. `config.reward` is the chosen one.
         observations: names that `observation=` chooses from; the first one unless given.
         defaults: options of the environment, by name, that differ from what they are elsewhere, such as the guidance.
         difficulties: names that `difficulty=` chooses from, each with the options that it stands for. "standard" must
@@ -104,7 +88,7 @@ class Task(ABC):
             alike. None is one group of all.
         pushable: whether `GuidedEnv.push` may displace the robot.
         options: the task's own options, checked: an instance of `Options`.
-        choice: what every environment is made with.
+        config: Configuration of the environment.
         has_held_out_distribution: whether `reset` draws from conditions that training never draws where `options.held_out` is
             true. Without it an evaluation repeats conditions of training, and says so.
         drawn: what `signals` adds to a diagram and a reset sets, by name. A diagram is used again by whoever asks for
@@ -113,12 +97,12 @@ class Task(ABC):
 
     name: ClassVar[str] = ""
     workcell_kind: ClassVar[str] = "workcell"
-    Options: ClassVar[type[declared.Options]] = declared.Options
-    Reset: ClassVar[type[declared.ResetOptions]] = declared.ResetOptions
+    Options: ClassVar[type[option_models.Options]] = option_models.Options
+    Reset: ClassVar[type[option_models.ResetOptions]] = option_models.ResetOptions
     rewards: ClassVar[tuple[str, ...]] = ("sparse",)
     observations: ClassVar[tuple[str, ...]] = ("state",)
     defaults: ClassVar[Mapping[str, Any]] = {}
-    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {declared.STANDARD: {}}
+    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {option_models.STANDARD: {}}
     learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "tqc_contact"}
     num_steps: int
     clip: ClassVar[float] = 3.0
@@ -127,14 +111,14 @@ class Task(ABC):
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
 
-    def __init__(self, options: declared.Options, choice: Choice):
-        """
+    def __init__(self, config: EnvConfig):
+        """Construct the task; a subclass may refuse options that do not go together.
+
         Args:
-            options: the task's own, checked.
-            choice: what every environment is made with.
+            config: Configuration of the environment.
         """
-        self.options = options
-        self.choice = choice
+        self.config = config
+        self.options = config.parts["task"]
         self.drawn: dict[str, EpisodeConstant] = {}
 
     # What there is.
@@ -180,11 +164,11 @@ class Task(ABC):
 
     @abstractmethod
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """What a policy sees, for `choice.observation`."""
+        """What a policy sees, for `config.observation`."""
 
     @abstractmethod
     def reward_terms(self, num_actions: int) -> Sequence[RewardTerm]:
-        """The terms of a control step's reward, for `choice.reward`."""
+        """The terms of a control step's reward, for `config.reward`."""
 
     @abstractmethod
     def termination_terms(self) -> Sequence[TerminationTerm]:

@@ -20,7 +20,7 @@ import numpy as np
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.envs.make import known
+from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
@@ -81,7 +81,7 @@ def _policy(observations: int, actions: int) -> Policy:
 def _parts() -> list[Row]:
     number = round(SECONDS / PERIOD)
     policy, observation = _policy(13, 2), np.zeros(13, np.float32)
-    skill = known(TASK, guidance="skgrl").demonstrations
+    skill = make_prior_knowledge(TASK, guidance="skgrl").demonstrations
     assert skill is not None
     rows = [_row("policy", HOLD * CONTROL_PERIOD, _timed(lambda index: policy(observation), number))]
     rng = np.random.default_rng(0)

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
-from guiderail.diagrams.envs.make import known
+from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
@@ -41,7 +41,7 @@ PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10
 
 def primitive_of(kind: str, variance: float = SHOWN) -> LcNsKmp:
     """The narrow passage's primitive, with a history for sKGRL."""
-    skill = known("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
+    skill = make_prior_knowledge("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
     assert skill is not None
     return skill.primitive(history=kind == "skgrl")
 

@@ -1,12 +1,12 @@
 from .diagrams.envs.assemble import build_skill_diagram as build_skill_diagram
 from .diagrams.envs.assemble import build_task_diagram as build_task_diagram
-from .diagrams.envs.config import Options as Options
-from .diagrams.envs.config import ResetOptions as ResetOptions
 from .diagrams.envs.env import GuidedEnv as GuidedEnv
 from .diagrams.envs.make import make_env as make_env
 from .diagrams.envs.make import make_skill as make_skill
 from .diagrams.envs.observation import Observation as Observation
 from .diagrams.envs.observation import ObservationTerm as ObservationTerm
+from .diagrams.envs.options import Options as Options
+from .diagrams.envs.options import ResetOptions as ResetOptions
 from .diagrams.envs.task_diagram import TaskDiagram as TaskDiagram
 from .diagrams.envs.task_diagram import round_period as round_period
 from .diagrams.guidance.function import FunctionGuidance as FunctionGuidance

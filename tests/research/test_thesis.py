@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import pytest
 
-from guiderail.diagrams.envs.make import option_models
+from guiderail.diagrams.envs.config import option_models
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances
 from guiderail.diagrams.stations.registry import stations_for

@@ -3,7 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
 from guiderail.models.common.errors import InputError
 from guiderail.tools.certify import _declared_start, certify_skill
@@ -87,7 +88,7 @@ def test_without_actions_held_out_episodes_stay_in_the_bounds(tmp_path, difficul
 def declared_start(task, **environment):
     """How far beside its start a certificate lets a task's robot begin."""
     options = check_environment(task, environment)
-    return _declared_start(task, options, resolve(task, options).task.reference().num_outputs)
+    return _declared_start(task, options, EnvConfig.resolve(task, options).make_task().reference().num_outputs)
 
 
 def test_a_start_is_within_what_the_task_declares_and_the_error_of_its_measurement():

@@ -7,8 +7,9 @@ import gymnasium
 import numpy as np
 import pytest
 
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.env import RECORDED, SAID
-from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
@@ -54,9 +55,10 @@ class Own(Task):
 
 
 class Ignorant(Task):
-    """Nobody wrote down anything about it."""
+    """Task that provides nothing to guidance."""
 
-    world, observed, reward_terms, conditions, reset = Own.world, Own.observed, Own.reward_terms, Own.conditions, None
+    workcell, observation_terms, reward_terms = Own.workcell, Own.observation_terms, Own.reward_terms
+    termination_terms, reset = Own.termination_terms, None
 
 
 @pytest.fixture(autouse=True)
@@ -98,24 +100,24 @@ def test_a_declaration_of_the_wrong_kind_is_refused_where_it_is_made(attributes,
 @pytest.mark.parametrize(
     ("attributes", "says"),
     [
-        ({"workcell_kind": "planes"}, "a world of the kind 'planes', which lab/Own has: did you mean plane"),
+        ({"workcell_kind": "planes"}, "a workcell of the kind 'planes', which lab/Own has: did you mean plane"),
         (
             {"of": Ignorant, "workcell_kind": "plane"},
-            "nothing guides lab/Own, as it knows nothing: write its reference",
+            "no guidance can be built for lab/Own: write its reference",
         ),
         ({"difficulties": {"standard": {}, "hard": {"gapp": 1}}}, "hard of lab/Own sets no option 'gapp'"),
-        ({"defaults": {"hodl": 5}}, "defaults of lab/Own sets no option 'hodl': did you mean hold"),
+        ({"defaults": {"histroy": 5}}, "defaults of lab/Own sets no option 'histroy': did you mean history"),
     ],
 )
 def test_what_no_environment_can_be_made_of_is_a_sentence(attributes, says):
     declare(**attributes)
     with pytest.raises(InputError, match=says):
-        resolve("lab/Own", {})
+        EnvConfig.resolve("lab/Own", {})
 
 
 def test_settings_of_another_guidance_are_no_mistake():
     declare(difficulties={"standard": {}, "hard": {"history": 4}}, defaults={"guidance": "kmp"})
-    assert resolve("lab/Own", {"difficulty": "hard"}).values["guidance"] == "kmp"
+    assert EnvConfig.resolve("lab/Own", {"difficulty": "hard"}).options["guidance"] == "kmp"
 
 
 @pytest.mark.parametrize(
@@ -126,7 +128,7 @@ def test_settings_of_another_guidance_are_no_mistake():
         ({"reward": lambda self, pose: None}, "reward term 'a' of lab/Own must be one number, and it is None"),
         ({"reward": lambda self, place: 0.0}, "reward term 'a' of lab/Own is called with .*, pose, and takes place"),
         (
-            {"conditions": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
+            {"termination_terms": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
             "the condition 'success' of lab/Own is called with .*, pose, and takes position",
         ),
         ({"reset": lambda self, *given: None}, "reset of lab/Own returns what it drew by name, {} .*, not None"),
@@ -141,7 +143,7 @@ def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, 
 @pytest.mark.parametrize(
     ("observed", "says"),
     [
-        ((), "the observation of lab/Own is of nothing: let observed"),
+        ((), "the observation of lab/Own is of nothing: let observation_terms"),
         ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is of nothing"),
         (
             (ObservationTerm("pose", scale=0.0),),
@@ -165,13 +167,13 @@ def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, 
     ],
 )
 def test_what_cannot_be_observed_is_refused_when_the_task_is_assembled(observed, says):
-    declare(observed=lambda self: observed)
+    declare(observation_terms=lambda self: observed)
     with pytest.raises(InputError, match=says):
         make_env("lab/Own", guidance="kmp")
 
 
 def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
-    declare(observed=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
+    declare(observation_terms=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
     env = make_env("lab/Own", guidance="kmp")
     seen, _ = env.reset(seed=0)
     x, y = env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
@@ -208,7 +210,10 @@ def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number)
         builder.Connect(station.get_pose_output_port(), broken.get_input_port())
         return {"broken": broken.get_output_port()}
 
-    declare(signals=signals, observed=lambda self: (ObservationTerm("phase"), ObservationTerm("broken", entries=(1,))))
+    declare(
+        signals=signals,
+        observation_terms=lambda self: (ObservationTerm("phase"), ObservationTerm("broken", entries=(1,))),
+    )
     with pytest.raises(InputError, match=r"the observation of lab/Own is not finite, but"):
         first_step()
 
@@ -216,8 +221,8 @@ def test_an_observation_that_is_not_finite_is_named_and_not_learned_from(number)
 @pytest.mark.parametrize("number", [0, None])
 def test_a_number_of_steps_that_a_constructor_gets_wrong_is_refused(number):
     class Late(Own):
-        def __init__(self, options, choice):
-            super().__init__(options, choice)
+        def __init__(self, config):
+            super().__init__(config)
             self.num_steps = number
 
     declare(of=Late, num_steps=np.int64(NUM_STEPS))
@@ -226,19 +231,21 @@ def test_a_number_of_steps_that_a_constructor_gets_wrong_is_refused(number):
 
 
 def test_a_world_that_is_none_is_a_sentence():
-    declare(world=lambda self: None)
-    with pytest.raises(InputError, match=r"world\(\) of lab/Own returns nothing: let it return what station='plane'"):
+    declare(workcell=lambda self: None)
+    with pytest.raises(
+        InputError, match=r"workcell\(\) of lab/Own returns nothing: let it return what station='plane'"
+    ):
         make_env("lab/Own", guidance="kmp")
 
 
 def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
     declare()
-    assert "conditions as in training" in evaluation_scope("lab/Own", {}, fresh=False)
+    assert "conditions as in training" in evaluation_scope("lab/Own", {}, resample_offsets=False)
     words = options_in_words("lab/Own")
     assert words["reset: held_out"].startswith("nothing here")
     assert words["reward"] == "what is rewarded: the task's own, which has no name"
     declare(has_held_out_distribution=True)
-    assert evaluation_scope("lab/Own", {}, fresh=False) == "a policy for starts that training never drew"
+    assert evaluation_scope("lab/Own", {}, resample_offsets=False) == "a policy for starts that training never drew"
     assert options_in_words("lab/Own")["reset: held_out"].startswith("draw from conditions that training never")
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-from guiderail.diagrams.envs.config import PrimitiveOptions, TemplateOptions, described
-from guiderail.diagrams.envs.make import CommonOptions, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.options import CommonOptions, PrimitiveOptions, TemplateOptions, describe_options
 from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
@@ -33,10 +33,10 @@ def everything() -> dict[str, Any]:
         "end_effectors": {name: {"is": find_end_effector(name).title} for name in end_effector_names()},
         "learners": {name: {} for name in LEARNERS.names()},
         "options": {
-            "of every environment": described(CommonOptions),
-            "of guidance made of demonstrations": described(PrimitiveOptions),
-            "of guidance made of a template": described(TemplateOptions),
-            "of everything that an insertion may be disturbed by": described(Disturbances),
+            "of every environment": describe_options(CommonOptions),
+            "of guidance made of demonstrations": describe_options(PrimitiveOptions),
+            "of guidance made of a template": describe_options(TemplateOptions),
+            "of everything that an insertion may be disturbed by": describe_options(Disturbances),
         },
     }
 
@@ -57,8 +57,8 @@ def task(name: str) -> dict[str, Any]:
         "observations": list(declared.observations),
         "difficulties": {level: dict(settings) for level, settings in declared.difficulties.items()},
         "defaults": {**declared.defaults, **declared.learner},
-        "options": described(declared.Options),
-        "reset_options": described(declared.Reset),
+        "options": describe_options(declared.Options),
+        "reset_options": describe_options(declared.Reset),
     }
 
 
@@ -70,7 +70,7 @@ def options_in_words(name: str) -> dict[str, str]:
     """
     if name not in TASKS.names():
         return {key: f"{value!r}" for key, value in task_options(name).items()}
-    resolved = resolve(name, {})
+    config = EnvConfig.resolve(name, {})
     declared = TASKS.get(name)
     choices = {
         "guidance": possible_guidance(declared.provides()),
@@ -80,14 +80,14 @@ def options_in_words(name: str) -> dict[str, str]:
         "difficulty": tuple(declared.difficulties),
     }
     words = {}
-    for model in resolved.models.values():
-        for row in described(type(model)):
-            words[row["name"]] = _option(row, resolved.values[row["name"]], choices.get(row["name"], ()))
+    for model in (CommonOptions, *map(type, config.parts.values())):
+        for row in describe_options(model):
+            words[row["name"]] = _option(row, config.options[row["name"]], choices.get(row["name"], ()))
     for kind in map(GUIDANCE.get, choices["guidance"]):
-        if kind.name != resolved.task.choice.guidance:
+        if kind.name != config.guidance:
             own = {
                 row["name"]: f"of guidance={kind.name}: {_option(row, row['default'])}"
-                for row in described(kind.options)
+                for row in describe_options(kind.options)
             }
             words |= {key: f"{words[key]}; {said}" if key in words else said for key, said in own.items()}
     for difficulty, settings in declared.difficulties.items():
@@ -96,7 +96,7 @@ def options_in_words(name: str) -> dict[str, str]:
             words[f"difficulty={difficulty}"] = f"stands for {stands_for}"
     if declared.rewards is Task.rewards:
         words["reward"] = "what is rewarded: the task's own, which has no name"
-    reset = {f"reset: {row['name']}": row["description"] for row in described(declared.Reset)}
+    reset = {f"reset: {row['name']}": row["description"] for row in describe_options(declared.Reset)}
     if not declared.has_held_out_distribution:
         reset["reset: held_out"] = "nothing here: the task declares no conditions that training never draws"
     return words | reset
@@ -118,7 +118,7 @@ def _guidance(name: str) -> dict[str, Any]:
         "needs": [list(needed) for needed in kind.needs],
         "inputs": list(GUIDANCE_INPUTS),
         "outputs": list(GUIDANCE_OUTPUTS),
-        "options": described(kind.options),
+        "options": describe_options(kind.options),
     }
 
 
@@ -129,7 +129,7 @@ def _station(name: str) -> dict[str, Any]:
         "world": kind.world,
         "inputs": list(STATION_INPUTS),
         "outputs": list(STATION_OUTPUTS),
-        "options": described(kind.options),
+        "options": describe_options(kind.options),
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from guiderail.diagrams.envs.config import validated
+from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.part.file import Bounds, PartTaskFile, read_task_file, write_task_file
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.bounds import DemonstratedBounds, demonstrated_bounds
@@ -83,7 +83,7 @@ def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
 
 def _with_bounds(folder: Path, values: dict[str, Any]) -> PartTaskFile:
     """A task folder's file with these bounds instead of its own."""
-    return read_task_file(folder).model_copy(update={"bounds": validated(Bounds, values, str(folder))})
+    return read_task_file(folder).model_copy(update={"bounds": validate_options(Bounds, values, str(folder))})
 
 
 def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> None:

@@ -25,14 +25,15 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
     Raises:
         InputError: for an unknown task or option.
     """
-    from guiderail.diagrams.envs.make import resolve  # Drake takes a second
+    from guiderail.diagrams.envs.config import EnvConfig  # Drake takes a second
 
-    resolved = resolve(task, environment)
-    if "demonstrations" not in resolved.task.provides():
+    config = EnvConfig.resolve(task, environment)
+    declared = config.make_task()
+    if "demonstrations" not in declared.provides():
         return None
-    values = resolved.values
+    values = config.options
     chosen = {name: values[name] for name in ("inverse_length", "lambda_", "beta", "horizon")}
-    share = estimated_share(resolved.task.reference(), **chosen)
+    share = estimated_share(declared.reference(), **chosen)
     if share >= ENOUGH:
         return None
     return (

@@ -149,7 +149,7 @@ def make_baseline(task: str, name: str, seed: int = 0) -> Callable[[gymnasium.En
     find_scripted_policy(task, name)
 
     def acting(env: gymnasium.Env) -> PolicyFn:
-        choice = getattr(cast(Any, env.unwrapped).task.declaration, "choice", None)
-        return find_scripted_policy(task, name, getattr(choice, "difficulty", "standard"))
+        config = getattr(cast(Any, env.unwrapped).task.declaration, "config", None)
+        return find_scripted_policy(task, name, getattr(config, "difficulty", "standard"))
 
     return acting

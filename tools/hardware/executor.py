@@ -15,8 +15,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.assemble import SkillDiagram
-from guiderail.diagrams.envs.config import Options
-from guiderail.diagrams.envs.make import make_skill, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_skill
+from guiderail.diagrams.envs.options import Options
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.diagrams.hardware.clock import Clock, MessageCounter, set_realtime_priority
 from guiderail.diagrams.hardware.station import HardwareStation
@@ -296,7 +297,7 @@ def run_policy(
     config, policy = folder.config(), Policy.load(folder.path)
     check_writable(ledger_file(recorded, 0))
     environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
-    task = resolve(config.task, environment).task
+    task = EnvConfig.resolve(config.task, environment).make_task()
     if not isinstance(task, InsertionTask):
         raise InputError(f"{config.task} has no pose that an arm could approach to begin: run an insertion")
     skill = make_skill(config.task, policy, **environment)
@@ -333,5 +334,5 @@ def on_a_robot(task: str, environment: Mapping[str, Any], station: str) -> dict[
     kind = STATIONS.get(station)
     if kind.is_simulated:
         raise InputError(f"station {station!r} is a simulation: watch the policy there by guiderail replay")
-    learned_on = STATIONS.get(resolve(task, environment).station.name).options or Options
+    learned_on = STATIONS.get(EnvConfig.resolve(task, environment).station).options or Options
     return {name: value for name, value in environment.items() if name not in learned_on.model_fields}

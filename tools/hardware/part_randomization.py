@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context
 
-from guiderail.diagrams.envs.config import validated
+from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.driver import Driver
 from guiderail.diagrams.hardware.station import SimulatedIiwa
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -32,11 +32,11 @@ class PartRandomizer:
             seed: of what is hidden for the whole run: the same as in a simulation with this seed.
         """
         self._task, self._lcm, self._driver = task, lcm, driver
-        task.offsets.draw(np.random.default_rng(seed), validated(task.Reset, {}, "a rehearsal"))
+        task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a rehearsal"))
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Puts them anew; returns what was drawn. `options` are those of a reset in a simulation."""
-        fixture, workpiece = self._task.offsets.draw(rng, validated(self._task.Reset, options, "a rehearsal"))
+        fixture, workpiece = self._task.offsets.draw(rng, validate_options(self._task.Reset, options, "a rehearsal"))
         self._lcm.Publish(_channel(self._driver), json.dumps([fixture.tolist(), workpiece.tolist()]).encode())
         return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 

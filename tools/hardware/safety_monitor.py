@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.hardware.bus import open_bus
 from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
@@ -27,7 +27,7 @@ def stand_by(url: str, robot: str, task: str, *, say: Callable[[str], None] = pr
         InputError: for a robot, a task or a bus that there is not.
     """
     driver = find_driver(robot)
-    declared = resolve(task, {}).task
+    declared = EnvConfig.resolve(task, {}).make_task()
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: name an insertion")
     plant = ArmControllerPlant(declared.workcell(), robot).plant

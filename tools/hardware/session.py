@@ -12,7 +12,8 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from guiderail.diagrams.envs.assemble import build_task_diagram
-from guiderail.diagrams.envs.make import make_guidance, make_station, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -50,17 +51,16 @@ def robot_session(config: RunConfig, other: RobotConnection, *, yes: bool, say: 
     Raises:
         InputError: for a task that no robot can do so, or where a check fails or isn't confirmed.
     """
-    resolved = resolve(config.task, config.environment)
-    task = resolved.task
+    task = EnvConfig.resolve(config.task, config.environment).make_task()
     if not isinstance(task, InsertionTask) or task.observable_success() is None:
         raise InputError(f"nobody wrote down how a robot tells that {config.task} is done: learn it in a simulation")
-    if task.choice.reward in task.simulated_rewards:
-        raise InputError(f"the reward {task.choice.reward!r} is of what a simulation alone knows: choose another")
+    if task.config.reward in task.simulated_rewards:
+        raise InputError(f"the reward {task.config.reward!r} is of what a simulation alone knows: choose another")
     threadpool_limits(1)
     torch.set_num_threads(1)
-    station = make_station(resolved)
+    station = make_station(task)
     assert isinstance(station, HardwareStation)
-    diagram = build_task_diagram(task, station, make_guidance(resolved, station))
+    diagram = build_task_diagram(task, station, make_guidance(task, station))
     start = task.start_pose(np.random.default_rng(0))
     with other.standing_in(config.task, station.lcm_url, config.imports), listening() as keys:
         pace, clock = other.paces(station)

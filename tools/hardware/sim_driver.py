@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.envs.config import validated
-from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.bus import open_bus
 from guiderail.diagrams.hardware.clock import check_rate, serve, serve_in_real_time, set_realtime_priority
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
@@ -57,12 +57,12 @@ def serve_iiwa(
             raise InputError(f"{name} must be a positive number, not {value:g}")
     if rate is not None:
         check_rate(rate)
-    declared = resolve(task, {}).task
+    declared = EnvConfig.resolve(task, {}).make_task()
     if not isinstance(declared, InsertionTask):
         raise InputError(f"{task} is done by no arm with a tool: serve an insertion")
     if offset is not None and len(offset) != 2:
         raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
-    moved = None if offset is None else validated(declared.Reset, {"offset": tuple(offset)}, "a robot")
+    moved = None if offset is None else validate_options(declared.Reset, {"offset": tuple(offset)}, "a robot")
     start = START if task == TASK else declared.start_pose(np.random.default_rng(0)) + ASIDE
     directives = [] if scenario is None else load_scenario(scenario).directives
     lcm, driver = open_bus(url), IIWA_DRIVER

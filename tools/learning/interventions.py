@@ -15,8 +15,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.diagrams.envs.make import resolve
-from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.reference import through
 from guiderail.tools.environments import make_environment
@@ -133,23 +132,23 @@ class ViaPointCorrections:
         Raises:
             InputError: for guidance that has no demonstrations to correct.
         """
-        resolved = resolve(task, environment)
-        kind = GUIDANCE.get(resolved.task.choice.guidance)
+        config = EnvConfig.resolve(task, environment)
+        declared, kind = config.make_task(), config.guidance_kind
         if "demonstrations" not in {one for needed in kind.needs for one in needed}:
             raise InputError(
                 f"a person corrects demonstrations, which guidance {kind.name!r} does without: choose another, such as "
                 "kgrl"
             )
-        values = resolved.values
+        values = config.options
         self.points = tuple(values["via_points"])
-        shown = resolved.task.reference()
+        shown = declared.reference()
         self._reference = through(shown, self.points, values["inverse_length"])
         action_dims = values["action_dims"]
         self._explored = list(range(shown.num_outputs)) if action_dims is None else list(action_dims)
         spread = np.sqrt(np.mean(shown.standard_deviations**2, axis=0))
         self.reach = np.sqrt(3.0) * values["action_scale"] * spread[self._explored]
         """(A,): how far a full action leads on average [output]."""
-        self._constraints = resolved.task.constraints()
+        self._constraints = declared.constraints()
 
     def with_pushes(self, pushes: Mapping[int, np.ndarray], *, still_pushing: bool = False) -> tuple[float, ...]:
         """The via-points with those of an episode's pushes; a newer one replaces older ones beside it.

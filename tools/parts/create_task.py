@@ -168,10 +168,10 @@ def onboard(
 
 def _check_given(friction: float, scenario: Sequence[Path]) -> None:
     """Raises an InputError for what would be found out only after minutes."""
-    from guiderail.diagrams.envs.config import validated
+    from guiderail.diagrams.envs.options import validate_options
     from guiderail.diagrams.tasks.part.file import FILE_NAME, Piece
 
-    validated(Piece, {"file": "plug.obj", "friction": friction}, "a part")
+    validate_options(Piece, {"file": "plug.obj", "friction": friction}, "a part")
     names = [file.name for file in scenario]
     for file in scenario:
         if not file.is_file():
@@ -339,7 +339,7 @@ def _write_pieces(folder: Path, parts: tuple[Part, Part], contact: Contact) -> N
 
 
 def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers: dict[str, Any]) -> Any:
-    from guiderail.diagrams.envs.config import validated
+    from guiderail.diagrams.envs.options import validate_options
     from guiderail.diagrams.tasks.part.file import NAMESPACE, MotionNumbers, PartModel, PartTaskFile, Piece
 
     path, friction = numbers["path"], numbers["friction"]
@@ -366,7 +366,7 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
         name=f"{NAMESPACE}/{_plain_name(numbers['name'])}",
         **models,
         scenario=tuple(file.name for file in numbers["scenario"]),
-        motion=validated(
+        motion=validate_options(
             MotionNumbers,
             {"travel": path.travel, "rim": path.rim, "turn": float(path.turn / DEGREE), "push": push},
             "a motion",
@@ -376,7 +376,7 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
         sides=numbers["sides"],
         rim_sides=numbers["rim_sides"],
     )
-    return validated(PartTaskFile, values, "a task of parts")
+    return validate_options(PartTaskFile, values, "a task of parts")
 
 
 def _plain_name(name: str) -> str:

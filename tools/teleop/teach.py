@@ -20,7 +20,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 
 from guiderail.diagrams.envs.cameras import add_meshcat
-from guiderail.diagrams.envs.make import make_station, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.envs.scene import Viewpoint
 from guiderail.diagrams.stations.station import POSE_SIZE
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -176,12 +177,12 @@ class Teaching:
         check_new(out, "file")
         if out.suffix not in (".npz", ".csv"):
             raise InputError(f"{out} must end in .npz or .csv")
-        resolved = resolve(task, environment)
-        if resolved.task.workcell_kind != "workcell":
+        declared = EnvConfig.resolve(task, environment).make_task()
+        if declared.workcell_kind != "workcell":
             raise InputError(f"{task} has no tool that a hand could lead: teach one that puts a part into another")
-        self.task, self.out = resolved.task, out
+        self.task, self.out = declared, out
         builder = DiagramBuilder()
-        self.station = builder.AddNamedSystem("station", make_station(resolved))
+        self.station = builder.AddNamedSystem("station", make_station(declared))
         builder.ExportInput(self.station.get_desired_pose_input_port(), "desired_pose")
         self.meshcat = add_meshcat(builder, self.station.GetOutputPort("query")) if meshcat is None else meshcat
         self.simulator = Simulator(builder.Build())

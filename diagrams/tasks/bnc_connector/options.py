@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, field_validator
 
-from guiderail.diagrams.envs.config import Number
+from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, HiddenOffsets, in_ring
 from guiderail.models.common.units import DEGREE, MM

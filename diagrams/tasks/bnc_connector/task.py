@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
-from guiderail.diagrams.envs.config import STANDARD
 from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import Station
@@ -30,7 +30,7 @@ from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, BncWorkce
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring, reference_of_file
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.diagrams.tasks.task import Threshold
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.objects.bnc_connector import demonstrations as inserting
@@ -40,6 +40,9 @@ from guiderail.models.primitives import Demonstrations, LinearConstraints, Refer
 from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.config import EnvConfig
 
 NUM_STEPS, COMPONENTS = inserting.NUM_STEPS, 16
 FLOOR = np.array(REPEATABILITY_STD)
@@ -81,9 +84,9 @@ class BncConnector(InsertionTask):
     }
     isotropic_groups = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
 
-    def __init__(self, options: BncOptions, choice: Choice):
-        super().__init__(options, choice)
-        o = options
+    def __init__(self, config: EnvConfig):
+        super().__init__(config)
+        o = self.options
         self.offsets = BncUncertainty(
             o.fixture_offset, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn
         )
@@ -124,11 +127,11 @@ class BncConnector(InsertionTask):
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Time, pose and wrench; "center_of_pressure" adds the contact's lever and the commanded x and y."""
-        return observation_terms(self.choice.observation, self.num_steps)
+        return observation_terms(self.config.observation, self.num_steps)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of actions, forces and the end; of depth where the reward is shaped."""
-        return reward_terms(self.choice.reward, num_actions)
+        return reward_terms(self.config.reward, num_actions)
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Locked for a while, or pushed too hard."""
@@ -136,14 +139,14 @@ class BncConnector(InsertionTask):
 
     def symmetry(self) -> Symmetry:
         """Half a turn about the jack's axis."""
-        action_dims = self.choice.values["action_dims"]
+        action_dims = self.config.options["action_dims"]
         action = HALF_TURN if action_dims is None else HALF_TURN[list(action_dims)]
-        return Symmetry.of_signs(half_turn(self.choice.observation), action)
+        return Symmetry.of_signs(half_turn(self.config.observation), action)
 
     def near_symmetry(self) -> Symmetry:
         """Quarter turns and mirrors too: alike as long as the plug stands on the rim, which has no sides."""
-        action_dims = self.choice.values["action_dims"]
-        sides = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if action_dims is None else action_dims)
+        action_dims = self.config.options["action_dims"]
+        sides = sides_of_the_rim(self.config.observation, range(POSE_SIZE) if action_dims is None else action_dims)
         return self.symmetry() if sides is None else Symmetry(*sides)
 
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
-from guiderail.diagrams.envs.config import STANDARD, Number, Numbers, Options
 from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.options import STANDARD, Number, Numbers, Options
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
@@ -21,7 +21,7 @@ from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.diagrams.tasks.task import Threshold
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import MM
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
@@ -29,6 +29,9 @@ from guiderail.models.objects.grid_clamp.sdf import FRICTION
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.config import EnvConfig
 
 # More than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m.
 COLLISION_FORCE = 35.0  # [N], of the impedance
@@ -204,13 +207,13 @@ class GridClamp(InsertionTask):
     defaults = {"guidance": "sct", "station": "gantry", "action_repeat": 5, "active_constraints": True}
     learner = {"algorithm": "sac", "preset": "sac_gridclamp"}
 
-    def __init__(self, options: GridClampOptions, choice: Choice):
-        super().__init__(options, choice)
-        self.offsets = GridClampUncertainty(options.fixture_offset)
-        self.collision = Threshold("contact_force", options.force_limit)
+    def __init__(self, config: EnvConfig):
+        super().__init__(config)
+        self.offsets = GridClampUncertainty(self.options.fixture_offset)
+        self.collision = Threshold("contact_force", self.options.force_limit)
         # 100 decisions at 10 Hz unless given; the thesis's episodes take 140 on average.
-        self.num_steps = round(options.seconds / CONTROL_PERIOD)
-        self._workcell = options.workcell()
+        self.num_steps = round(self.options.seconds / CONTROL_PERIOD)
+        self._workcell = self.options.workcell()
 
     def workcell(self) -> GridClampWorkcell:
         """A table with holes, a clamp in the tool."""
@@ -218,7 +221,7 @@ class GridClamp(InsertionTask):
 
     def template(self) -> PlacedTemplate:
         """One phase: a cuboid above the hole, upright."""
-        active = self.choice.values["active_constraints"]
+        active = self.config.options["active_constraints"]
         return PlacedTemplate(
             make_template(), {"hole": RigidTransform()}, active_constraints=active, max_tracking_error=LEASH
         )
@@ -238,7 +241,7 @@ class GridClamp(InsertionTask):
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Equations 3.11 and 3.12."""
-        return reward_terms(self.choice.reward, num_actions, self.choice.action_repeat)
+        return reward_terms(self.config.reward, num_actions, self.config.action_repeat)
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Seated for a while, or pushed too hard."""

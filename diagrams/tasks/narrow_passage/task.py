@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -13,14 +13,14 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera
-from guiderail.diagrams.envs.config import STANDARD, Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.options import STANDARD, Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, EpisodeConstant, Task
+from guiderail.diagrams.tasks.task import EpisodeConstant, Task
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.objects.narrow_passage import demonstrations
@@ -28,6 +28,9 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, ac
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import SUCCESS, TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.config import EnvConfig
 
 USUAL = PassageGeometry()
 # Half way through the wide part behind the passage, on the demonstrations' mean.
@@ -199,9 +202,9 @@ class NarrowPassage(Task):
     num_steps = demonstrations.NUM_STEPS
     clip = 1.0
 
-    def __init__(self, options: NarrowPassageOptions, choice: Choice):
-        super().__init__(options, choice)
-        self._world = options.workcell()
+    def __init__(self, config: EnvConfig):
+        super().__init__(config)
+        self._world = self.options.workcell()
 
     def workcell(self) -> PassageGeometry:
         """Walls, a zone, an obstacle and a goal."""
@@ -229,7 +232,7 @@ class NarrowPassage(Task):
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
         """The phase, and where obstacles are that a reset draws; or the plane from above, lying on its side: the way up
         is to the right."""
-        if self.choice.observation == "state":
+        if self.config.observation == "state":
             usual = self._world.obstacles.ravel()
             beside = ObservationTerm("obstacles", usual, self.options.obstacle_beside or 1.0)
             return (ObservationTerm("phase"), beside) if self.options.obstacle_beside else (ObservationTerm("phase"),)
@@ -238,7 +241,7 @@ class NarrowPassage(Task):
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of the way gone, the obstacle and the goal; of the way to the goal where the reward is shaped."""
-        return reward_terms(self.choice.reward, self._world, self.options.drawn)
+        return reward_terms(self.config.reward, self._world, self.options.drawn)
 
     def termination_terms(self) -> list[TerminationTerm]:
         """At the goal, or getting nowhere; where touching obstacles ends an episode, that."""

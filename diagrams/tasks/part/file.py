@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from pydantic import Field, ValidationInfo, field_validator
 
-from guiderail.diagrams.envs.config import Number, Numbers, Options, validated
+from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
 from guiderail.diagrams.stations.station import ContactOptions
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
@@ -226,7 +226,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
     data = load_yaml(path, "task")
     if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
         raise InputError(f"{path} is no task: its first line must be 'format: {FILE_FORMAT}'")
-    file = validated(PartTaskFile, data, str(path))
+    file = validate_options(PartTaskFile, data, str(path))
     for name in file.files:
         if not (folder / name).is_file():
             raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or onboard the parts again")

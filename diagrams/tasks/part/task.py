@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cache, cached_property
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 from pydantic import Field
@@ -13,8 +13,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera, look_from_front
-from guiderail.diagrams.envs.config import Number
 from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.options import Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
@@ -24,7 +24,7 @@ from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import FixtureOffsetOptions, in_ring, reference_of_file
 from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET, PartWorkcell
-from guiderail.diagrams.tasks.task import Choice, Threshold
+from guiderail.diagrams.tasks.task import Threshold
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
@@ -42,6 +42,9 @@ from guiderail.models.primitives import Demonstrations, LinearConstraints, Refer
 from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.config import EnvConfig
 
 COLOURS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
@@ -74,10 +77,10 @@ class PartInsertion(InsertionTask):
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]
 
-    def __init__(self, options: PartOptions, choice: Choice):
-        super().__init__(options, choice)
-        self.offsets = BncUncertainty(options.fixture_offset, offset_range=options.offset_range)
-        self.collision = Threshold("contact_force", options.force_limit)
+    def __init__(self, config: EnvConfig):
+        super().__init__(config)
+        self.offsets = BncUncertainty(self.options.fixture_offset, offset_range=self.options.offset_range)
+        self.collision = Threshold("contact_force", self.options.force_limit)
         self.num_steps = self.reference().num_steps
 
     def workcell(self) -> PartWorkcell:
@@ -124,7 +127,7 @@ class PartInsertion(InsertionTask):
             ObservationTerm("pose", centre, scale),
             ObservationTerm("wrench", 0.0, WRENCH_SCALE),
         )
-        if self.choice.observation == "state":
+        if self.config.observation == "state":
             return state
         return (
             *state,
@@ -134,7 +137,7 @@ class PartInsertion(InsertionTask):
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Of actions, forces and the end; of depth and nearness where the reward says so."""
-        return reward_terms(self.choice.reward, num_actions)
+        return reward_terms(self.config.reward, num_actions)
 
     def termination_terms(self) -> list[TerminationTerm]:
         """At the target for a while, or pushed too hard."""
@@ -150,8 +153,8 @@ class PartInsertion(InsertionTask):
         return self._seen_from((*self.file.sides, *self.file.rim_sides))
 
     def _seen_from(self, names: Sequence[str]) -> Symmetry | None:
-        action_dims = self.choice.values["action_dims"]
-        every = sides_of_the_rim(self.choice.observation, range(POSE_SIZE) if action_dims is None else action_dims)
+        action_dims = self.config.options["action_dims"]
+        every = sides_of_the_rim(self.config.observation, range(POSE_SIZE) if action_dims is None else action_dims)
         chosen = [number for number, name in enumerate(SIDES) if name in names]
         return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
 

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.envs.config import Integer, Number, Numbers, Options, ResetOptions
+from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, Ball

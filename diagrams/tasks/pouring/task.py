@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
 
 from guiderail.diagrams.envs.cameras import Camera, look_at
-from guiderail.diagrams.envs.config import STANDARD
 from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import Scene, in_frame, viewpoint
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PlacedTemplate
@@ -31,11 +31,14 @@ from guiderail.diagrams.tasks.pouring.options import (
 )
 from guiderail.diagrams.tasks.pouring.rewards import reward_terms
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Choice, EpisodeConstant, Task, Threshold
+from guiderail.diagrams.tasks.task import EpisodeConstant, Task, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import transform_to_pose
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.config import EnvConfig
 
 
 def draw_error(episode: np.random.Generator, options: PouringOptions, reset: PouringReset) -> np.ndarray:
@@ -114,24 +117,24 @@ class Pouring(Task):
     collision = Threshold("touched")
     pushable = False  # what is in a thermos does not move along with an arm that is put elsewhere
 
-    def __init__(self, options: PouringOptions, choice: Choice):
-        super().__init__(options, choice)
-        options.check()
+    def __init__(self, config: EnvConfig):
+        super().__init__(config)
+        self.options.check()
         self._config = PouringConfig(
-            mug=make_mug(options.mug_inner_diameter, options.mug_depth, options.ball),
-            ball=options.ball,
-            num_balls=options.balls,
+            mug=make_mug(self.options.mug_inner_diameter, self.options.mug_depth, self.options.ball),
+            ball=self.options.ball,
+            num_balls=self.options.balls,
         )
-        self.num_steps = round(options.time_limit / self._config.control_period)
+        self.num_steps = round(self.options.time_limit / self._config.control_period)
         speed = self._input_speed()
         self._template = make_template(self._config, speed)
-        if options.aim:
-            self._template = make_aimed_template(self._config, speed, options.aim_speed, options.pour_speed)
+        if self.options.aim:
+            self._template = make_aimed_template(self._config, speed, self.options.aim_speed, self.options.pour_speed)
 
     def _input_speed(self) -> float:
         if self.options.input_speed is not None:
             return self.options.input_speed
-        return SPARSE_INPUT_SPEED if (self.choice.guidance, self.choice.reward) == ("sct", "sparse") else 1.0
+        return SPARSE_INPUT_SPEED if (self.config.guidance, self.config.reward) == ("sct", "sparse") else 1.0
 
     def workcell(self) -> PouringConfig:
         """The vessels, and where they stand."""
@@ -146,7 +149,7 @@ class Pouring(Task):
 
     def template(self) -> PlacedTemplate:
         """Of figure 2.2 and table 3.3, or the one that can be aimed."""
-        active = self.choice.values["active_constraints"]
+        active = self.config.options["active_constraints"]
         return PlacedTemplate(
             self._template,
             frames_of(self._template, RigidTransform()),
@@ -166,7 +169,7 @@ class Pouring(Task):
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
         """Equations 3.5 to 3.10, and aiming."""
-        return reward_terms(self.choice.reward, num_actions, self.choice.action_repeat, self.options.aim)
+        return reward_terms(self.config.reward, num_actions, self.config.action_repeat, self.options.aim)
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Poured, spilled, or touched."""

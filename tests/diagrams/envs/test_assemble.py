@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from guiderail import make_env
-from guiderail.diagrams.envs.assemble import known_of
+from guiderail.diagrams.envs.assemble import build_prior_knowledge
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
@@ -26,11 +26,12 @@ def known(turn, station, period=PERIOD):
         reference=lambda: reference,
         constraints=lambda: None,
         isotropic_groups=None,
+        config=SimpleNamespace(part=lambda name: {}),
     )
     where = SimpleNamespace(
         wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=period, nominal_period=period
     )
-    return known_of(task, where, {}, {})
+    return build_prior_knowledge(task, where)
 
 
 @pytest.mark.parametrize("period", [0.01, 0.1])

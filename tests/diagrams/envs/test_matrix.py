@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import make_env, make_skill, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env, make_skill
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, REQUIREMENTS, possible_guidance
 from guiderail.diagrams.stations.registry import STATIONS, stations_for
@@ -60,8 +61,8 @@ def test_both_contracts_hold_in_every_tasks_diagram(task):
 @pytest.mark.parametrize("task", OWN)
 def test_resolved_options_resolve_to_themselves(task):
     """What a run stores makes the same environment again."""
-    values = resolve(task, {}).values
-    assert resolve(task, values).values == values
+    values = EnvConfig.resolve(task, {}).options
+    assert EnvConfig.resolve(task, values).options == values
 
 
 @pytest.mark.parametrize("task", OWN)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
@@ -12,7 +12,7 @@ from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.motion import CLEAR, insert_and_lock, poses
 
 FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
-HARD = resolve("BncConnector", {"difficulty": "hard"}).task
+HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
 WORKCELL = HARD.workcell()
 STIFFNESS = Impedance().stiffness[2]
 LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height
@@ -22,7 +22,7 @@ LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORK
 def build(request):
     """Makes the station."""
     options = {"difficulty": "hard", **request.param}
-    workcell = resolve("BncConnector", options).task.workcell()
+    workcell = EnvConfig.resolve("BncConnector", options).make_task().workcell()
     return lambda: GantryStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail import InputError, make_env
-from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.units import MM
@@ -35,7 +35,7 @@ def test_nothing_is_between_unless_asked_for(plain):
     env, _, info = plain
     assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
     assert "friction_factor" not in info
-    assert not resolve("GridClamp", {}).models["disturbances"].any
+    assert not EnvConfig.resolve("GridClamp", {}).parts["disturbances"].any
 
 
 def test_drawn_errors_repeat_with_their_seed_and_differ_without_it(plain):

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import make_station, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_station
 from guiderail.models.common.errors import InputError
 
 PLACES = [
@@ -15,7 +16,7 @@ PLACES = [
 
 @pytest.mark.parametrize(("task", "place"), PLACES)
 def test_a_robot_is_put_only_to_a_pose_of_finite_numbers(task, place):
-    station = make_station(resolve(task, {"station": place}))
+    station = make_station(EnvConfig.resolve(task, {"station": place}).make_task())
     context = station.CreateDefaultContext()
     whole = np.zeros(station.pose_size)
     broken = [np.r_[np.nan, whole[1:]], np.r_[whole[1:], -np.inf], whole[1:], [*whole, 0.0], ["a"] * len(whole), None]

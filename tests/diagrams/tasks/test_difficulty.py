@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.bnc_connector import options as bnc_options
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure
@@ -34,22 +35,22 @@ def clamp():
 
 @pytest.mark.parametrize("task", HARD)
 def test_hard_is_what_its_numbers_say_and_each_can_be_given_by_itself(task):
-    standard, hard = (resolve(task, {"difficulty": word}).values for word in ("standard", "hard"))
+    standard, hard = (EnvConfig.resolve(task, {"difficulty": word}).options for word in ("standard", "hard"))
     assert {name for name in hard if hard[name] != standard[name]} == {"difficulty", *HARD[task]}
     assert {name: hard[name] for name in HARD[task]} == HARD[task]
-    assert resolve(task, HARD[task]).values == hard | {"difficulty": "standard"}
+    assert EnvConfig.resolve(task, HARD[task]).options == hard | {"difficulty": "standard"}
     given = {"difficulty": "hard", "force_limit": 30.0}
-    assert resolve(task, given).values == hard | {"force_limit": 30.0}
+    assert EnvConfig.resolve(task, given).options == hard | {"force_limit": 30.0}
 
 
 @pytest.mark.parametrize("task", HARD)
 def test_standard_is_what_it_was(task):
-    declared = resolve(task, {}).task
+    declared = EnvConfig.resolve(task, {}).make_task()
     drawn = {"BncConnector": BncDimensions(), "GridClamp": GridClampDimensions()}[task]
     assert declared.workcell() == type(declared.workcell())(drawn)
     assert declared.collision.above == 35.0
     assert declared.num_steps == {"BncConnector": 400, "GridClamp": 500}[task]
-    assert declared.choice.observation == "state"
+    assert declared.config.observation == "state"
     if task == "BncConnector":
         assert declared.reference() is reference_trajectory("insert")
         np.testing.assert_array_equal(declared.constraints().c, -2.0 * MM)
@@ -94,7 +95,7 @@ WRONG = [
 @pytest.mark.parametrize(("task", "wrong", "words"), WRONG)
 def test_what_is_out_of_range_is_refused_in_a_sentence(task, wrong, words):
     with pytest.raises(InputError) as refused:
-        resolve(task, wrong)
+        EnvConfig.resolve(task, wrong)
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
 

@@ -6,8 +6,9 @@ import pytest
 import yaml
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.envs.config import validated
-from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.part.file import Bounds
 from guiderail.diagrams.tasks.part.task import load_task_folder
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
@@ -71,7 +72,7 @@ def test_bounds_that_change_on_the_way_hold_at_every_step(tmp_path):
     assert np.abs(env.trace.commanded[:25, :2]).max() > 0.0
     env.close()
     with pytest.raises(InputError, match="needs walls to keep out of"):
-        resolve(str(folder), {"guidance": "safe_residual"})
+        EnvConfig.resolve(str(folder), {"guidance": "safe_residual"})
 
 
 def with_row(changed):
@@ -97,7 +98,7 @@ def with_row(changed):
 )
 def test_bounds_that_mean_nothing_are_refused(bounds, says):
     with pytest.raises(InputError, match=says):
-        validated(Bounds, bounds, "here")
+        validate_options(Bounds, bounds, "here")
 
 
 def test_a_bound_is_that_of_its_phase():
@@ -124,27 +125,27 @@ def test_a_folder_is_the_same_task_until_a_file_of_it_changes(tmp_path):
 
 def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp_path):
     folder = write(tmp_path / "written")
-    task = resolve(str(folder), {}).task
+    task = EnvConfig.resolve(str(folder), {}).make_task()
     assert task.workcell() is task.workcell()
     assert "from task.yaml; change the dimensions there" in (folder / "plug.sdf").read_text()
     assert sorted(path.name for path in folder.glob("*.sdf*")) == ["plug.sdf", "socket.sdf"]
     (folder / "plug.sdf").unlink()
     (folder / "plug.sdf").mkdir()
     with pytest.raises(InputError, match=r"plug\.sdf cannot be written"):
-        resolve(str(folder), {}).task.workcell()
+        EnvConfig.resolve(str(folder), {}).make_task().workcell()
 
 
 def test_a_parts_mass_is_where_its_file_says(tmp_path):
     centre = [0.001, -0.002, 0.003]
     folder = write(tmp_path / "centred", plug=part("plug", centre=centre))
     plant = MultibodyPlant(0.0)
-    plug = resolve(str(folder), {}).task.workcell().add_workpiece(plant, plant.world_frame())
+    plug = EnvConfig.resolve(str(folder), {}).make_task().workcell().add_workpiece(plant, plant.world_frame())
     np.testing.assert_allclose(plug.default_com(), centre)
 
 
 def test_it_starts_inside_its_bounds(tmp_path):
     bounds = {"lower": [*[None] * 3, *[-0.01] * 3], "upper": [0.0001, None, 0.015, *[0.01] * 3]}
-    task = resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_offset_max": 0.002}).task
+    task = EnvConfig.resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_offset_max": 0.002}).make_task()
     for seed in range(5):
         start = task.start_pose(np.random.default_rng(seed))
         assert task.constraints().violation(start) <= 1e-9
@@ -155,10 +156,12 @@ def test_what_is_drawn_is_the_box_of_each_phase(tmp_path):
     lower, upper = [[-0.001, -0.003], [0.0, -0.003]], [[0.002, 0.001], [0.0005, 0.001]]
     free = [None] * 4
     bounds = {"lower": [[*row, *free] for row in lower], "upper": [[*row, *free] for row in upper]}
-    task = resolve(str(write(tmp_path / "drawn", bounds=bounds | {"phases": [0.0, 0.5]})), {}).task
+    task = EnvConfig.resolve(str(write(tmp_path / "drawn", bounds=bounds | {"phases": [0.0, 0.5]})), {}).make_task()
     edges = np.array(task.scene().constraint) - task.file.place
     for number, box in enumerate(np.split(edges, 2)):
         np.testing.assert_allclose(box.min(axis=(0, 1)), [*lower[number], 0.0], atol=1e-12)
         np.testing.assert_allclose(box.max(axis=(0, 1)), [*upper[number], 0.02], atol=1e-12)
-    task = resolve(str(write(tmp_path / "open", bounds={"lower": [0.0, *5 * [None]], "upper": 6 * [0.1]})), {}).task
+    task = EnvConfig.resolve(
+        str(write(tmp_path / "open", bounds={"lower": [0.0, *5 * [None]], "upper": 6 * [0.1]})), {}
+    ).make_task()
     assert task.scene().constraint == ()

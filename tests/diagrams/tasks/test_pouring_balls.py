@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import make_env, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring.scripted import scripted_pour_aimed
 from guiderail.diagrams.tasks.pouring.task import conditions
@@ -50,9 +51,9 @@ def test_balls_lie_in_the_thermos_and_not_in_each_other(number, diameter):
 
 def test_what_does_not_go_together_is_refused():
     with pytest.raises(InputError, match="balls_in must be at most balls, which is 2, not 3"):
-        resolve("Pouring", {"balls_in": 3})
+        EnvConfig.resolve("Pouring", {"balls_in": 3})
     with pytest.raises(InputError, match="6 balls of 0\\.04 m don't go into the thermos"):
-        resolve("Pouring", {"balls": 6})
+        EnvConfig.resolve("Pouring", {"balls": 6})
 
 
 def test_who_aims_pours_enough_of_them():

@@ -7,7 +7,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fuzz.tally import attempt
-from guiderail.diagrams.envs.make import make_env, option_models, resolve
+from guiderail.diagrams.envs.config import EnvConfig, option_models
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import as_value, check_environment
@@ -93,8 +94,8 @@ def test_settings_of_a_learner(preset, pairs):
 
 def options_of(task):
     """All options that its environments can have, with their defaults as they are typed."""
-    resolved = resolve(task, {})
-    models = option_models(TASKS.get(task), resolved.task.choice.guidance, resolved.station.name).values()
+    config = EnvConfig.resolve(task, {})
+    models = option_models(TASKS.get(task), config.guidance, config.station).values()
     return {name: str(field.default) for model in models for name, field in model.model_fields.items()}
 
 

@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from guiderail.diagrams.envs.config import Options
+from guiderail.diagrams.envs.options import Options
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.tools.cli.catalog import options_in_words
 

@@ -298,7 +298,10 @@ WRONG = [
     ({"eval_set": [{"sampled": {"wal": [0, 1]}}]}, "did you mean wall"),
     ({"folder": "{guidance}-{seed}"}, "it may have {method}, {seed}, {episodes}, {algorithm}"),
     ({"folder": "{method}-{seed"}, "has braces that nothing fills"),
-    ({"eval_set": [{"file": "{after_episodes}-{seed}.csv"}]}, "it may have {name}, {after_episodes}, {episodes}, {digest}"),
+    (
+        {"eval_set": [{"file": "{after_episodes}-{seed}.csv"}]},
+        "it may have {name}, {after_episodes}, {episodes}, {digest}",
+    ),
     ({"statistics": ["sucess_rate"]}, "did you mean success_rate"),
     ({"eval_set": [{"episodes": 2}, {"episodes": 3}]}, "called 'held out'"),
     ({"ratios": [{"of": "mean_force", "method": "learnt", "against": "learner"}]}, "did you mean learner"),

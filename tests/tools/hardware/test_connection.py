@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import gymnasium
 import pytest
 
-from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.tools.cli.main import main
 from guiderail.tools.hardware.connection import RobotConnection
@@ -32,7 +32,7 @@ def test_a_simulated_robot_imports_what_the_run_does(tmp_path, monkeypatch):
         yield
 
     def serve(url, seconds, command_timeout, task, **more):
-        served.append(type(resolve(task, {}).task).__name__)
+        served.append(type(EnvConfig.resolve(task, {}).make_task()).__name__)
         return True
 
     def wait(url, robot, task, say):

@@ -11,7 +11,8 @@ from drake import lcmt_iiwa_command
 from injections.together import Together
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.envs.make import make_skill, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_skill
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, StatusLimits
@@ -40,7 +41,7 @@ def operated(monkeypatch):
             # The skill's station makes its own bus from a URL, and a bus in memory is known to its maker alone.
             patch.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS)
-        task = resolve("BncConnector", OPTIONS).task
+        task = EnvConfig.resolve("BncConnector", OPTIONS).make_task()
         monkeypatch.setattr(task, "num_steps", num_steps)
         pace = Together(task.workcell(), lcm, start, deputy)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
@@ -70,7 +71,7 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
 
 def test_a_run_that_fails_leaves_what_was_recorded_beside_what_was_there(monkeypatch, tmp_path):
     lcm, asked, imported = DrakeLcm("memq://"), [], []
-    task = resolve("BncConnector", {}).task
+    task = EnvConfig.resolve("BncConnector", {}).make_task()
     pace = Together(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
 
     def policy(observation):
@@ -157,7 +158,7 @@ def test_a_robot_far_from_the_start_is_not_moved(operated):
 def test_no_task_without_a_start_and_no_simulated_station(monkeypatch):
     with pytest.raises(InputError, match="is a simulation"):
         run_policy.on_a_robot("BncConnector", {}, "gantry")
-    environment = resolve("BncConnector", {"station": "arm", "robot": "panda"}).values
+    environment = EnvConfig.resolve("BncConnector", {"station": "arm", "robot": "panda"}).options
     assert "end_effector" not in run_policy.on_a_robot("BncConnector", environment, "hardware")
 
 
@@ -247,8 +248,10 @@ def test_refuses_another_end_that_makes_no_sense(wrong, words):
 def test_the_stations_of_an_operation_have_the_same_limits():
     slow = StatusLimits((1.0,) * 7, max_age=0.1)
     other = {"period": 0.002, "wrench_time_constant": 0.05, "lcm_url": "memq://x", "status_limits": slow}
-    station = HardwareStation(resolve("BncConnector", {}).task.workcell(), DrakeLcm("memq://"), robot="panda", **other)
-    alike = station.alike(resolve("BncConnector", {}).task.workcell())
+    station = HardwareStation(
+        EnvConfig.resolve("BncConnector", {}).make_task().workcell(), DrakeLcm("memq://"), robot="panda", **other
+    )
+    alike = station.alike(EnvConfig.resolve("BncConnector", {}).make_task().workcell())
     assert (alike.limits, alike.impedance, alike.driver) == (station.limits, station.impedance, station.driver)
     assert alike.lcm is station.lcm
     assert (alike.period, alike.lcm_url, alike.status_limits) == (0.002, "memq://x", slow)

@@ -3,8 +3,8 @@
 import numpy as np
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.envs.config import validated
-from guiderail.diagrams.envs.make import resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa
 from guiderail.tools.hardware.part_randomization import PartRandomizer, put
 
@@ -12,21 +12,21 @@ SEED = 30
 
 
 def test_the_same_seed_puts_them_where_a_simulations_resets_do():
-    task = resolve("BncConnector", {"fixture_offset": "per_run"}).task
+    task = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
     lcm = DrakeLcm("memq://")
     robot = SimulatedIiwa(task.workcell(), lcm)
     context = robot.CreateDefaultContext()
     put(lcm, IIWA_DRIVER, task, robot, context)
     places, rng = PartRandomizer(task, lcm, IIWA_DRIVER, SEED), np.random.default_rng(7)
-    simulated = resolve("BncConnector", {"fixture_offset": "per_run"}).task
-    simulated.offsets.draw(np.random.default_rng(SEED), validated(simulated.Reset, {}, "a reset"))
+    simulated = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
+    simulated.offsets.draw(np.random.default_rng(SEED), validate_options(simulated.Reset, {}, "a reset"))
     others, jacks = np.random.default_rng(7), []
     plant = robot.plant
     own = plant.GetMyContextFromRoot(context)
     for options in ({}, {"held_out": True}):
         drawn = places(rng, options)
         lcm.HandleSubscriptions(0)
-        expected = simulated.offsets.draw(others, validated(simulated.Reset, options, "a reset"))
+        expected = simulated.offsets.draw(others, validate_options(simulated.Reset, options, "a reset"))
         np.testing.assert_array_equal(drawn["jack_offset"], expected[0])
         np.testing.assert_array_equal(drawn["grasp_offset"], expected[1])
         jacks.append(plant.GetBodyByName("jack").EvalPoseInWorld(own).translation())

@@ -11,7 +11,8 @@ from injections.together import Together
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.assemble import build_task_diagram
-from guiderail.diagrams.envs.make import make_guidance, make_station, resolve
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.station import IIWA_DRIVER
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
@@ -35,15 +36,15 @@ OPTIONS = {"station": "hardware", "guidance": "kgrl", "fixture_offset": "none", 
 
 def make(patch, start, **options):
     """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
-    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS | options)
-    patch.setattr(resolved.task, "num_steps", 10)
+    lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
+    patch.setattr(declared, "num_steps", 10)
     with patch.context() as bus:
         bus.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
-        station = make_station(resolved)
-    task = build_task_diagram(resolved.task, station, make_guidance(resolved, station))
-    pace, keys, asked = Together(resolved.task.workcell(), lcm, start), Keys(), []
-    begin = resolved.task.start_pose(np.random.default_rng(0))
-    elsewhere = station.alike(resolved.task.workcell())
+        station = make_station(declared)
+    task = build_task_diagram(declared, station, make_guidance(declared, station))
+    pace, keys, asked = Together(declared.workcell(), lcm, start), Keys(), []
+    begin = declared.start_pose(np.random.default_rng(0))
+    elsewhere = station.alike(declared.workcell())
     env = RobotEnv(
         task, station, elsewhere, begin, pace, action_repeat=5, keys=keys, go_on=asked.append, say=lambda words: None
     )
@@ -181,8 +182,8 @@ def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decisi
 @pytest.fixture
 def ready(monkeypatch):
     """An arm that waits for `robot_session`, which is told to begin; and what a person is asked."""
-    lcm, resolved = DrakeLcm("memq://"), resolve("BncConnector", OPTIONS)
-    pace, asked = Together(resolved.task.workcell(), lcm, START), []
+    lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
+    pace, asked = Together(declared.workcell(), lcm, START), []
 
     @contextmanager
     def nobody(other, *where):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from guiderail.diagrams.envs.config import validated
+from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.part.file import PartTaskFile
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common import files as writing
@@ -110,7 +110,7 @@ def test_it_is_a_task(folder, tmp_path, capsys, monkeypatch):
 
 
 def test_it_is_learned_as_its_folder_recommends(folder):
-    from guiderail.diagrams.envs.make import resolve
+    from guiderail.diagrams.envs.config import EnvConfig
     from guiderail.tools.environments import task_named
     from guiderail.tools.learning.train import configure, with_defaults
 
@@ -120,12 +120,12 @@ def test_it_is_learned_as_its_folder_recommends(folder):
     for key, value in recommended["environment"].items():
         assert config.environment[key] == (tuple(value) if isinstance(value, list) else value)
     assert (config.learner.symmetry, config.learner.batch_size) == ("near", 32)
-    task = resolve(name, {}).task
+    task = EnvConfig.resolve(name, {}).make_task()
     assert task.symmetry().actions.shape == (7, 2, 2)  # a square has eight sides
     changed = yaml.safe_load((folder / "task.yaml").read_text())
     for wrong in ({"sides": ["upside down"]}, {"time_step": 0.003}):
         with pytest.raises(InputError, match=next(iter(wrong))):
-            validated(PartTaskFile, changed | wrong, "task.yaml")
+            validate_options(PartTaskFile, changed | wrong, "task.yaml")
 
 
 def test_its_options_are_listed(folder, capsys):
@@ -134,12 +134,13 @@ def test_its_options_are_listed(folder, capsys):
 
 
 def test_bounds_from_demonstrations_become_its_own(folder, capsys):
-    from guiderail.diagrams.envs.make import make_env, resolve
+    from guiderail.diagrams.envs.config import EnvConfig
+    from guiderail.diagrams.envs.make import make_env
 
     before = (folder / "task.yaml").read_text()
     try:
         call("constraints", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--into", folder)
-        constraints = resolve(str(folder), {}).task.constraints()
+        constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
         assert constraints.G.shape[0] > 1
         np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
         env = make_env(str(folder), horizon=4)

@@ -276,7 +276,7 @@ def test_every_key_is_one_things(session):
 @pytest.mark.parametrize("name", ["file/shown.npz", f"{'x' * 300}.npz", f"{'x' * 300}/shown.npz"])
 def test_where_nothing_can_be_written_nobody_begins_to_show_anything(name, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    monkeypatch.setattr(teaching, "resolve", lambda *given: pytest.fail("the page opens"))
+    monkeypatch.setattr(teaching.EnvConfig, "resolve", lambda *given: pytest.fail("the page opens"))
     with pytest.raises(InputError, match=r"written|read"):
         Teaching("GridClamp", {}, tmp_path / name, meshcat=Page())
 

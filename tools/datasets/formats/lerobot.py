@@ -135,7 +135,7 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     }
     features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _CLOCKS.items()}
     ends = np.cumsum(lengths)
-    described = {
+    describe_options = {
         "episode_index": list(range(len(lengths))),
         "tasks": [[TASK]] * len(lengths),
         "length": lengths,
@@ -164,7 +164,7 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     with whole_folder(folder) as made:
         for path, table in (
             (DATA_PATH.format(chunk_index=0, file_index=0), columns),
-            ("meta/episodes/chunk-000/file-000.parquet", described),
+            ("meta/episodes/chunk-000/file-000.parquet", describe_options),
         ):
             (made / path).parent.mkdir(parents=True)
             parquet.write_table(arrow.table(table), made / path)

@@ -1,0 +1,189 @@
+"""Option models of environments and resets: each option has a type, a range and a description."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, TypeVar, get_args
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import did_you_mean
+
+STANDARD = "standard"
+"""Default difficulty; every task has it."""
+
+
+class Options(BaseModel):
+    """Base class of option models: immutable; refuses undeclared names, NaN and infinite numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+
+
+def _split_list(value: Any) -> Any:
+    """Return comma-separated text or an array as a list; return anything else unchanged."""
+    if isinstance(value, str):
+        return [part for part in value.split(",") if part.strip()]
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _reject_bool(value: Any) -> Any:
+    """Refuse a bool, which Python would accept as 0 or 1, and unwrap a NumPy number."""
+    if isinstance(value, bool | np.bool_):
+        raise ValueError("give a number")
+    return value.item() if isinstance(value, np.number) else value
+
+
+Integer = Annotated[int, BeforeValidator(_reject_bool)]
+Number = Annotated[float, BeforeValidator(_reject_bool)]
+Integers = Annotated[tuple[Integer, ...], BeforeValidator(_split_list)]
+Numbers = Annotated[tuple[Number, ...], BeforeValidator(_split_list)]
+
+
+class CommonOptions(Options):
+    """Options of every environment; an empty word stands for the task's default."""
+
+    guidance: str = Field("", description="guidance between the policy and the robot")
+    station: str = Field("", description="station that the task is done on")
+    reward: str = Field("", description="reward")
+    observation: str = Field("", description="observation of the policy")
+    difficulty: str = Field(STANDARD, description="one of the difficulties that the task declares")
+    action_repeat: Integer = Field(1, ge=1, description="control steps per action")
+
+
+class PrimitiveOptions(Options):
+    """Options of every guidance built from demonstrations; see `PrimitiveConfig`."""
+
+    action_scale: Number = Field(1.0, gt=0, description="κ: a constant action of ±1 ends √3 κ standard deviations away")
+    action_dims: Integers | None = Field(
+        None, description="indices of the outputs that an action moves; default: all", examples=[(0, 1)]
+    )
+    history: Integer = Field(10, ge=1, le=1000, description="P, past outputs that sKGRL's motion passes through")
+    history_variance: Number = Field(1e-6, gt=0, description="ρ [output²], variance of the past outputs")
+    history_source: Literal["commanded", "measured"] = Field("commanded", description="poses that form the history")
+    adaptive_history: bool = Field(False, description="shorten the history during contact")
+    gains: Numbers | None = Field(None, description="raw null-space units per action; default: computed from κ")
+    horizon: Integer = Field(40, ge=0, le=1000, description="H, future points at which constraints are satisfied")
+    lambda_: Number = Field(6.0, ge=0, description="λ of problem 4.5")
+    beta: Number = Field(6.0, gt=0, description="β of problem 4.5")
+    inverse_length: Number = Field(2.0, gt=0, description="of the kernel")
+    via_points: Numbers = Field(
+        (), description="points of the mean: a control step and an output each, one after another"
+    )
+    solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")
+
+
+class TemplateOptions(Options):
+    """Options of every guidance built from a shared control template."""
+
+    active_constraints: bool | None = Field(
+        None, description="keep commands inside the template's active constraints; default: with sct only"
+    )
+
+
+class ResetOptions(Options):
+    """Options of every reset."""
+
+    held_out: bool = Field(False, description="sample held-out conditions, which training never samples")
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validate_options(model: type[Model], values: Mapping[str, Any], context: str) -> Model:
+    """Validate and convert options by their model.
+
+    Args:
+        model: Option model.
+        values: Options by name.
+        context: Subject of an error message, such as the name of the task.
+
+    Raises:
+        InputError: If a name is unknown, or a value has the wrong type or is out of range.
+    """
+    unknown = [name for name in values if name not in model.model_fields]
+    if unknown:
+        raise InputError(f"{context} has no option {brief(unknown[0])}: {did_you_mean(unknown[0], model.model_fields)}")
+    try:
+        return model(**values)
+    except ValidationError as error:
+        raise InputError(_format_error(model, error.errors()[0], values)) from None
+
+
+def check_choice(name: str, value: Any, choices: list[str], context: str) -> str:
+    """Return `value` if it is one of `choices`.
+
+    Raises:
+        InputError: If it is not.
+    """
+    if value not in choices:
+        raise InputError(f"{context} has no {name} {brief(value)}: {did_you_mean(value, choices)}")
+    return str(value)
+
+
+def describe_options(model: type[BaseModel] | None) -> list[dict[str, Any]]:
+    """Return a row for each option of a model: name, type, default, range and description."""
+    if model is None:
+        return []
+    properties = model.model_json_schema()["properties"]
+    rows = []
+    for name, field in model.model_fields.items():
+        schema = properties[name]
+        bounds = {
+            key: schema[key] for key in ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum") if key in schema
+        }
+        kinds = [schema] if "type" in schema or "enum" in schema else schema.get("anyOf", [])
+        row = {
+            "name": name,
+            "type": " or ".join(str(kind.get("type", "any")) for kind in kinds),
+            "default": field.default,
+        }
+        choices = schema.get("enum")
+        rows.append(row | ({"choices": choices} if choices else {}) | bounds | {"description": field.description or ""})
+    return rows
+
+
+_NUMBER_ERRORS = {
+    "int_type": "whole number",
+    "int_parsing": "whole number",
+    "int_from_float": "whole number",
+    "float_type": "number",
+    "float_parsing": "number",
+}
+
+
+def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any]) -> str:
+    """Return pydantic's error as a sentence that names the option and the remedy."""
+    name = str(error["loc"][0])
+    value, kind, context = values.get(name), error["type"], error.get("ctx", {})
+    if kind == "literal_error":
+        choices = [word.strip().strip("'") for word in context["expected"].replace(" or ", ", ").split(",")]
+        return f"there is no {name} {brief(value)}: {did_you_mean(value, choices)}"
+    bounds = {"greater_than": "more than", "greater_than_equal": "at least", "less_than": "less than"}
+    bounds["less_than_equal"] = "at most"
+    if kind in bounds:
+        (bound,) = context.values()
+        return f"{name} must be {bounds[kind]} {bound:g}, not {brief(value)}"
+    if kind in ("tuple_type", "too_short", "too_long") and (example := _example(model.model_fields[name])):
+        return f"{name} must be {example}, not {brief(value)}"
+    if kind in _NUMBER_ERRORS:
+        return f"{name} must be a {_NUMBER_ERRORS[kind]}, not {brief(value)}"
+    message = str(error["msg"]).removeprefix("Value error, ")
+    return f"{name} cannot be {brief(value)}: {message[:1].lower()}{message[1:]}"
+
+
+def _example(field: FieldInfo) -> str:
+    """Return the number of entries that a field of several numbers takes, with an example; "" for another field."""
+    annotations = repr(field.annotation)
+    if "float" not in annotations and "int" not in annotations:
+        return ""
+    lengths = {getattr(item, "min_length", None) for item in (*field.metadata, *_metadata_of(field.annotation))}
+    (number,) = (lengths - {None}) or {0}
+    example = (field.examples or [field.default or tuple(0.001 * (index + 1) for index in range(number or 2))])[0]
+    return f"{number or 'several'} numbers, such as {','.join(f'{entry:g}' for entry in example)}"
+
+
+def _metadata_of(annotation: Any) -> list[Any]:
+    return [item for part in get_args(annotation) for item in getattr(part, "__metadata__", ())]
