@@ -451,13 +451,11 @@ def shipped_templates() -> str:
 
 def templates() -> str:
     """The YAML of shared control templates."""
-    from guiderail.models.templates import schema as loader
+    from guiderail.models.templates import schema
     from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
 
-    if set(TEMPLATE_WORDS) != loader.TEMPLATE_FIELDS:
-        raise ValueError(
-            f"the fields of a template changed: {set(TEMPLATE_WORDS) ^ loader.TEMPLATE_FIELDS} have no words here"
-        )
+    if changed := {*TEMPLATE_WORDS} ^ {*schema.TemplateFile.model_fields}:
+        raise ValueError(f"the fields of a template changed: {changed} have no words here")
     page = (
         "# Template files\n\nA shared control template is a YAML file; `load_template(path)` reads it and "
         "`guiderail check FILE` says what is wrong with it, in a sentence. "
@@ -466,7 +464,7 @@ def templates() -> str:
     page += table(["field", "what it is"], [(code(n), cell(w)) for n, w in TEMPLATE_WORDS.items()])
     page += "## A state\n\n" + table(["field", "what it is"], [(code(n), cell(w)) for n, w in STATE_WORDS.items()])
     page += (
-        f"At most {loader.MOST_STATES} states, {loader.MOST_PARTS} entries in a list, and {loader.LARGEST_NUMBER:g} "
+        f"At most {schema.MAX_STATES} states, {schema.MAX_PARTS} entries in a list, and {schema.MAX_NUMBER:g} "
         "for any number.\n\n"
     )
     kinds = (

@@ -19,12 +19,13 @@ from guiderail.models.templates.geometry import (
     angle_between,
     bearing,
     chord_angle,
+    interpolate,
     largest,
     matrix_deg,
     pose_in,
     with_position_in,
 )
-from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, interpolate, register, require, require_three
+from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, require, require_three
 
 UNBOUNDED = 1e3  # [m] farther than any robot of ours reaches
 

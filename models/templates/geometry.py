@@ -110,3 +110,8 @@ def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> Rigi
     R_AB = X_WA.rotation().InvertAndCompose(X_WB.rotation()).ToAngleAxis()
     R_AX = RotationMatrix(AngleAxis(fraction * R_AB.angle(), R_AB.axis()))
     return RigidTransform(X_WA.rotation().multiply(R_AX), p_WX)
+
+
+def interpolate(x: float, xs: tuple[float, ...], ys: tuple[float, ...]) -> float:
+    """Return the value at `x` of the piecewise linear function through (xs, ys), constant beyond both ends."""
+    return float(np.interp(x, xs, ys))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from guiderail.models.templates.geometry import WORLD, Frames, about, bearing, position_in, tilt_axis
-from guiderail.models.templates.kinds import INPUT_MAPPINGS, interpolate, register, require, require_three
+from guiderail.models.templates.geometry import WORLD, Frames, about, bearing, interpolate, position_in, tilt_axis
+from guiderail.models.templates.kinds import INPUT_MAPPINGS, register, require, require_three
 
 TOOL = "tool"
 

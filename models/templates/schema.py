@@ -1,318 +1,337 @@
-"""Reads a template from a YAML file, and says in one sentence what is wrong with one."""
+"""Reader of shared control templates from YAML files, which refuses a faulty file in one sentence."""
 
 import ast
+import dataclasses
 import math
 import operator
+import re
 from collections.abc import Callable, Iterable, Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    PlainValidator,
+    StrictBool,
+    StrictInt,
+    TypeAdapter,
+    ValidationError,
+    ValidationInfo,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml, parse_yaml
-from guiderail.models.templates import constraints as active_constraints
-from guiderail.models.templates import mappings as input_mappings
-from guiderail.models.templates import transitions as transition_distances
+from guiderail.models.templates.constraints import ActiveConstraint
 from guiderail.models.templates.geometry import WORLD
-from guiderail.models.templates.kinds import (
-    ACTIVE_CONSTRAINTS,
-    INPUT_MAPPINGS,
-    TRANSITION_DISTANCES,
-    build,
-    did_you_mean,
-)
-from guiderail.models.templates.mappings import TOOL
+from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+from guiderail.models.templates.mappings import TOOL, InputMapping
 from guiderail.models.templates.template import SharedControlTemplate, TemplateState, Transition
+from guiderail.models.templates.transitions import TransitionDistance
 
-# Importing them is what registers the kinds.
-KINDS = (active_constraints, input_mappings, transition_distances)
+MAX_STATES = 30
+MAX_PARTS = 30  # mappings, constraints or transitions of one state
+MAX_EXPRESSION = 200  # characters
+MAX_NUMBER = 1e6  # in any unit of a template: metres, degrees, radians, seconds
 
-OPERATORS: dict[type, Callable[..., float]] = {
+_OPERATORS: dict[type, Callable[..., float]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
     ast.USub: operator.neg,
 }
-MOST_STATES = 30
-MOST_PARTS = 30  # mappings, constraints or transitions of one state
-LONGEST_EXPRESSION = 200  # characters
-LARGEST_NUMBER = 1e6  # in any unit of a template: metres, degrees, radians, seconds
-TEMPLATE_FIELDS = {
-    "name",
-    "inputs",
-    "frames",
-    "parameters",
-    "initial_state",
-    "max_speed_m_per_s",
-    "max_speed_rad_per_s",
-    "states",
-}
 
 
 def load_template(source: str | Path, **parameters: float) -> SharedControlTemplate:
-    """Reads a template.
+    """Read a template.
 
     Args:
-        source: a file that ends in .yaml or .yml, or the name of one of guiderail's own templates: `pouring`,
-            `pouring_aimed`, `grid_clamp` or `end_effector_velocity`.
-        **parameters: sizes of the objects at hand, in place of the file's own values under `parameters`.
+        source: Path of a .yaml or .yml file, or the name of a shipped template: `pouring`, `pouring_aimed`,
+            `grid_clamp` or `end_effector_velocity`.
+        **parameters: Sizes of the objects at hand. They replace values under `parameters` in the file.
 
     Raises:
-        InputError: if the file cannot be read, or what it says is not a template.
+        InputError: If the file cannot be read or is not a valid template.
     """
     path = Path(source)
-    if path.suffix not in (".yaml", ".yml"):
-        files = _shipped_files()
-        if str(source) not in files:
-            raise InputError(f"There is no template {brief(str(source))}; {did_you_mean(str(source), files)}")
-        path = files[str(source)]
-        return _template(_shipped(path), path.name, parameters)
-    return _template(load_yaml(path, "template"), path.name, parameters)
+    if path.suffix in (".yaml", ".yml"):
+        return _read(load_yaml(path, "template"), path.name, parameters)
+    files = _shipped_files()
+    if str(source) not in files:
+        raise InputError(f"There is no template {brief(str(source))}: {did_you_mean(str(source), files)}")
+    path = files[str(source)]
+    return _read(_load_shipped(path), path.name, parameters)
+
+
+def parse_template(text: str, where: str = "template", **parameters: float) -> SharedControlTemplate:
+    """Read a template from YAML text like `load_template`; `where` names the text in messages."""
+    return _read(parse_yaml(text, where), where, parameters)
 
 
 def shipped_templates() -> list[str]:
-    """The names of guiderail's own templates."""
+    """Return the names of the shipped templates, sorted."""
     return sorted(_shipped_files())
 
 
 def _shipped_files() -> dict[str, Path]:
-    """The files of the shipped templates by name; each is in the folder of its object."""
+    """Return the files of the shipped templates by name; each is in the folder of its object."""
     return {file.stem: file for file in Path(__file__).parents[1].joinpath("objects").glob("*/*.yaml")}
 
 
 @lru_cache
-def _shipped(path: Path) -> Any:
-    """What one of guiderail's own files says: environments are checked and made many times in a study."""
+def _load_shipped(path: Path) -> Any:
+    """Return the content of a shipped file, cached because a study makes many environments."""
     return load_yaml(path, "template")
 
 
-def parse_template(text: str, where: str = "template", **parameters: float) -> SharedControlTemplate:
-    """Like load_template, from the YAML text itself; `where` names it in messages."""
-    return _template(parse_yaml(text, where), where, parameters)
+def _calculate(node: ast.expr, parameters: Mapping[str, float] | None) -> float:
+    """Return the value of arithmetic on the names of parameters; None: names are not allowed."""
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        return float(node.value)  # type: ignore[arg-type]
+    if isinstance(node, ast.Name):
+        if parameters is None:
+            raise InputError(f"{brief(node.id)} is not a number, and a parameter can't be computed from others")
+        _check_known("there is no parameter", node.id, parameters)
+        return parameters[node.id]
+    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)](_calculate(node.left, parameters), _calculate(node.right, parameters))
+    if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)](_calculate(node.operand, parameters))
+    raise InputError(f"{brief(ast.unparse(node))} is not a number; use parameters with + − * / only")
 
 
-def _template(data: Any, where: str, parameters: Mapping[str, float]) -> SharedControlTemplate:
-    data = _mapping(data, where, TEMPLATE_FIELDS, required=TEMPLATE_FIELDS - {"frames", "parameters", "initial_state"})
-    number = _Numbers(_parameters(data.get("parameters", {}), parameters, where))
-
-    frames = data.get("frames", [])
-    if not isinstance(frames, list) or not all(map(_is_name, frames)) or len({*frames}) < len(frames):
-        raise InputError(f"{where}: frames must be a list of different names, not {brief(frames)}.")
-    for reserved in (WORLD, TOOL):
-        if reserved in frames:
-            raise InputError(f"{where}: {reserved} is always there; call that object's frame something else.")
-    inputs = data["inputs"]
-    if not isinstance(inputs, int) or isinstance(inputs, bool) or not 1 <= inputs <= 6:
-        raise InputError(f"{where}: inputs must be a whole number from 1 to 6, not {brief(inputs)}.")
-    states = data["states"]
-    if not isinstance(states, dict) or not states:
-        raise InputError(f"{where}: states must be a mapping from names to states, with at least one.")
-    if len(states) > MOST_STATES:
-        raise InputError(f"{where}: {len(states)} states are more than {MOST_STATES}; make two templates of it.")
-    for name in states:
-        if not _is_name(name):
-            raise InputError(f"{where}: {brief(name)} can't name a state; take a short word.")
-    initial = data.get("initial_state", next(iter(states)))
-    if not isinstance(initial, str) or initial not in states:
-        raise InputError(
-            f"{where}: initial_state {brief(initial)} is not a state; {did_you_mean(str(initial), states)}"
-        )
-    if not _is_name(data["name"]):
-        raise InputError(f"{where}: name must be a short text, not {brief(data['name'])}.")
-
-    speeds = {key: number(data[key], f"{where}, {key}") for key in ("max_speed_m_per_s", "max_speed_rad_per_s")}
-    for key, speed in speeds.items():
-        if not speed > 0:
-            raise InputError(f"{where}: {key} must be positive, not {speed}.")
-    built = tuple(_state(name, state, f"{where}, state {name}", number) for name, state in states.items())
-    template = SharedControlTemplate(
-        name=data["name"],
-        inputs=inputs,
-        frames=tuple(frames),
-        states=built,
-        initial_state=list(states).index(initial),
-        parameters=dict(number.names),
-        **speeds,
-    )
-    _check_names(template, where)
-    return template
+def _check_known(message: str, name: str, known: Iterable[str]) -> None:
+    if name not in known:
+        raise InputError(f"{message} {brief(name)}: {did_you_mean(name, known)}")
 
 
-class _Numbers:
-    """Turns an entry of the file into a number: a literal, or arithmetic on the names of parameters."""
-
-    def __init__(self, names: Mapping[str, float]):
-        self.names = names
-
-    def _unknown(self, name: str, where: str) -> InputError:
-        return InputError(f"{where}: there is no parameter {brief(name)}; {did_you_mean(name, self.names)}")
-
-    def __call__(self, entry: Any, where: str) -> float:
-        try:
-            value = self._value(entry, where)
-        except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{where}: {brief(entry)} is not arithmetic on the parameters; mend it.") from error
-        if not math.isfinite(value):
-            raise InputError(f"{where} must be a finite number, not {brief(entry)}.")
-        if abs(value) > LARGEST_NUMBER:
-            raise InputError(f"{where} must be at most a million, not {brief(entry)}; mind its unit.")
-        return value
-
-    def _value(self, entry: Any, where: str) -> float:
-        if isinstance(entry, str):
-            if len(entry) > LONGEST_EXPRESSION:
-                raise InputError(f"{where}: {brief(entry)} is too long; make parts of it parameters.")
-            return self._evaluate(ast.parse(entry.strip(), mode="eval").body, where)
-        if isinstance(entry, int | float) and not isinstance(entry, bool):
-            return float(entry)
-        raise InputError(f"{where} must be a number, not {brief(entry)}.")
-
-    def _evaluate(self, node: ast.expr, where: str) -> float:
-        if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
-            return float(node.value)
-        if isinstance(node, ast.Name):
-            if node.id not in self.names:
-                raise self._unknown(node.id, where)
-            return self.names[node.id]
-        if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
-            return OPERATORS[type(node.op)](self._evaluate(node.left, where), self._evaluate(node.right, where))
-        if isinstance(node, ast.UnaryOp) and type(node.op) in OPERATORS:
-            return OPERATORS[type(node.op)](self._evaluate(node.operand, where))
-        raise InputError(f"{where}: {brief(ast.unparse(node))} is not a number; use parameters with + − * / only.")
+def _number(entry: Any, info: ValidationInfo) -> float:
+    """Return the value of a number, or of an expression of the parameters in `info.context`."""
+    context: Any = info.context
+    entry = entry.item() if isinstance(entry, np.generic) else entry
+    if type(entry) not in (str, int, float):
+        raise ValueError(f"must be a number, not {brief(entry)}")
+    if isinstance(entry, str) and len(entry) > MAX_EXPRESSION:
+        raise ValueError(f"{brief(entry)} is too long; make parts of it parameters")
+    try:
+        parsed = ast.parse(entry.strip(), mode="eval").body if isinstance(entry, str) else ast.Constant(entry)
+        value = _calculate(parsed, context["parameters"])
+    except InputError:
+        raise
+    except (SyntaxError, ValueError, ArithmeticError, RecursionError, MemoryError) as error:
+        raise ValueError(f"{brief(entry)} is not arithmetic on the parameters; correct it") from error
+    if not math.isfinite(value):
+        raise ValueError(f"must be a finite number, not {brief(entry)}")
+    if abs(value) > MAX_NUMBER:
+        raise ValueError(f"must be at most a million, not {brief(entry)}; check its unit")
+    return value
 
 
-class _OwnNumbers(_Numbers):
-    """The same for the parameters themselves, none of which is made of others."""
-
-    def __init__(self, declared: Iterable[Any]):
-        super().__init__({})
-        self._declared = [str(name) for name in declared]
-
-    def _unknown(self, name: str, where: str) -> InputError:
-        return InputError(
-            f"{where}: {brief(name)} is no number, and no parameter ({', '.join(self._declared)}) is made of others."
-        )
+def _name(text: str) -> str:
+    """Accept a text that fits into a sentence and a figure."""
+    if not (0 < len(text) <= 100 and text.isprintable()):
+        raise ValueError(f"{brief(text)} can't name anything; use a short text")
+    return text
 
 
-def _is_name(entry: Any) -> bool:
-    """A text that can stand in a sentence and in a picture."""
-    return isinstance(entry, str) and 0 < len(entry) <= 100 and entry.isprintable()
+def _part(entry: Any, info: ValidationInfo, registry: dict[str, type]) -> Any:
+    """Build a mapping, constraint or distance from an entry with its `kind` and the fields of that kind."""
+    return _union(tuple(registry.items())).validate_python(entry, context=info.context)
 
 
-def _mapping(data: Any, where: str, known: set[str], required: set[str]) -> dict[str, Any]:
-    if not isinstance(data, dict):
-        raise InputError(f"{where} must be a mapping with {', '.join(sorted(required))}, not {brief(data)}.")
-    for key in data:
-        if key not in known:
-            raise InputError(f"{where}: unknown field {brief(key)}; {did_you_mean(str(key), known)}")
-    for key in sorted(required):
-        if key not in data:
-            raise InputError(f"{where}: {key} is missing; give it a value.")
-    return data
+Number = Annotated[float, BeforeValidator(_number)]
+Positive = Annotated[Number, Field(gt=0)]
+Name = Annotated[str, AfterValidator(_name)]
+ParameterName = Annotated[str, Field(pattern="^[A-Za-z_][A-Za-z0-9_]{0,99}$")]
+AnyMapping = Annotated[InputMapping, PlainValidator(partial(_part, registry=INPUT_MAPPINGS))]
+AnyConstraint = Annotated[ActiveConstraint, PlainValidator(partial(_part, registry=ACTIVE_CONSTRAINTS))]
+AnyDistance = Annotated[TransitionDistance, PlainValidator(partial(_part, registry=TRANSITION_DISTANCES))]
+FIELD_TYPES = {
+    float: Number, int: StrictInt, bool: StrictBool, str: str,
+    InputMapping: AnyMapping, ActiveConstraint: AnyConstraint, TransitionDistance: AnyDistance,
+}  # fmt: skip
 
 
-def _parameters(defaults: Any, given: Mapping[str, float], where: str) -> dict[str, float]:
-    if not isinstance(defaults, dict):
-        raise InputError(f"{where}: parameters must be a mapping from names to numbers, not {brief(defaults)}.")
-    plain = _OwnNumbers(defaults)
-    for name in defaults:
-        if not (_is_name(name) and name.isascii() and name.isidentifier()):
-            raise InputError(f"{where}: {brief(name)} can't name a parameter; take letters, digits and underscores.")
-    values = {name: plain(value, f"{where}, parameter {name}") for name, value in defaults.items()}
-    for name, value in given.items():
-        if name not in values:
-            raise InputError(f"{where} has no parameter {brief(name)}; {did_you_mean(name, values)}")
-        values[name] = plain(_plain(value), f"{where}, parameter {name}")
-    return values
+class _Entry(BaseModel):
+    """Base of the mappings in a template file; an unknown field is refused with the nearest known one."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown(cls, data: Any) -> Any:
+        known = [field.alias or name for name, field in cls.model_fields.items()]
+        for key in data if isinstance(data, dict) else ():
+            _check_known("there is no field", key, known)
+        return data
+
+    def build(self, kind: type, **fields: Any) -> Any:
+        """Return an instance of a dataclass with the fields that the file gives, and further ones."""
+        return kind(**{key: getattr(self, key) for key in self.model_fields_set - {"kind"}}, **fields)
 
 
-def _plain(value: Any) -> Any:
-    """A number of NumPy's as one of Python's."""
-    return value.item() if isinstance(value, np.generic) else value
+@lru_cache
+def _union(kinds: tuple[tuple[str, type], ...]) -> TypeAdapter[Any]:
+    """Return the discriminated union of registered kinds; another registration makes another union."""
+    models: Any = tuple(_kind_model(name, kind) for name, kind in kinds)
+    return TypeAdapter(Annotated[Union[models], Field(discriminator="kind")])  # noqa: UP007  (of a tuple)
 
 
-def _state(name: str, data: Any, where: str, number: _Numbers) -> TemplateState:
-    if not isinstance(data, dict) or "transition_distance" not in data:
-        raise InputError(f"{where} must be a mapping with input_mapping, active_constraints and transition_distance.")
-    distance = build(TRANSITION_DISTANCES, data["transition_distance"], f"{where}, transition_distance", number)
-    unit = distance.unit
-    start, end, weight = f"starts_at_{unit}", f"ends_at_{unit}", f"weight_per_{unit}"
-    required = {"input_mapping", "active_constraints", "transition_distance", start}
-    if not data.get("transitions"):
-        required = required | {end}
-    data = _mapping(data, where, required | {end, weight, "transitions"}, required)
+def _kind_model(name: str, kind: type) -> Any:
+    """Return the type of a kind's entries, each of which becomes an instance of the kind."""
+    hints, types = get_type_hints(kind), {}
+    for field in dataclasses.fields(kind):
+        is_required = field.default is field.default_factory is dataclasses.MISSING
+        types[field.name] = (_field_type(hints[field.name]), ... if is_required else None)
+    model: Any = create_model(kind.__name__, __base__=_Entry, kind=(Literal[name], ...), **types)  # type: ignore
+    return Annotated[model, AfterValidator(lambda entry: entry.build(kind))]
+
+
+def _field_type(hint: Any) -> Any:
+    """Return the type that reads a field of a kind: expressions for floats, and no conversion of anything else."""
+    if get_origin(hint) is tuple:
+        element: Any = _field_type(get_args(hint)[0])
+        return tuple[element, ...]
+    return FIELD_TYPES[hint]
+
+
+class _State(_Entry):
+    """A state without the fields that have the unit of its transition distance in their names."""
+
+    transition_distance: AnyDistance
+    input_mapping: tuple[AnyMapping, ...] = Field(max_length=MAX_PARTS)
+    active_constraints: tuple[AnyConstraint, ...] = Field(max_length=MAX_PARTS)
+
+
+@lru_cache
+def _state_model(unit: str) -> Any:
+    """Return the type of a state whose transition distance is in `unit`, "m" or "deg"; it holds SI units."""
     si = math.pi / 180 if unit == "deg" else 1.0
-
-    def quantity(key: str) -> float:
-        return si * number(data[key], f"{where}, {key}")
-
-    transitions = tuple(
-        _transition(entry, unit, si, f"{where}, transition {i + 1}", number)
-        for i, entry in enumerate(_list(data, "transitions", where))
+    number: Any = Annotated[Number, AfterValidator(lambda value: si * value)]
+    margin: Any = Annotated[Positive, AfterValidator(lambda value: si * value)]
+    weight: Any = Annotated[Positive, AfterValidator(lambda value: value / si)]
+    model: Any = create_model(
+        "Transition",
+        __base__=_Entry,
+        to=(str, ...),
+        below=(number, Field(alias=f"below_{unit}")),
+        hysteresis=(margin, Field(None, alias=f"hysteresis_{unit}")),
     )
-    state = TemplateState(
-        name=name,
-        input_mapping=tuple(
-            build(INPUT_MAPPINGS, entry, f"{where}, input_mapping {i + 1}", number)
-            for i, entry in enumerate(_list(data, "input_mapping", where))
-        ),
-        active_constraints=tuple(
-            build(ACTIVE_CONSTRAINTS, entry, f"{where}, active_constraint {i + 1}", number)
-            for i, entry in enumerate(_list(data, "active_constraints", where))
-        ),
-        transition_distance=distance,
-        starts_at=quantity(start),
-        ends_at=quantity(end) if end in data else transitions[0].below,
-        weight=number(data[weight], f"{where}, {weight}") / si if weight in data else 1.0,
-        transitions=transitions,
+    transition: Any = Annotated[model, AfterValidator(lambda entry: entry.build(Transition))]
+    return create_model(
+        "State",
+        __base__=_State,
+        starts_at=(number, Field(alias=f"starts_at_{unit}")),
+        ends_at=(number, Field(None, alias=f"ends_at_{unit}")),
+        weight=(weight, Field(None, alias=f"weight_per_{unit}")),
+        transitions=(tuple[transition, ...], Field((), max_length=MAX_PARTS)),
     )
+
+
+class _MeasuredState(BaseModel):
+    """The part of a state that determines the unit of the others."""
+
+    transition_distance: AnyDistance
+
+
+def _state(entry: Any, info: ValidationInfo) -> Any:
+    """Read one state."""
+    unit = _MeasuredState.model_validate(entry, context=info.context).transition_distance.unit
+    state = _state_model(unit).model_validate(entry, context=info.context)
+    if state.ends_at is None and not state.transitions:
+        raise ValueError(f"ends_at_{unit} is missing; give it a value")
+    state.ends_at = state.transitions[0].below if state.ends_at is None else state.ends_at
     if not state.starts_at > state.ends_at:
-        raise InputError(f"{where}: {start} must be greater than where the phase ends; distances decrease.")
-    if not state.weight > 0:
-        raise InputError(f"{where}: {weight} must be positive.")
+        raise ValueError(f"starts_at_{unit} must be greater than where the phase ends; distances decrease")
     return state
 
 
-def _list(data: Mapping[str, Any], key: str, where: str) -> list:
-    entries = data.get(key, [])
-    if not isinstance(entries, list):
-        raise InputError(f"{where}: {key} must be a list, not {brief(entries)}.")
-    if len(entries) > MOST_PARTS:
-        raise InputError(f"{where}: {len(entries)} {key} are more than {MOST_PARTS}; make two states of it.")
-    return entries
+class TemplateFile(_Entry):
+    """Content of a template file."""
+
+    # First, because the expressions in the other fields need their values.
+    parameters: dict[ParameterName, Number] = Field({}, validate_default=True)
+    name: Name
+    inputs: StrictInt = Field(ge=1, le=6)
+    frames: tuple[Name, ...] = ()
+    max_speed_m_per_s: Positive
+    max_speed_rad_per_s: Positive
+    states: dict[Name, Annotated[Any, PlainValidator(_state)]] = Field(min_length=1, max_length=MAX_STATES)
+    initial_state: str | None = None
+
+    @field_validator("parameters")
+    @classmethod
+    def _replace_given(cls, declared: dict[str, float], info: ValidationInfo) -> dict[str, float]:
+        context: Any = info.context
+        for name in context["given"]:
+            _check_known("there is no parameter", name, declared)
+        given = TypeAdapter(dict[str, Number]).validate_python(context["given"], context=context)
+        context["parameters"] = declared | given
+        return declared | given
+
+    @field_validator("frames")
+    @classmethod
+    def _check_frames(cls, frames: tuple[str, ...]) -> tuple[str, ...]:
+        if len({*frames, WORLD, TOOL}) < len(frames) + 2:
+            raise ValueError(f"frames need different names, and {WORLD} and {TOOL} exist already")
+        return frames
 
 
-def _transition(data: Any, unit: str, si: float, where: str, number: _Numbers) -> Transition:
-    below, hysteresis = f"below_{unit}", f"hysteresis_{unit}"
-    data = _mapping(data, where, {"to", below, hysteresis}, {"to", below})
-    margin = si * number(data[hysteresis], f"{where}, {hysteresis}") if hysteresis in data else None
-    if margin is not None and not margin > 0:
-        raise InputError(f"{where}: {hysteresis} must be positive, or left out where there is no way back.")
-    if not isinstance(data["to"], str):
-        raise InputError(f"{where}: to must be the name of a state, not {brief(data['to'])}.")
-    return Transition(data["to"], si * number(data[below], f"{where}, {below}"), margin)
+def _read(data: Any, where: str, given: Mapping[str, float]) -> SharedControlTemplate:
+    """Build the template of a file with the content `data`."""
+    try:
+        file = TemplateFile.model_validate(data, context={"given": given, "parameters": None})
+        states = tuple(state.build(TemplateState, name=name) for name, state in file.states.items())
+        first = states[0].name if file.initial_state is None else file.initial_state
+        _check_known("initial_state: there is no state", first, file.states)
+        initial = list(file.states).index(first)
+        template = SharedControlTemplate(**{**dict(file), "states": states, "initial_state": initial})
+        for state in states:
+            _check_references(template, state)
+    except ValidationError as error:
+        raise InputError(f"{where}: {_sentence(error)}") from None
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    return template
 
 
-def _check_names(template: SharedControlTemplate, where: str) -> None:
-    """Refuses states, frames and inputs that are named but not there."""
-    states = [state.name for state in template.states]
-    for state in template.states:
-        place = f"{where}, state {state.name}"
-        for transition in state.transitions:
-            if transition.to not in states:
-                raise InputError(
-                    f"{place}: there is no state {brief(transition.to)}; {did_you_mean(transition.to, states)}"
-                )
-        for frame in sorted(state.frame_names):
-            if frame not in template.frames:
-                known = (*template.frames, WORLD)
-                raise InputError(f"{place}: there is no frame {brief(frame)}; {did_you_mean(frame, known)}")
-        for mapping in state.input_mapping:
-            for used in mapping.used_inputs:
-                if not 0 <= used < template.inputs:
-                    raise InputError(f"{place}: there is no input {used}; they are 0 to {template.inputs - 1}.")
+def _check_references(template: SharedControlTemplate, state: TemplateState) -> None:
+    """Refuse states, frames and inputs that a state names and the template does not have."""
+    for transition in state.transitions:
+        names = [other.name for other in template.states]
+        _check_known(f"states.{state.name}: there is no state", transition.to, names)
+    for frame in sorted(state.frame_names):
+        _check_known(f"states.{state.name}: there is no frame", frame, [*template.frames, WORLD])
+    for used in (used for mapping in state.input_mapping for used in mapping.used_inputs):
+        if not 0 <= used < template.inputs:
+            raise InputError(
+                f"states.{state.name}: there is no input {brief(used)}; they are 0 to {template.inputs - 1}"
+            )
+
+
+def _sentence(error: ValidationError) -> str:
+    """Return the first error and its place in the file as a sentence."""
+    first: Any = error.errors()[0]
+    names = (key if isinstance(key, int) or key.isidentifier() else brief(key) for key in first["loc"])
+    place = "".join(f"[{name}]" if isinstance(name, int) else f".{name:.60}" for name in names)
+    place = place.lstrip(".") or "the file"
+    if first["type"] == "value_error":
+        return f"{place}: {first['ctx']['error']}"
+    if first["type"] == "missing":
+        return f"{place} is missing; give it a value"
+    if first["type"] == "union_tag_not_found":
+        return f"{place} has no kind; give it one"
+    if first["type"] == "union_tag_invalid":
+        known = [tag.strip(" '") for tag in first["ctx"]["expected_tags"].split(",")]
+        return f"{place}: unknown kind {brief(first['ctx']['tag'])}: {did_you_mean(first['ctx']['tag'], known)}"
+    message = re.sub(r"valid dictionary.*", "mapping", first["msg"]).replace("tuple", "list").replace("Tuple", "List")
+    if message.startswith("Input "):
+        return f"{place} {message.removeprefix('Input ')}, not {brief(first['input'])}"
+    return f"{place}: {message[0].lower()}{message[1:]}"

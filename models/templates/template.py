@@ -9,9 +9,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import did_you_mean
 from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, grouped
 from guiderail.models.templates.geometry import Frames, angle_between, between, largest
-from guiderail.models.templates.kinds import did_you_mean
 from guiderail.models.templates.mappings import InputMapping
 from guiderail.models.templates.transitions import TransitionDistance
 

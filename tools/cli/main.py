@@ -439,7 +439,7 @@ def check(
     ],
     draw: Annotated[
         Path | None,
-        _opt("Draw the demonstrations, or a template's state machine (.png, .svg, .pdf; a template also .dot)."),
+        _opt("Draw the demonstrations, or a template's states (.png, .svg, .pdf; a template also .dot)."),
     ] = None,
     fit: Annotated[
         bool, _opt("Choose components, kernel and λ by what reproduces them, and say why.", "--fit")
