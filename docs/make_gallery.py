@@ -29,9 +29,9 @@ from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.evaluation.scripted import make_baseline
 from guiderail.tools.learning.train import run
-from guiderail.tools.parts.create_task import onboard
+from guiderail.tools.parts.create_task import create_task
 from guiderail.tools.visualization.curves import draw_world
-from guiderail.tools.visualization.film import path_in_picture
+from guiderail.tools.visualization.camera import path_in_picture
 
 HERE = Path(__file__).parent
 FOLDER = HERE / "pictures"
@@ -193,7 +193,7 @@ def _right(env: Any) -> PolicyFn:
 
 @cache
 def _onboarded(name: str) -> str:
-    """A task made of one of the tests' drawings, as `guiderail onboard` makes it; its name."""
+    """A task made of one of the tests' drawings, as `guiderail create-task` makes it; its name."""
     sys.path.insert(0, str(HERE.parent / "tests"))
     try:
         from oracles.parts import PARTS
@@ -202,7 +202,7 @@ def _onboarded(name: str) -> str:
     folder, drawn = Path(SCRATCH.name) / name, PARTS[name]()
     folder.mkdir()
     turn = float(dict(zip(drawn.options[::2], drawn.options[1::2], strict=True)).get("--turn", 0.0))
-    onboard(*drawn.write(folder), folder / "task", unit="mm", turn=turn)
+    create_task(*drawn.write(folder), folder / "task", unit="mm", turn=turn)
     return task_named(str(folder / "task"))[0]
 
 

@@ -290,29 +290,27 @@ def command() -> str:
     """The command with all its options."""
     import typer
 
-    from guiderail.tools.cli.main import CHOICES, app
+    from guiderail.tools.cli.app import expand_choices
+    from guiderail.tools.cli.main import app
 
     group: Any = typer.main.get_command(app)
-    functions = {
-        command.name or command.callback.__name__.replace("_", "-"): command.callback  # type: ignore[union-attr]
-        for command in app.registered_commands
-    }
+    commands: dict[str, Any] = {}
+    for name, one in group.commands.items():
+        commands |= {f"{name} {part}": sub for part, sub in one.commands.items()} if hasattr(one, "commands") else {}
+        commands |= {} if hasattr(one, "commands") else {name: one}
     page = (
         "# The command\n\n`guiderail COMMAND --help` says the same. Where a program may read the result, "
         "`--json` prints one object.\n\n"
     )
-    for name, one in group.commands.items():
+    for name, one in commands.items():
         page += f"## guiderail {name}\n\n{prose(inspect.cleandoc(one.help or ''))}\n\n"
         page += f"```sh\n{(one.epilog or '').removeprefix('Example: ')}\n```\n\n"
-        kinds = _kinds(functions[name])
+        kinds = _kinds(inspect.unwrap(one.callback))
         rows = []
         for parameter in one.params:
             if parameter.name == "help":
                 continue
-            words = parameter.help or ""
-            for choice, names in CHOICES.items():
-                if f"{{{choice}}}" in words:
-                    words = words.replace(f"{{{choice}}}", ", ".join(names()))
+            words = expand_choices(parameter.help or "")
             given = parameter.opts + parameter.secondary_opts
             is_option = given[0].startswith("-")
             shown = ", ".join(given) if is_option else parameter.metavar or parameter.name.upper()
@@ -339,9 +337,9 @@ def _kinds(function: Any) -> dict[str, str]:
 
 def options() -> str:
     """Tasks, guidance, stations, robots and learners, and what each of them takes."""
-    from guiderail.tools.cli.catalog import everything
+    from guiderail.tools.cli.catalog import describe_all
 
-    known = everything()
+    known = describe_all()
     page = (
         "# Tasks, guidance and their options\n\n`make_env(task, …)`, `gymnasium.make`, and `--env key=value` take "
         "them; `guiderail list --json` has the same.\n\n## Of every environment\n\n"

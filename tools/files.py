@@ -13,6 +13,7 @@ from guiderail.models.common.files import write_atomically as write_atomically
 
 PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 PAGES = (".html", ".htm")
+VIDEOS = (".webp", ".gif")
 
 
 LOCK = ".lock"
@@ -55,6 +56,15 @@ def check_picture(path: Path) -> None:
         InputError: for an ending that is none of `PICTURES`, or a place where nothing can be written.
     """
     _check_named(path, "picture", PICTURES)
+
+
+def check_video(path: Path) -> None:
+    """Refuse a video that cannot be written, before anything is run for it.
+
+    Raises:
+        InputError: For an ending that is none of `VIDEOS`, or a folder that cannot be written to.
+    """
+    _check_named(path, "video", VIDEOS)
 
 
 def check_page(path: Path) -> None:

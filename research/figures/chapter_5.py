@@ -25,7 +25,7 @@ from guiderail.tools.experiments.declaration import LearnerChoice
 from guiderail.tools.experiments.study import each, run_study
 from guiderail.tools.visualization.curves import draw_world
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
-from guiderail.tools.visualization.film import draw_frames, watch
+from guiderail.tools.visualization.camera import draw_frames, record_frames
 from guiderail.tools.visualization.style import colour, label, new_figure
 from research.figures.chapter_4 import CONNECTOR, FORCE, HOLD, LEARNED, TASK, figure_4_3, random_episodes
 from research.figures.runs import episodes_of, figure_study, learning_curves, leave, mean_of_last, said
@@ -335,7 +335,7 @@ def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
     figure, axes = new_figure(2, 4, (13, 6.2))
     rows = []
     for shown, panels, letter in ((unlearned, axes[0], "A"), (learned, axes[1], "B")):
-        row, frames = watch(_first(shown, success=shown is learned), len(panels))
+        row, frames = record_frames(_first(shown, success=shown is learned), len(panels))
         draw_frames(panels, frames, letter)
         kept = ("success", "termination", "steps", "peak_force", "max_commanded_violation")
         rows.append({"episode": shown.acting} | {key: row[key] for key in kept})

@@ -74,7 +74,11 @@ def test_every_command_task_and_kind_is_there(reference):
     from guiderail.tools.cli.main import app
     from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS
 
+    commands = {}
     for name, command in typer.main.get_command(app).commands.items():
+        parts = getattr(command, "commands", None)
+        commands |= {name: command} if parts is None else {f"{name} {part}": one for part, one in parts.items()}
+    for name, command in commands.items():
         part = reference["command"].partition(f"\n## guiderail {name}\n")[2].partition("\n## ")[0]
         for option in (one for parameter in command.params for one in parameter.opts if one[:2] == "--"):
             assert option == "--help" or f"`{option}" in part or f", {option}" in part, f"{name} lacks {option}"

@@ -105,7 +105,7 @@ def test_it_is_trained_resumed_and_evaluated(lab, trained):
 
 
 def test_it_is_replayed(lab, trained):
-    guiderail(lab, "replay", "run", "--episodes", "1", "--html", "page.html")
+    guiderail(lab, "visualize", "run", "--episodes", "1", "--html", "page.html")
     assert "peglab/Slot" in (lab.folder / "page.html").read_text()
 
 

@@ -11,14 +11,14 @@ from safetensors.numpy import load_file
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.datasets.record import record
-from guiderail.tools.datasets.validate import check
+from guiderail.tools.datasets.validate import validate_demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import reset_held_out
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import train
-from guiderail.tools.visualization import film
+from guiderail.tools.visualization import camera
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.replay import default_page, tube, write_page
 
@@ -89,11 +89,11 @@ def test_the_replay_is_one_page_that_needs_nothing_else(trained):
 
 
 def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, monkeypatch):
-    watched = film.watch(EpisodeSpec.of_run(trained.path), film.ROWS * film.COLUMNS)
-    monkeypatch.setattr(film, "watch", lambda *_: watched)  # once for both
+    watched = camera.record_frames(EpisodeSpec.of_run(trained.path), camera.ROWS * camera.COLUMNS)
+    monkeypatch.setattr(camera, "record_frames", lambda *_: watched)  # once for both
     for ending, magic in ((".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")):
         picture = tmp_path / f"film{ending}"
-        row = film.write_film(picture, EpisodeSpec.of_run(trained.path))
+        row = camera.write_image(picture, EpisodeSpec.of_run(trained.path))
         assert row["success"]
         assert picture.read_bytes().startswith(magic)
         image = imread(picture)
@@ -105,14 +105,14 @@ def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
     with pytest.raises(InputError, match="no station 'arm': choose one of plane"):
         write_page(tmp_path / "replay.html", EpisodeSpec.of_run(trained.path, {"station": "arm"}))
     with pytest.raises(InputError, match="a picture is"):
-        film.write_film(tmp_path / "film.gif", EpisodeSpec.of_run(trained.path))
+        camera.write_image(tmp_path / "film.gif", EpisodeSpec.of_run(trained.path))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_policy_does_can_be_demonstrated_again(trained, tmp_path):
     file = record(trained.path, tmp_path / "again.npz", episodes=2)
     assert Demonstrations.load(file).num_demonstrations == 2
-    assert check(file)["demonstrations"] == 2
+    assert validate_demonstrations(file)["demonstrations"] == 2
     with pytest.raises(InputError, match="already exists"):
         record(trained.path, file, episodes=2)
 

@@ -18,8 +18,8 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
-from guiderail.tools.cli.catalog import options_in_words
-from guiderail.tools.datasets.validate import check
+from guiderail.tools.cli.catalog import describe_task_options
+from guiderail.tools.datasets.validate import validate_template
 from guiderail.tools.environments import import_modules
 from guiderail.tools.evaluation.evaluate import _counts_collisions, evaluation_scope
 from research.action_fuzzing.campaign import stress
@@ -241,12 +241,12 @@ def test_a_world_that_is_none_is_a_sentence():
 def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
     declare()
     assert "conditions as in training" in evaluation_scope("lab/Own", {}, resample_offsets=False)
-    words = options_in_words("lab/Own")
-    assert words["reset: held_out"].startswith("nothing here")
-    assert words["reward"] == "what is rewarded: the task's own, which has no name"
+    words = describe_task_options("lab/Own")
+    assert words["reset: held_out"].startswith("no effect")
+    assert words["reward"] == "reward of the task, which has one unnamed reward"
     declare(has_held_out_distribution=True)
     assert evaluation_scope("lab/Own", {}, resample_offsets=False) == "a policy for starts that training never drew"
-    assert options_in_words("lab/Own")["reset: held_out"].startswith("draw from conditions that training never")
+    assert describe_task_options("lab/Own")["reset: held_out"].startswith("draw from conditions that training never")
 
 
 def test_collisions_are_counted_only_where_a_task_says_what_they_are():
@@ -283,6 +283,6 @@ def test_a_file_finds_those_beside_it_and_what_fails_in_it_is_said(tmp_path):
 
 def test_check_accepts_the_name_of_a_shipped_template(monkeypatch):
     monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
-    back, none = check(Path("pouring"))["transitions"]
+    back, none = validate_template(Path("pouring"))["transitions"]
     assert back == "translational → tilt below 0.25 m, back above 0.27 m"
     assert none == "tilt → pour below 0.075 m, no way back"

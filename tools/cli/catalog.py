@@ -1,4 +1,4 @@
-"""`guiderail list`: what there is to choose from, this package's own and whatever installed packages add."""
+"""Descriptions of tasks, guidance, stations, robots and learners, for `guiderail list` and the reference pages."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from guiderail.tools.environments import task_options
 from guiderail.tools.learning.learner import LEARNERS
 
 
-def everything() -> dict[str, Any]:
-    """Tasks, guidance, stations, robots and learners by name: what each is, its ports and its options."""
+def describe_all() -> dict[str, Any]:
+    """Describe all tasks, guidance, stations, robots, end effectors and learners by name, with ports and options."""
     return {
-        "tasks": {name: task(name) for name in TASKS.names()},
+        "tasks": {name: describe_task(name) for name in TASKS.names()},
         "guidance": {name: _guidance(name) for name in GUIDANCE.names()},
         "stations": {name: _station(name) for name in STATIONS.names()},
         "robots": {
@@ -41,11 +41,16 @@ def everything() -> dict[str, Any]:
     }
 
 
-def task(name: str) -> dict[str, Any]:
-    """One task.
+def is_declared(task: str) -> bool:
+    """Return True if a task is declared with `register_task`, and not only registered with Gymnasium."""
+    return task in TASKS.names()
+
+
+def describe_task(name: str) -> dict[str, Any]:
+    """Describe a task: its guidance, stations, rewards, observations, difficulties, defaults and options.
 
     Raises:
-        InputError: if there is none of that name.
+        InputError: If there is no task of that name.
     """
     declared = TASKS.get(name)
     return {
@@ -62,13 +67,13 @@ def task(name: str) -> dict[str, Any]:
     }
 
 
-def options_in_words(name: str) -> dict[str, str]:
-    """The options of a task's environment, each with its default, its range and what it is.
+def describe_task_options(name: str) -> dict[str, str]:
+    """Describe the options of a task's environment and of its reset as text: meaning, range and default.
 
     Raises:
-        InputError: if there is no task of that name.
+        InputError: If there is no task of that name.
     """
-    if name not in TASKS.names():
+    if not is_declared(name):
         return {key: f"{value!r}" for key, value in task_options(name).items()}
     config = EnvConfig.resolve(name, {})
     declared = TASKS.get(name)
@@ -79,43 +84,41 @@ def options_in_words(name: str) -> dict[str, str]:
         "observation": declared.observations,
         "difficulty": tuple(declared.difficulties),
     }
-    words = {}
+    texts = {}
     for model in (CommonOptions, *map(type, config.parts.values())):
         for row in describe_options(model):
-            words[row["name"]] = _option(row, config.options[row["name"]], choices.get(row["name"], ()))
+            texts[row["name"]] = _describe_option(row, config.options[row["name"]], choices.get(row["name"], ()))
     for kind in map(GUIDANCE.get, choices["guidance"]):
         if kind.name != config.guidance:
-            own = {
-                row["name"]: f"of guidance={kind.name}: {_option(row, row['default'])}"
-                for row in describe_options(kind.options)
-            }
-            words |= {key: f"{words[key]}; {said}" if key in words else said for key, said in own.items()}
+            for row in describe_options(kind.options):
+                text = f"with guidance={kind.name}: {_describe_option(row, row['default'])}"
+                texts[row["name"]] = f"{texts[row['name']]}; {text}" if row["name"] in texts else text
     for difficulty, settings in declared.difficulties.items():
         if settings:
-            stands_for = ", ".join(f"{key}={_said(value)}" for key, value in settings.items())
-            words[f"difficulty={difficulty}"] = f"stands for {stands_for}"
+            pairs = ", ".join(f"{key}={_format_value(value)}" for key, value in settings.items())
+            texts[f"difficulty={difficulty}"] = f"is the same as {pairs}"
     if declared.rewards is Task.rewards:
-        words["reward"] = "what is rewarded: the task's own, which has no name"
+        texts["reward"] = "reward of the task, which has one unnamed reward"
     reset = {f"reset: {row['name']}": row["description"] for row in describe_options(declared.Reset)}
     if not declared.has_held_out_distribution:
-        reset["reset: held_out"] = "nothing here: the task declares no conditions that training never draws"
-    return words | reset
+        reset["reset: held_out"] = "no effect: the task declares no held-out conditions"
+    return texts | reset
 
 
-def _option(row: Mapping[str, Any], default: Any, choices: Collection[str] = ()) -> str:
-    """What an option is, what it can be, and what it is unless given."""
+def _describe_option(row: Mapping[str, Any], default: Any, choices: Collection[str] = ()) -> str:
+    """Return an option's meaning, its range or choices, and its default."""
     allowed = row.get("choices") or choices
-    among = f"one of {', '.join(map(str, allowed))}; " if allowed else ""
+    values = f"one of {', '.join(map(str, allowed))}; " if allowed else ""
     if {"minimum", "maximum"} <= row.keys():
-        among = f"from {row['minimum']:g} to {row['maximum']:g}; "
-    return f"{row['description']}: {among}{default!r} unless given"
+        values = f"from {row['minimum']:g} to {row['maximum']:g}; "
+    return f"{row['description']}: {values}default {default!r}"
 
 
 def _guidance(name: str) -> dict[str, Any]:
     kind = GUIDANCE.get(name)
     return {
         "is": kind.label,
-        "needs": [list(needed) for needed in kind.needs],
+        "needs": [list(names) for names in kind.needs],
         "inputs": list(GUIDANCE_INPUTS),
         "outputs": list(GUIDANCE_OUTPUTS),
         "options": describe_options(kind.options),
@@ -133,10 +136,10 @@ def _station(name: str) -> dict[str, Any]:
     }
 
 
-def _said(value: Any) -> str:
-    """A setting as `--env` takes it, without the rounding of the last bit."""
+def _format_value(value: Any) -> str:
+    """Return a value as `--env` takes it, without the rounding error of the last digit."""
     if isinstance(value, tuple | list):
-        return f"[{','.join(map(_said, value))}]"
+        return f"[{','.join(map(_format_value, value))}]"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

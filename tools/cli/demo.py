@@ -1,4 +1,4 @@
-"""`guiderail demo`: a skill learned before your eyes, and what it leaves behind."""
+"""`guiderail demo`: train a policy in a minute or two, and show what the run folder contains."""
 
 import shutil
 import sys
@@ -20,28 +20,28 @@ from guiderail.tools.learning.train import run
 from guiderail.tools.visualization.curves import draw_world
 from guiderail.tools.visualization.style import colour, new_figure, save_figure
 
-HELD_OUT = 10  # episodes that the result is judged on
-SEED = 1_000_000
+HELD_OUT = 10  # number of held-out episodes
+SEED = 1_000_000  # seed of the first of them
 PRESET = "tqc_cheap_correlated"
-MARK = ".demo"  # a file in the folder of a demo: nothing without it is removed
+MARK = ".demo"  # file that marks the folder of a demo: no other folder is removed
 
 
 def run_demo(out: Path, *, episodes: int, seed: int) -> None:
-    """Learns to avoid an obstacle in the narrow passage by sKGRL with TQC, and says what came of it.
+    """Train sKGRL with TQC to avoid an obstacle in the narrow passage, evaluate it and print the result.
 
     Args:
-        out: the run's folder; a demo that is there already is replaced, anything else is left alone.
-        episodes: how many to learn from.
-        seed: of everything random.
+        out: Folder of the run; an existing demo is replaced, anything else is refused.
+        episodes: Number of training episodes.
+        seed: Seed of all random numbers.
 
     Raises:
-        InputError: if the folder holds something else than a demo, or a number is out of range.
+        InputError: If the folder contains something else than a demo, or a number is out of range.
     """
     started = time.perf_counter()
     console = Console(soft_wrap=True, highlight=False)
     console.print(
-        "A robot was shown nine times how to get through a narrow passage. Then an obstacle was put into its way,\n"
-        "and a zone was forbidden. It now learns by trial and error to go around the one, and never enters the other."
+        "A robot has nine demonstrations of the way through a narrow passage. Then an obstacle and a forbidden zone\n"
+        "were added. It now learns by trial and error to avoid the obstacle, and never enters the forbidden zone."
     )
     _clear(out)
     write_atomically(out / MARK, b"")
@@ -59,44 +59,44 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     rows = RunFolder(out).episodes()
     avoided = avoids_obstacle_from(rows)
     violations = (rows[["max_commanded_violation", "max_measured_violation"]].max(axis=1) > TOLERANCE).sum()
-    console.print(f"\nWhat came of it, in {time.perf_counter() - started:.0f} s:")
+    console.print(f"\nResult after {time.perf_counter() - started:.0f} s:")
     for line in (
         f"{rows['success'].sum()} of {len(rows)} training episodes reached the goal, "
         f"{violations} violated the constraint, {(rows['collisions'] > 0).sum()} touched a wall.",
-        "It did not learn to keep clear of the obstacle: give it more --episodes."
+        "It did not learn to avoid the obstacle: try more --episodes."
         if avoided is None
-        else f"From episode {avoided} on it kept clear of the obstacle while still exploring.",
-        f"What it learned, from {HELD_OUT} starts that it never trained from: {_outcome(after)}.",
-        f"The demonstrations alone, from the same starts: {_outcome(before)}.",
+        else f"From episode {avoided} on it avoided the obstacle while still exploring.",
+        f"The policy on {HELD_OUT} held-out starts: {_outcome(after)}.",
+        f"The demonstrations alone on the same starts: {_outcome(before)}.",
     ):
         console.print(f"  · {line}")
-    console.print("\nWhat it left:")
-    for path, what in (
-        (picture, "the paths before and after learning, and what learning earned"),
-        (summary["replay"], "the same in three dimensions, moving: open it in a browser"),
+    console.print("\nFiles:")
+    for path, content in (
+        (picture, "paths before and after learning, and the return over the episodes"),
+        (summary["replay"], "animation in three dimensions: open it in a browser"),
         (out / "episodes.csv", "every training episode: return, success, violations, forces, jerk"),
-        (out / "learning_curve.png", "the same, drawn"),
+        (out / "learning_curve.png", "plots of these"),
     ):
-        console.print(f"  {path}\n      {what}")
-    called = _called()
-    console.print(f"\nNext: {called} evaluate {out}, {called} reproduce 5.6, {called} train --help")
+        console.print(f"  {path}\n      {content}")
+    name = _command_name()
+    console.print(f"\nNext: {name} evaluate {out}, {name} list, {name} train --help")
 
 
-def _called() -> str:
-    """What to write for this command: its path where the shell does not find it by its name."""
+def _command_name() -> str:
+    """Return the name of this command, or its path if the shell does not find it by its name."""
     path = Path(sys.argv[0])
     return str(path) if path.name == "guiderail" and shutil.which("guiderail") is None else "guiderail"
 
 
 def _clear(out: Path) -> None:
-    """Removes an earlier demo, and nothing else."""
+    """Remove an earlier demo, and nothing else."""
     if (out / MARK).is_file():
         shutil.rmtree(out)
     RunFolder(out).refuse_existing()
 
 
 def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Held-out episodes of the demonstration alone and of the policy: rows with paths."""
+    """Run held-out episodes of the demonstration alone and of the policy; return their rows, with paths."""
     config = RunFolder(out).config()
     env = make_environment(config.task, config.environment)
     env.reset(seed=config.seed)
@@ -109,12 +109,12 @@ def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _outcome(rows: pd.DataFrame) -> str:
-    reach, earned, near = (rows[name].mean() for name in ("success", "return", "reward_obstacle_cost"))
-    return f"{reach:.0%} reach the goal, return {earned:.1f}, {near:+.1f} of it at the obstacle"
+    success, total, cost = (rows[name].mean() for name in ("success", "return", "reward_obstacle_cost"))
+    return f"{success:.0%} reach the goal, return {total:.1f}, {cost:+.1f} of it from the obstacle"
 
 
 def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
-    """The plane with the paths before and after, and the return over the episodes."""
+    """Draw the paths before and after learning, and the return over the episodes."""
     figure, ((plane, curve),) = new_figure(1, 2, (11, 5.2))
     draw_world(plane, named=True)
     for index, path in enumerate(after["measured"]):
@@ -124,7 +124,7 @@ def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
     rows = RunFolder(out).episodes()
     episodes = np.arange(1, len(rows) + 1)
     curve.plot(episodes, rows["return"], "o-", markersize=3, color=colour("skgrl"), label="return")
-    curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="of it at the obstacle")
+    curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="of it from the obstacle")
     curve.axhline(before["return"].mean(), color="black", linewidth=0.8, linestyle=":", label="return before learning")
     curve.set(xlabel="training episode")
     curve.legend(frameon=False, fontsize=8)

@@ -1,4 +1,4 @@
-"""`guiderail constraints`: bounds from demonstrations, drawn over them, as YAML that a task folder takes."""
+"""Bounds of commands, fitted to demonstrations, as a picture, as YAML and in a task folder."""
 
 from __future__ import annotations
 
@@ -16,29 +16,31 @@ from guiderail.tools.datasets.paths import check_new, is_there, load_demonstrati
 from guiderail.tools.files import check_picture, check_writable, write_atomically
 
 
-def constraints(
+def fit_bounds(
     file: Path,
     *,
     phases: int = 1,
     margin: float = 0.1,
-    least: float = 0.0,
+    min_margin: float = 0.0,
     outputs: list[int] | None = None,
     draw: Path | None = None,
     out: Path | None = None,
-    into: Path | None = None,
+    task: Path | None = None,
 ) -> dict[str, Any]:
-    """Finds bounds, draws and writes them.
+    """Fit bounds to demonstrations, draw and write them; return them as text.
 
     Args:
-        file: demonstrations.
-        phases, margin, least: see `demonstrated_bounds`.
-        outputs: numbers of those that are bounded; all unless given.
-        draw: a picture.
-        out: a YAML file to write, which must not exist.
-        into: a task folder whose bounds become these.
+        file: Demonstrations.
+        phases: Number of phases, each with its own bounds.
+        margin: Margin beyond the demonstrations, as a fraction of their range.
+        min_margin: Smallest margin, in the outputs' unit.
+        outputs: Indices of the bounded outputs; all by default.
+        draw: Picture to write.
+        out: YAML file to write; it must not exist.
+        task: Task folder whose bounds are replaced.
 
     Raises:
-        InputError: if something of that makes no sense.
+        InputError: If an argument is invalid.
     """
     if draw is not None:
         check_picture(draw)
@@ -48,33 +50,33 @@ def constraints(
         check_new(out, "file")
         check_writable(out)
     demonstrations = load_demonstrations(file)
-    found = demonstrated_bounds(demonstrations, phases, margin, least, outputs)
-    values = as_values(found)
-    # A picture can be drawn again, a task's bounds are what others rely on: they change last, and are sound by then.
-    bounded = None if into is None else _with_bounds(into, values)
+    bounds = demonstrated_bounds(demonstrations, phases, margin, min_margin, outputs)
+    values = as_values(bounds)
+    # The task's bounds are written last, once they are valid: a picture can be drawn again.
+    task_file = None if task is None else _with_bounds(task, values)
     if draw is not None:
-        _draw(found, demonstrations, draw)
+        _draw(bounds, demonstrations, draw)
     if out is not None:
-        text = yaml.safe_dump({"outputs": list(found.names), "bounds": values}, sort_keys=False, width=110)
+        text = yaml.safe_dump({"outputs": list(bounds.names), "bounds": values}, sort_keys=False, width=110)
         write_atomically(out, text.encode())
-    if into is not None and bounded is not None:
-        write_task_file(into, bounded)
+    if task is not None and task_file is not None:
+        write_task_file(task, task_file)
     rows = {
-        f"{name} in phase {k + 1}": f"{found.lower[k, o]:.4g} to {found.upper[k, o]:.4g}"
+        f"{name} in phase {k + 1}": f"{bounds.lower[k, o]:.4g} to {bounds.upper[k, o]:.4g}"
         for k in range(phases)
-        for o, name in enumerate(found.names)
-        if np.isfinite(found.lower[k, o])
+        for o, name in enumerate(bounds.names)
+        if np.isfinite(bounds.lower[k, o])
     }
-    fastest = [float(f"{one:.4g}") for one in found.fastest]
-    written = {"written": str(out or into)} if out or into else {}
+    fastest = [float(f"{speed:.4g}") for speed in bounds.fastest]
+    written = {"written": str(out or task)} if out or task else {}
     return {"demonstrations": str(file), **rows, "fastest per second": fastest, **written}
 
 
 def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
-    """What a task folder's `bounds` holds; null where an output is free."""
+    """Return the value of `bounds` in a task folder; an unbounded output is None."""
 
     def plain(rows: np.ndarray) -> list[Any]:
-        lists = [[float(f"{one:.9g}") if np.isfinite(one) else None for one in row] for row in rows]
+        lists = [[float(f"{value:.9g}") if np.isfinite(value) else None for value in row] for row in rows]
         return lists if len(lists) > 1 else lists[0]
 
     values: dict[str, Any] = {"lower": plain(bounds.lower), "upper": plain(bounds.upper)}
@@ -82,7 +84,7 @@ def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
 
 
 def _with_bounds(folder: Path, values: dict[str, Any]) -> PartTaskFile:
-    """A task folder's file with these bounds instead of its own."""
+    """Return the task file of a folder with its bounds replaced."""
     return read_task_file(folder).model_copy(update={"bounds": validate_options(Bounds, values, str(folder))})
 
 
@@ -99,5 +101,5 @@ def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> Non
             if np.isfinite(bound).all():
                 axis.step(edges, np.append(bound, bound[-1]), where="post", color="firebrick", linewidth=1.0)
         axis.set(ylabel=name, xlabel="phase" if o + 1 == len(bounds.names) else "")
-    axes[0, 0].set_title("demonstrations, and the bounds that they keep", fontsize=9)
+    axes[0, 0].set_title("demonstrations and fitted bounds", fontsize=9)
     save_figure(figure, picture)

@@ -1,4 +1,4 @@
-"""`guiderail check`: what a file of demonstrations or a template holds, before anything is learned from it."""
+"""Validation of demonstrations and templates before they are used."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from guiderail.tools.files import check_picture
 
 
 def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | None:
-    """A sentence if the zero action leaves the demonstrations' spread; None if it doesn't, or there are none.
+    """Return a warning if the motion without actions leaves the spread of the demonstrations, else None.
 
     Args:
-        task: its name.
-        environment: its options.
+        task: Name of the task.
+        environment: Options of its environment.
 
     Raises:
-        InputError: for an unknown task or option.
+        InputError: For an unknown task or option.
     """
     from guiderail.diagrams.envs.config import EnvConfig  # Drake takes a second
 
@@ -38,60 +38,27 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
         return None
     return (
         f"without actions, {share:.0%} of the steps stay within a standard deviation of the demonstrations: let "
-        "guiderail check FILE --fit choose inverse_length, lambda_ and beta, and give them by --env"
+        "guiderail dataset validate FILE --fit choose inverse_length, lambda_ and beta, and give them by --env"
     )
 
 
-TEMPLATES = (".yaml", ".yml")
-SI = {"m": "m", "deg": "rad"}  # what a distance is in, by the unit that a file gives it in
-
-
-def check(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
-    """Reads a file as what its ending says it is.
+def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
+    """Read demonstrations and return their number, durations, ranges and spread.
 
     Args:
-        file: what is read; or the name of one of guiderail's own templates.
-        draw: where demonstrations or a state machine are drawn.
-        fit: whether a primitive is fitted to demonstrations, which takes seconds.
+        file: File of demonstrations, or a folder of files.
+        draw: Picture of their mean, covariance and bounds to write.
+        fit: Whether a primitive is fitted to them, which takes seconds.
 
     Raises:
-        InputError: if it is neither, or what it holds makes no sense.
-    """
-    if not is_there(file):
-        from guiderail.models.templates.schema import shipped_templates
-
-        if str(file) in shipped_templates():
-            _refuse_fit(fit)
-            return check_template(file, draw)
-        raise InputError(
-            f"there is no file {file}: name demonstrations (.npz, .csv, a folder), a template (.yaml) or one of "
-            f"{', '.join(shipped_templates())}"
-        )
-    if file.suffix in ENDINGS or file.is_dir():
-        return check_demonstrations(file, draw) | (fitted(file) if fit else {})
-    if file.suffix in TEMPLATES:
-        _refuse_fit(fit)
-        return check_template(file, draw)
-    raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv, a template is .yaml")
-
-
-def _refuse_fit(fit: bool) -> None:
-    if fit:
-        raise InputError("--fit is of demonstrations, and this is a template: leave it out")
-
-
-def check_demonstrations(file: Path, draw: Path | None = None) -> dict[str, Any]:
-    """What a file of demonstrations holds: how many, how long, and how far they agree with each other.
-
-    Args:
-        file: the file, or a folder of files.
-        draw: where they are drawn, with their mean, covariance and bounds.
-
-    Raises:
-        InputError: if they make no sense, or cannot be drawn.
+        InputError: If the demonstrations are invalid, or cannot be drawn or fitted.
     """
     if draw is not None:
         check_picture(draw)
+    if not is_there(file):
+        raise InputError(f"there is no file {file}: name demonstrations (.npz, .csv or a folder of them)")
+    if file.suffix not in ENDINGS and not file.is_dir():
+        raise InputError(f"{file} has the ending {file.suffix!r}: demonstrations are .npz or .csv")
     demonstrations = load_demonstrations(file)
     common = demonstrations.resampled()
     outputs = np.stack(common.outputs)
@@ -99,7 +66,7 @@ def check_demonstrations(file: Path, draw: Path | None = None) -> dict[str, Any]
     durations = [float(t[-1] - t[0]) for t in demonstrations.times]
     if draw is not None:
         draw_demonstrations(common, draw)
-    return {
+    summary = {
         "file": str(file),
         "demonstrations": demonstrations.num_demonstrations,
         "outputs": list(demonstrations.names),
@@ -110,41 +77,40 @@ def check_demonstrations(file: Path, draw: Path | None = None) -> dict[str, Any]
         "highest": outputs.max(axis=(0, 1)).round(6).tolist(),
         "tightest": spread.min(axis=0).round(6).tolist(),
         "widest": spread.max(axis=0).round(6).tolist(),
-    } | ({} if draw is None else {"picture": str(draw)})
+    }
+    summary |= {} if draw is None else {"picture": str(draw)}
+    return summary | (fit_primitive(demonstrations) if fit else {})
 
 
-def fitted(file: Path) -> dict[str, Any]:
-    """What a primitive of these demonstrations should be made with, why, and how the defaults would do.
+def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
+    """Return the parameters of a primitive that reproduces the demonstrations, the reason, and the defaults' result.
 
     Raises:
-        InputError: if they are too few for that.
+        InputError: If there are too few demonstrations.
     """
     from guiderail.models.primitives import LcNsKmp
-    from guiderail.models.primitives.fit import ENOUGH, fit, share_within_spread
+    from guiderail.models.primitives.fit import fit, share_within_spread
 
-    demonstrations = load_demonstrations(file)
-    # What agrees exactly would leave a covariance singular.
-    floor = 1e-3 * np.maximum(np.ptp(np.concatenate(demonstrations.outputs), axis=0), 1e-9)
+    floor = _variance_floor(np.concatenate(demonstrations.outputs))
     chosen = fit(demonstrations, floor=floor)
     share = share_within_spread(LcNsKmp(chosen.reference))
-    words = "stays with them" if share >= ENOUGH else "LEAVES them: give what is chosen here"
+    verdict = "follows the demonstrations" if share >= ENOUGH else "LEAVES the demonstrations: use these values"
     return {
         "components": chosen.components,
         "inverse_length": float(f"{chosen.kernel.inverse_length:.4g}"),
         "lambda_": float(f"{chosen.lambda_:.4g}"),
         "beta": float(f"{chosen.beta:.4g}"),
         "why": chosen.why,
-        "with the defaults": f"λ = β = 6 and inverse_length = 2: {share:.1%} of the steps within; {words}",
+        "with the defaults": f"λ = β = 6 and inverse_length = 2: {share:.1%} of the steps within; {verdict}",
     }
 
 
 def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
-    """Draws demonstrations on one clock: each, the reference's mean with two standard deviations, and their bounds."""
+    """Draw resampled demonstrations, the mean and two standard deviations of the reference, and their bounds."""
     from guiderail.tools.visualization.style import new_figure, save_figure
 
     outputs = np.stack(common.outputs)
-    # What agrees exactly would leave a covariance singular.
-    floor = 1e-3 * np.maximum(np.ptp(outputs, axis=(0, 1)), 1e-9)
+    floor = _variance_floor(outputs.reshape(-1, outputs.shape[-1]))
     reference = ReferenceTrajectory.from_demonstrations(common, floor=floor)
     figure, axes = new_figure(len(common.names), 1, (8.0, 2.2 * len(common.names)))
     for o, (axis, name) in enumerate(zip(axes[:, 0], common.names, strict=True)):
@@ -159,20 +125,36 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
     save_figure(figure, picture)
 
 
-def check_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
-    """What a template holds, and what is odd about it; reading it is what finds most of its faults.
+def _variance_floor(samples: np.ndarray) -> np.ndarray:
+    """Return a floor (O,) of the standard deviation: demonstrations that agree exactly have a singular covariance."""
+    return 1e-3 * np.maximum(np.ptp(samples, axis=0), 1e-9)
+
+
+TEMPLATE_ENDINGS = (".yaml", ".yml")
+SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a transition distance, by the unit in the file
+
+
+def validate_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
+    """Read a template and return its inputs, frames, states and transitions, with remarks.
 
     Args:
-        file: the template, or the name of one of guiderail's own.
-        draw: where its state machine is drawn: .png, .svg, .pdf or .dot.
+        file: Template, or the name of a shipped one.
+        draw: Picture of its state machine to write: .png, .svg, .pdf or .dot.
 
     Raises:
-        InputError: if the template cannot be used.
+        InputError: If the template cannot be used.
     """
-    from guiderail.models.templates import load_template  # it needs Drake, which demonstrations don't
+    from guiderail.models.templates import load_template  # imports Drake, which demonstrations do not need
     from guiderail.models.templates.drawing import draw as draw_template
+    from guiderail.models.templates.schema import shipped_templates
     from guiderail.models.templates.validate import validate
 
+    if not is_there(file) and str(file) not in shipped_templates():
+        raise InputError(
+            f"there is no file {file}: name a template (.yaml), or one of {', '.join(shipped_templates())}"
+        )
+    if is_there(file) and file.suffix not in TEMPLATE_ENDINGS:
+        raise InputError(f"{file} has the ending {file.suffix!r}: a template is .yaml")
     template = load_template(file)
     findings = validate(template)
     errors = [finding.message for finding in findings if finding.is_error]
@@ -186,15 +168,15 @@ def check_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
         "inputs": template.inputs,
         "frames": list(template.frames),
         "states": [state.name for state in template.states],
-        "transitions": [_in_words(s, t) for s in template.states for t in s.transitions],
+        "transitions": [_describe_transition(s, t) for s in template.states for t in s.transitions],
         "remarks": [finding.message for finding in findings if not finding.is_error],
     }
 
 
-def _in_words(state: Any, transition: Any) -> str:
-    """A transition with its unit, and where the way back is."""
-    unit = SI[state.transition_distance.unit]
-    words = f"{state.name} → {transition.to} below {transition.below:g} {unit}"
+def _describe_transition(state: Any, transition: Any) -> str:
+    """Return a transition as text, with its unit and the threshold of the way back."""
+    unit = SI_UNITS[state.transition_distance.unit]
+    text = f"{state.name} → {transition.to} below {transition.below:g} {unit}"
     if transition.hysteresis is None:
-        return f"{words}, no way back"
-    return f"{words}, back above {transition.below + transition.hysteresis:g} {unit}"
+        return f"{text}, no way back"
+    return f"{text}, back above {transition.below + transition.hysteresis:g} {unit}"

@@ -93,9 +93,9 @@ class RobotConnection:
             if given.get(name) and theirs and given[name] != theirs:
                 option = name.replace("_", "-")
                 raise InputError(f"{file} says {theirs}, and --{option} {given[name]}: leave one of the two out")
-        sim = said.is_simulated or given.get("rehearse", False)
+        sim = said.is_simulated or given.get("sim", False)
         url = given.get("lcm_url", "") if sim else said.lcm_url or given.get("lcm_url", "")
-        return cls(**given | {"lcm_url": url, "robot": said.robot, "scenario": file, "rehearse": sim})
+        return cls(**given | {"lcm_url": url, "robot": said.robot, "scenario": file, "sim": sim})
 
     def __post_init__(self) -> None:
         if self.synchronous and not self.sim:
@@ -148,7 +148,7 @@ class RobotConnection:
         if not self.sim:
             yield
             return
-        arguments = ["serve-iiwa", "--url", url, "--task", task, "--command-timeout", "300", "--seconds", str(LONGEST)]
+        arguments = ["sim-driver", "--url", url, "--task", task, "--command-timeout", "300", "--seconds", str(LONGEST)]
         arguments += [] if self.synchronous else ["--rate", str(self.rate)]
         arguments += [word for module in imports for word in ("--import", module)]
         arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]

@@ -80,14 +80,14 @@ class Contact:
 
 
 def read_parts(
-    plug: Path, socket: Path, unit: str | None, place: Sequence[float], axis: str, centre: Sequence[float] | None
+    plug: Path, socket: Path, unit: str | None, plug_pose: Sequence[float], axis: str, centre: Sequence[float] | None
 ) -> tuple[Part, Part]:
     """Both parts in the target frame: z out of the socket, its origin on the axis at the plug's lower end.
 
     Args:
         plug, socket: the files.
         unit: of both files' numbers; None where their formats say it.
-        place: [x y z] in the files' unit and [rx ry rz] in degrees by which the plug's file is moved into the
+        plug_pose: [x y z] in the files' unit and [rx ry rz] in degrees by which the plug's file is moved into the
             socket's; zeros where both are drawn assembled.
         axis: which way the plug comes out, in the socket's file.
         centre: a point on the axis, in the socket's file; the plug's centre of mass unless given.
@@ -104,7 +104,7 @@ def read_parts(
         )
     first, second = (load_part(path, str(one)) for path, one in zip((plug, socket), units, strict=True))
     scale = UNITS[str(units[1])]
-    first = first.moved(_rotation(np.asarray(place[3:]) * DEGREE), np.asarray(place[:3]) * scale)
+    first = first.moved(_rotation(np.asarray(plug_pose[3:]) * DEGREE), np.asarray(plug_pose[:3]) * scale)
     z = np.array(AXES[axis], dtype=float)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
@@ -121,13 +121,13 @@ def _rotation(angles: np.ndarray) -> np.ndarray:
     return Rotation.from_euler("xyz", angles).as_matrix()
 
 
-def onboard(
+def create_task(
     plug: Path,
     socket: Path,
     out: Path,
     *,
     unit: str | None = None,
-    place: Sequence[float] = (0.0,) * 6,
+    plug_pose: Sequence[float] = (0.0,) * 6,
     axis: str = "+z",
     centre: Sequence[float] | None = None,
     turn: float = 0.0,
@@ -139,7 +139,7 @@ def onboard(
     """Makes a task folder, and returns what was measured.
 
     Args:
-        plug, socket, unit, place, axis, centre: see `read_parts`.
+        plug, socket, unit, plug_pose, axis, centre: see `read_parts`.
         out: the folder; it must not exist.
         turn: of the plug at the bottom [degrees], counter-clockwise as seen from outside; it is drawn turned.
         force_limit: more than that ends an episode [N].
@@ -154,7 +154,7 @@ def onboard(
         raise InputError(f"{out} already exists: name another folder with --out, or remove it")
     check_writable(out)
     _check_given(friction, scenario)
-    parts = read_parts(plug, socket, unit, place, axis, centre)
+    parts = read_parts(plug, socket, unit, plug_pose, axis, centre)
     check_target(*parts)
     path = motion(*parts, turn * DEGREE, CLEAR)
     clearance = side_clearance(*parts)

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.models.common.errors import InputError
-from guiderail.tools.cli.main import _environment
+from guiderail.tools.cli.app import parse_environment
 from guiderail.tools.environments import check_environment
 
 
@@ -32,6 +32,6 @@ def test_every_solver_commands_the_same_and_keeps_the_constraint():
 
 
 def test_the_solver_is_chosen_from_the_shell_and_another_word_is_refused():
-    assert check_environment("BncConnector", _environment(["solver=osqp"]))["solver"] == "osqp"
+    assert check_environment("BncConnector", parse_environment(["solver=osqp"]))["solver"] == "osqp"
     with pytest.raises(InputError, match="there is no solver 'osq': did you mean osqp"):
-        check_environment("NarrowPassage", _environment(["solver=osq"]))
+        check_environment("NarrowPassage", parse_environment(["solver=osq"]))

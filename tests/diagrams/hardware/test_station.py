@@ -99,7 +99,7 @@ def test_follows_pushes_and_feels_over_messages():
 def test_two_processes_on_one_machine(monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "lcm")  # with a time to live of zero: no message leaves this machine
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
-    call = f"from guiderail.tools.cli.main import main; main(['serve-iiwa', '--url', {url!r}, '--seconds', '1.5'])"
+    call = f"from guiderail.tools.cli.main import main; main(['sim-driver', '--url', {url!r}, '--seconds', '1.5'])"
     command = [sys.executable, "-c", call]
     with subprocess.Popen(command) as robot:
         lcm = DrakeLcm(url)

@@ -95,7 +95,7 @@ class Ear:
 
 def robot(url: str, rate: float) -> subprocess.Popen:
     """A simulated one, with its deputy."""
-    call = f"from guiderail.tools.cli.main import main; main(['serve-iiwa', '--url', {url!r}, '--rate', '{rate}'])"
+    call = f"from guiderail.tools.cli.main import main; main(['sim-driver', '--url', {url!r}, '--rate', '{rate}'])"
     return subprocess.Popen([sys.executable, "-c", call], stderr=subprocess.DEVNULL)
 
 

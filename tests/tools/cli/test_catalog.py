@@ -1,23 +1,20 @@
-"""What `guiderail list` says of what somebody else registered."""
-
 from pydantic import Field
 
 from guiderail.diagrams.envs.options import Options
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
-from guiderail.tools.cli.catalog import options_in_words
+from guiderail.tools.cli.catalog import describe_task_options
 
 
 class Clock(Options):
-    reach: float = Field(0.05, ge=0, le=1, description="how far a full action leads [m]")
-    history: int = Field(3, description="past outputs that are remembered")
+    reach: float = Field(0.05, ge=0, le=1, description="motion of a full action [m]")
+    history: int = Field(3, description="number of past outputs")
 
 
-def test_the_options_of_a_foreign_guidance_are_named(monkeypatch):
-    before = options_in_words("NarrowPassage")
+def test_options_of_a_registered_guidance_are_described(monkeypatch):
+    before = describe_task_options("NarrowPassage")
     assert "reach" not in before
-    monkeypatch.setitem(GUIDANCE._entries, "pace_of_mine", None)  # no other test has this one
+    monkeypatch.setitem(GUIDANCE._entries, "pace_of_mine", None)  # undone after the test
     register_guidance("pace_of_mine", options=Clock)(lambda known: None)
-    told = options_in_words("NarrowPassage")
-    own = "of guidance=pace_of_mine: how far a full action leads [m]: from 0 to 1; 0.05 unless given"
-    assert told["reach"] == own
-    assert told["history"].startswith(f"{before['history']}; of guidance=pace_of_mine: past outputs")
+    after = describe_task_options("NarrowPassage")
+    assert after["reach"] == "with guidance=pace_of_mine: motion of a full action [m]: from 0 to 1; default 0.05"
+    assert after["history"].startswith(f"{before['history']}; with guidance=pace_of_mine: number of past outputs")

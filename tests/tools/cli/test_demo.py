@@ -6,33 +6,33 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.visualization import replay, style
 
 
-def test_the_demo_says_what_it_left_and_replaces_itself(tmp_path, monkeypatch, capsys):
+def test_demo_prints_its_result_and_can_be_replaced(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "HELD_OUT", 1)
     monkeypatch.setattr(replay, "EPISODES", 1)
-    monkeypatch.setattr(style, "LAYOUT", "constrained")  # pictures as people get them
+    monkeypatch.setattr(style, "LAYOUT", "constrained")  # the layout of users, which tests replace by a faster one
     out = tmp_path / "demo"
     demo.run_demo(out, episodes=2, seed=0)
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for name in ("picture.png", "replay.html", "episodes.csv", "learning_curve.png"):
         assert (out / name).stat().st_size > 0
-        assert name in said
-    assert "2 of 2 training episodes reached the goal, 0 violated the constraint, 0 touched a wall" in said
-    assert "The demonstrations alone" in said
-    (out / "left_over.txt").write_text("of the last demo")
+        assert name in printed
+    assert "2 of 2 training episodes reached the goal, 0 violated the constraint, 0 touched a wall" in printed
+    assert "The demonstrations alone" in printed
+    (out / "left_over.txt").write_text("file of the last demo")
     demo._clear(out)
     assert not out.exists()
 
 
-def test_a_run_like_a_demo_that_is_none_is_left_alone(tmp_path):
+def test_demo_refuses_a_run_with_the_same_settings(tmp_path):
     out = tmp_path / "mine"
     out.mkdir()
-    (out / "config.yaml").write_text("task: NarrowPassage\npreset: steady\n")
+    (out / "config.yaml").write_text("task: NarrowPassage\npreset: tqc_cheap_correlated\n")
     with pytest.raises(InputError, match="already exists"):
         demo.run_demo(out, episodes=2, seed=0)
     assert (out / "config.yaml").exists()
 
 
-def test_a_demo_that_was_killed_at_its_start_is_replaced(tmp_path):
+def test_demo_replaces_a_demo_that_was_killed_at_its_start(tmp_path):
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / demo.MARK).touch()
     RunFolder(tmp_path / "demo").refuse_existing()

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.bounds import constraints
+from guiderail.tools.datasets.bounds import fit_bounds
 from guiderail.tools.datasets.convert import export_demonstrations, import_recording
 
 NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
@@ -209,7 +209,7 @@ def test_two_publishers_on_a_topic_are_not_mixed(tmp_path):
 
 def test_bounds_go_into_a_folder_that_is_there(file, tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
-        constraints(file, out=tmp_path / "none" / "bounds.yaml")
+        fit_bounds(file, out=tmp_path / "none" / "bounds.yaml")
 
 
 @pytest.mark.parametrize("kind", ["lerobot", "mcap"])

@@ -3,9 +3,9 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.bounds import constraints
+from guiderail.tools.datasets.bounds import fit_bounds
 from guiderail.tools.datasets.paths import load_demonstrations
-from guiderail.tools.datasets.validate import check
+from guiderail.tools.datasets.validate import validate_demonstrations
 
 CLOCK = np.linspace(0, 1, 30)
 
@@ -50,7 +50,7 @@ def test_a_mark_at_the_beginning_is_no_part_of_the_first_name(tmp_path):
     assert load_demonstrations(tmp_path / "marked.csv").num_demonstrations == 2
 
 
-@pytest.mark.parametrize("read", [check, load_demonstrations, constraints])
+@pytest.mark.parametrize("read", [validate_demonstrations, load_demonstrations, fit_bounds])
 @pytest.mark.parametrize("ending", ["", ".csv", ".npz"])
 def test_a_name_that_no_file_can_have_is_refused(read, ending, tmp_path):
     with pytest.raises(InputError, match="File name too long"):
@@ -92,7 +92,7 @@ def test_demonstrations_are_drawn_in_the_format_that_is_asked_for(tmp_path, endi
     for index in range(3):
         write(tmp_path / f"{index}.csv", index)
     picture = tmp_path / f"drawn{ending}"
-    assert check(tmp_path, picture)["picture"] == str(picture)
+    assert validate_demonstrations(tmp_path, picture)["picture"] == str(picture)
     assert picture.read_bytes().startswith(magic)
     with pytest.raises(InputError, match="a picture is"):
-        check(tmp_path, tmp_path / "drawn.gif")
+        validate_demonstrations(tmp_path, tmp_path / "drawn.gif")

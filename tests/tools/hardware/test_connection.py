@@ -46,7 +46,7 @@ def test_a_simulated_robot_imports_what_the_run_does(tmp_path, monkeypatch):
     try:
         for run in (
             lambda: exec(codes[0], {}),
-            lambda: main(["stand-by", "--task", "mine/Connector", "--import", str(file)]),
+            lambda: main(["safety-monitor", "--task", "mine/Connector", "--import", str(file)]),
         ):
             monkeypatch.setattr(TASKS, "_entries", {**TASKS._entries})
             monkeypatch.setattr("guiderail.tools.environments._IMPORTED", {})

@@ -60,7 +60,7 @@ def onboarded(name: str, out: Path, log: Path) -> dict:
     plug, socket = part.write(drawn)
     if not task.exists():
         task.parent.mkdir(exist_ok=True)
-        guiderail(log, "onboard", plug, socket, "--unit", "mm", *part.options, "--out", task)
+        guiderail(log, "create-task", plug, socket, "--unit", "mm", *part.options, "--out", task)
     return yaml.safe_load((task / "task.yaml").read_text(encoding="utf-8"))["measured"]
 
 

@@ -14,7 +14,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common import files as writing
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
-from guiderail.tools.parts.create_task import ask_unit, onboard, rank
+from guiderail.tools.parts.create_task import ask_unit, create_task, rank
 from guiderail.tools.visualization import replay
 
 pytest.importorskip("trimesh")
@@ -31,10 +31,10 @@ def call(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The simplest of the six; `learn_parts.py` beside this onboards and learns all of them."""
+    """The simplest of the six; `learn_parts.py` beside it creates the tasks of all of them and learns them all of them."""
     where = tmp_path_factory.mktemp("parts")
     plug, socket = PARTS["square_peg"]().write(where)
-    call("onboard", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
+    call("create-task", plug, socket, "--unit", "mm", "--out", where / "peg", "--json")
     yield where / "peg"
     # What was registered here is nobody else's.
     for name in [name for name in TASKS.names() if name.startswith("parts/")]:
@@ -65,7 +65,7 @@ def test_scenarios_that_would_lie_on_each_other_or_on_the_tasks_own_files_are_re
         (("a/plug.obj",), "is no scenario"),
     ):
         with pytest.raises(InputError, match=words):
-            onboard(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
+            create_task(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
     assert not (tmp_path / "peg").exists()
 
 
@@ -73,7 +73,7 @@ def test_a_folder_that_cannot_be_made_is_refused_in_a_sentence(tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
-        onboard(plug, socket, tmp_path / "file" / "peg", unit="mm")
+        create_task(plug, socket, tmp_path / "file" / "peg", unit="mm")
 
 
 def test_a_question_is_no_part_of_the_result(tmp_path, monkeypatch, capsys):
@@ -139,7 +139,7 @@ def test_bounds_from_demonstrations_become_its_own(folder, capsys):
 
     before = (folder / "task.yaml").read_text()
     try:
-        call("constraints", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--into", folder)
+        call("dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder)
         constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
         assert constraints.G.shape[0] > 1
         np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
@@ -157,7 +157,7 @@ def test_bounds_that_cannot_be_written_leave_the_task_as_it_was(folder, monkeypa
 
     before = (folder / "task.yaml").read_text()
     monkeypatch.setattr(writing.os, "replace", fail)
-    call("constraints", folder / "demonstrations.npz", "--into", folder, code=2)
+    call("dataset", "fit-bounds", folder / "demonstrations.npz", "--task", folder, code=2)
     assert "cannot be written" in capsys.readouterr().err
     assert (folder / "task.yaml").read_text() == before
 
@@ -168,8 +168,8 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_task_as_it_was(folder, tmp_pa
 
     before = (folder / "task.yaml").read_text()
     monkeypatch.setattr("guiderail.tools.datasets.bounds._draw", fail)
-    args = ("--draw", tmp_path / "bounds.png", "--out", tmp_path / "bounds.yaml", "--into", folder)
-    call("constraints", folder / "demonstrations.npz", *args, code=2)
+    args = ("--draw", tmp_path / "bounds.png", "--out", tmp_path / "bounds.yaml", "--task", folder)
+    call("dataset", "fit-bounds", folder / "demonstrations.npz", *args, code=2)
     assert (folder / "task.yaml").read_text() == before
     assert not (tmp_path / "bounds.yaml").exists()
 
@@ -200,19 +200,19 @@ def test_what_makes_no_sense_is_refused_and_leaves_nothing(folder, tmp_path, cap
         (("--unit", "ell"), "there is no unit"),
         (("--unit", "mm"), "does not pass the socket"),
         (("--unit", "mm", "--axis", "z"), "--axis is one of"),
-        (("--unit", "mm", "--place", "1,2"), "--place takes 6 numbers"),
+        (("--unit", "mm", "--plug-pose", "1,2"), "--plug-pose takes 6 numbers"),
         (("--unit", "mm", "--out", folder), "already exists"),
         (("--unit", "mm", "--friction", "5"), "friction must be at most 2, not 5"),
         (("--unit", "mm", "--scenario", tmp_path / "none.yaml"), "there is no scenario"),
     ):
         out = () if "--out" in arguments else ("--out", tmp_path / "task")
-        call("onboard", plug, socket, *out, *arguments, code=2)
+        call("create-task", plug, socket, *out, *arguments, code=2)
         assert says in capsys.readouterr().err
         assert sorted(path.name for path in tmp_path.iterdir()) == ["plug.stl", "socket.stl"]
 
 
 def test_a_part_from_another_direction_is_the_same_task(tmp_path):
-    """Drawn lying along x, and the plug apart from its socket: --axis and --place bring both to the target frame."""
+    """Drawn lying along x, and the plug apart from its socket: --axis and --plug-pose bring both to the target frame."""
     from guiderail.tools.parts.create_task import read_parts
 
     plug, socket = PARTS["square_peg"]().write(tmp_path)

@@ -1,0 +1,287 @@
+"""Typer application of the `guiderail` command: shared arguments, their choices and their parsing."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import typer.core
+
+from guiderail.models.common.errors import InputError
+
+# Commands import their tools when they are called: PyTorch and Drake take seconds to import, and `--help` must not.
+
+app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def _names(module: str, attribute: str) -> Callable[[], list[str]]:
+    """Return a function that lists the names of a registry, a collection or a callable of a module."""
+
+    def list_names() -> list[str]:
+        value = getattr(import_module(f"guiderail.{module}"), attribute)
+        value = getattr(value, "names", value)
+        return list(value() if callable(value) else value)
+
+    return list_names
+
+
+def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
+    """Return a function that lists what all registered tasks declare under `attribute`."""
+
+    def list_names() -> list[str]:
+        tasks = import_module("guiderail.diagrams.tasks.registry").TASKS
+        return sorted({name for task in tasks.names() for name in getattr(tasks.get(task), attribute)})
+
+    return list_names
+
+
+LISTED: dict[str, Callable[[], list[str]]] = {
+    "tasks": _names("tools.environments", "known_tasks"),
+    "guidance": _names("diagrams.guidance.registry", "GUIDANCE"),
+    "stations": _names("diagrams.stations.registry", "STATIONS"),
+    "robots": _names("models.robots.robot", "robot_names"),
+    "presets": _names("tools.learning.config", "PRESETS"),
+    "learners": _names("tools.learning.learner", "learner_names"),
+}
+"""Lists that `guiderail list` prints, by name."""
+
+CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
+    "rewards": _declared_by_tasks("rewards"),
+    "observations": _declared_by_tasks("observations"),
+    "templates": _names("models.templates.schema", "shipped_templates"),
+    "engines": _names("tools.experiments.engines.engine", "ENGINES"),
+    "pictures": _names("tools.files", "PICTURES"),
+    "videos": _names("tools.files", "VIDEOS"),
+    "baselines": _names("tools.evaluation.baselines", "BASELINES"),
+    "axes": lambda: [axis.name for axis in import_module("guiderail.tools.evaluation.robustness").AXES],
+    "listed": lambda: [*LISTED, *LISTED["tasks"]()],
+}
+"""Choices that `{name}` in a help text expands to, and that a shell completes."""
+
+
+class Command(typer.core.TyperCommand):
+    """Command whose help expands `{name}` to the choices that exist when the help is printed."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Expand the choices, then format the options."""
+        for parameter in self.params:
+            if text := getattr(parameter, "help", None):
+                parameter.help = expand_choices(text)  # type: ignore[attr-defined]
+        super().format_options(ctx, formatter)
+
+
+def expand_choices(text: str) -> str:
+    """Return a help text with every `{name}` of `CHOICES` replaced by its choices."""
+    for name, list_names in CHOICES.items():
+        if f"{{{name}}}" in text:
+            text = text.replace(f"{{{name}}}", ", ".join(list_names()))
+    return text
+
+
+def command(
+    example: str, name: str | None = None, group: typer.Typer = app
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Register a command with an example of its use.
+
+    Args:
+        example: Command line after `guiderail`.
+        name: Name of the command; the function's name by default.
+        group: Application that the command is added to.
+    """
+    return group.command(name, cls=Command, epilog=f"Example: guiderail {example}")
+
+
+def command_group(name: str, text: str) -> typer.Typer:
+    """Return a new group of commands, such as `guiderail dataset`, with its help text."""
+    group = typer.Typer(help=text, rich_markup_mode=None)
+    app.add_typer(group, name=name)
+    return group
+
+
+def option(text: str, *names: str, choices: str | None = None, **more: Any) -> Any:
+    """Return an option with its help text; `choices` is the key of `CHOICES` that a shell completes."""
+    return typer.Option(*names, help=text, autocompletion=_completion(choices), **more)
+
+
+def argument(text: str, metavar: str, choices: str | None = None) -> Any:
+    """Return an argument with its help text; `choices` is the key of `CHOICES` that a shell completes."""
+    return typer.Argument(help=text, metavar=metavar, autocompletion=_completion(choices))
+
+
+def _completion(choices: str | None) -> Callable[[str], list[str]] | None:
+    if choices is None:
+        return None
+    return lambda incomplete: [name for name in CHOICES[choices]() if name.startswith(incomplete)]
+
+
+Json = Annotated[bool, option("Print one JSON object.", "--json")]
+Run = Annotated[Path, argument("Folder of a run of guiderail train.", "RUN")]
+Shown = Annotated[str, argument("Folder of a run; or a task, for --policy: {tasks}.", "RUN or TASK")]
+Demonstrations = Annotated[Path, argument("Demonstrations: .npz, .csv or a folder of them.", "FILE")]
+DemonstrationsOut = Annotated[Path, option("File of demonstrations to write, .npz or .csv.")]
+Seed = Annotated[int, option("Seed of the first held-out episode; episode i has seed + i.")]
+Env = Annotated[
+    list[str] | None,
+    option(
+        "Option of the environment, such as station=arm or action_dims=[0,1,2]; repeatable. "
+        "guiderail list TASK lists them.",
+        "--env",
+        metavar="key=value",
+    ),
+]
+Imports = Annotated[
+    list[str] | None,
+    option(
+        "Module or file (.py) that registers a task, guidance, a station or a learner; stored in the run.",
+        "--import",
+        metavar="MODULE",
+    ),
+]
+TaskImports = Annotated[
+    list[str] | None, option("Module or file (.py) that registers the task.", "--import", metavar="MODULE")
+]
+Guidance = Annotated[str | None, option("Guidance: {guidance}.  [default: the task's]", choices="guidance")]
+Baseline = Annotated[str, option("Policy that acts in a TASK: scripted, {baselines}.", "--policy")]
+Baselines = Annotated[
+    str | None,
+    option(
+        "Baseline policies that are evaluated on the same episodes, comma-separated: scripted, {baselines}; or none. "
+        "The demonstration is always evaluated where the guidance has one; zero is then the same.  "
+        "[default: uniform_random, scripted where the task has one, constant in evaluate, and zero without a "
+        "demonstration]"
+    ),
+]
+Offsets = Annotated[bool, option("Resample the fixture offset of the run in every episode.", "--resample-offsets")]
+
+LcmUrl = Annotated[str | None, option("Hardware: LCM URL of the driver's bus.  [default: LCM's default]")]
+Robot = Annotated[str | None, option("Hardware: robot arm.  [default: the scenario's, or iiwa14]", choices="robots")]
+Sim = Annotated[bool, option("Hardware: use a simulated driver in a subprocess instead of a robot.", "--sim")]
+Synchronous = Annotated[
+    bool,
+    option("With --sim: driver and controller wait for each other; wall-clock time does not count.", "--synchronous"),
+]
+Rate = Annotated[
+    float | None, option("With --sim: speed of the simulated robot's clock relative to real time.  [default: 0.2]")
+]
+Scenario = Annotated[Path | None, option("Hardware: scenario file with the robot, its bus and its surroundings.")]
+Yes = Annotated[bool, option("Hardware: answer all pre-flight questions with yes.", "--yes")]
+
+
+def parse_pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]:
+    """Return `key=value` pairs as a dictionary.
+
+    Args:
+        given: Values of a repeated option.
+        option: Its name, for the error message.
+        example: Valid value, for the error message.
+
+    Raises:
+        InputError: If a value has no `=`.
+    """
+    for pair in given or []:
+        if "=" not in pair:
+            raise InputError(f"{option} takes name=value, such as {example}, not {pair!r}")
+    return {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in given or [])}
+
+
+def parse_floats(text: str, count: int, option: str) -> list[float]:
+    """Return `count` finite numbers from a comma-separated list.
+
+    Raises:
+        InputError: For another number of values, or one that is not finite.
+    """
+    try:
+        numbers = [float(number) for number in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{option} takes {count} numbers separated by commas, not {text!r}")
+    return numbers
+
+
+def parse_integers(text: str | None, option: str) -> list[int] | None:
+    """Return integers from a comma-separated list; None for None.
+
+    Raises:
+        InputError: If a value is not an integer.
+    """
+    try:
+        return None if text is None else [int(number) for number in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} takes whole numbers separated by commas, such as 0,1, not {text!r}") from None
+
+
+def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]:
+    """Return the options of an environment, each value of `--env` read as YAML.
+
+    Args:
+        given: Values of `--env`.
+        options: Options that have an argument of their own; None is left out, and `--env` takes precedence.
+
+    Raises:
+        InputError: If a value of `--env` has no `=`.
+    """
+    environment = {name: value for name, value in options.items() if value is not None}
+    if given:
+        from guiderail.tools.environments import as_value
+
+        pairs = parse_pairs(given, "--env", "station=arm")
+        environment |= {key: as_value(value) for key, value in pairs.items()}
+    return environment
+
+
+def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
+    """Import what registers a task and return its name, with the imports that a run of it has to store.
+
+    Args:
+        typed: Name of a task, or path of a task folder.
+        imports: Modules and files that register it.
+
+    Raises:
+        InputError: If an import fails or the task folder is invalid.
+    """
+    if imports:
+        from guiderail.tools.environments import import_modules
+
+        import_modules(imports)
+    if not (Path(typed) / "task.yaml").is_file():
+        return typed, ()
+    from guiderail.tools.environments import task_named
+
+    return task_named(typed)
+
+
+def is_hardware(station: Any) -> bool:
+    """Return True if `station` is the name of a hardware station."""
+    if station is None:
+        return False
+    stations = import_module("guiderail.diagrams.stations.registry").STATIONS
+    return station in stations.names() and not stations.get(station).is_simulated
+
+
+def hardware_arguments(
+    environment: Mapping[str, Any], *, sim: bool, synchronous: bool, rate: float | None
+) -> dict[str, Any]:
+    """Return the arguments of `RobotConnection.in_scenario` that were given.
+
+    Args:
+        environment: Options of the environment; `lcm_url` and `robot` are taken from it.
+        sim: Whether a simulated driver is used.
+        synchronous: Whether it runs in lockstep.
+        rate: Speed of its clock; None for the default.
+    """
+    given = {name: environment[name] for name in ("lcm_url", "robot") if name in environment}
+    return given | {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
+
+
+def refuse_hardware_options(**given: Any) -> None:
+    """Raise InputError if an option that needs a hardware station was given without one.
+
+    Args:
+        given: Values of the options by name; None and False count as not given.
+    """
+    if any(value is not None and value is not False for value in given.values()):
+        *names, last = (f"--{name}" for name in given)
+        raise InputError(f"{', '.join(names)} and {last} are options of hardware: give --station hardware too")

@@ -1,0 +1,194 @@
+"""`guiderail evaluate`, `guiderail robustness` and `guiderail certify`."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli import app as cli
+from guiderail.tools.cli.app import argument, option
+from guiderail.tools.cli.output import print_message, print_result, to_json
+
+
+@cli.command("evaluate runs/passage --episodes 100 --json")
+def evaluate(
+    run: cli.Run,
+    episodes: Annotated[int, option("Number of held-out episodes.")] = 100,
+    seed: cli.Seed = 1_000_000,
+    env: cli.Env = None,
+    station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
+    baselines: cli.Baselines = None,
+    resample_offsets: cli.Offsets = False,
+    policy: Annotated[
+        str | None, option("Hardware: baseline policy that acts instead of the run's: scripted, {baselines}.")
+    ] = None,
+    lcm_url: cli.LcmUrl = None,
+    robot: cli.Robot = None,
+    sim: cli.Sim = False,
+    synchronous: cli.Synchronous = False,
+    rate: cli.Rate = None,
+    scenario: cli.Scenario = None,
+    yes: cli.Yes = False,
+    out: Annotated[
+        Path | None, option("Hardware: folder of the table of episodes.  [default: hardware in the run]")
+    ] = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Evaluate a policy on held-out episodes, together with baseline policies.
+
+    The policy acts deterministically, on initial conditions that training never samples. The demonstration alone,
+    random actions and the scripted policy of the task run on the same episodes: if they succeed as well, the task is
+    too easy to show learning. The row evaluation_scope of the table states what the result is valid for.
+    """
+    environment = cli.parse_environment(env, station=station, robot=robot, lcm_url=lcm_url)
+    if cli.is_hardware(environment.get("station")):
+        if baselines is not None or resample_offsets or environment.keys() - {"station", "robot", "lcm_url"}:
+            raise InputError(
+                "on hardware one policy is evaluated in the run's own environment: leave --baselines, "
+                "--resample-offsets and --env out"
+            )
+        connection = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
+        station = str(environment["station"])
+        print_result(_evaluate_on_hardware(run, episodes, policy, station, connection, scenario, yes, out), as_json)
+        return
+    cli.refuse_hardware_options(
+        sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes, out=out, policy=policy
+    )
+    from guiderail.tools.evaluation.evaluate import evaluate as evaluate_run
+
+    others = _select_baselines(run, environment, baselines)
+    result = evaluate_run(
+        run, episodes=episodes, seed=seed, environment=environment, baselines=others, resample_offsets=resample_offsets
+    )
+    for name in others:
+        if name not in result["baselines"]:
+            print_message(f"{name} is left out: its observation or action does not match this environment")
+    print_result(result, as_json)
+
+
+def _evaluate_on_hardware(
+    run: Path,
+    episodes: int,
+    policy: str | None,
+    station: str,
+    connection: Mapping[str, Any],
+    scenario: Path | None,
+    yes: bool,
+    out: Path | None,
+) -> Mapping[str, Any]:
+    from guiderail.tools.evaluation.scripted import make_baseline
+    from guiderail.tools.hardware.connection import RobotConnection
+    from guiderail.tools.hardware.evaluate import evaluate_on_robot
+    from guiderail.tools.learning.run_folder import RunFolder
+
+    driver = RobotConnection.in_scenario(scenario, **connection)
+    config = RunFolder(run).config()
+    acting = None if policy is None else make_baseline(config.task, policy, config.seed)
+    return evaluate_on_robot(
+        run, driver, episodes, station=station, policy=policy or "", acting=acting, yes=yes, out=out, say=print_message
+    )
+
+
+def _select_baselines(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
+    """Return baseline policies by name, comma-separated in `names`; the default set of the run's task for None."""
+    from guiderail.tools.environments import changed_environment
+    from guiderail.tools.evaluation.scripted import SCRIPTED_POLICIES, make_baseline
+    from guiderail.tools.learning.run_folder import RunFolder
+    from guiderail.tools.visualization.style import is_demonstrated
+
+    config = RunFolder(run).config()
+    environment = changed_environment(config.task, config.environment, environment)
+    if names is None:
+        zero = [] if is_demonstrated(environment.get("guidance")) else ["zero"]
+        has_scripted = config.task in SCRIPTED_POLICIES and environment.get("observation") != "image"
+        chosen = [*zero, "uniform_random", "constant", *(["scripted"] if has_scripted else [])]
+    else:
+        chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
+    return {name: make_baseline(config.task, name, config.seed) for name in chosen}
+
+
+@cli.command("robustness runs/connector --env station=mujoco --episodes 50")
+def robustness(
+    runs: Annotated[list[Path], argument("Folders of runs of one task, which are compared.", "RUN...")],
+    episodes: Annotated[int, option("Number of held-out episodes of each policy at each value.")] = 30,
+    seed: cli.Seed = 1_000_000,
+    axes: Annotated[str | None, option("Disturbances, comma-separated: {axes}.  [default: all]")] = None,
+    env: cli.Env = None,
+    baselines: cli.Baselines = None,
+    out: Annotated[
+        Path | None, option("Folder to write, required for several runs.  [default: robustness/STATION in the run]")
+    ] = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Evaluate policies under friction, stiffness, sensor, command and timing errors.
+
+    One quantity is changed at a time; one table and one picture compare all runs. Evaluated episodes are stored: the
+    same command resumes an interrupted evaluation, and an additional run costs only its own episodes.
+    """
+    from guiderail.tools.evaluation.robustness import breaks
+    from guiderail.tools.evaluation.robustness import robustness as evaluate_robustness
+
+    environment = cli.parse_environment(env)
+    others = _select_baselines(runs[0], environment, baselines)
+    if baselines is None:
+        others.pop("constant")
+    result = evaluate_robustness(
+        runs,
+        episodes=episodes,
+        seed=seed,
+        environment=environment,
+        axes=axes,
+        baselines=others,
+        out=out,
+        tell=print_message,
+    )
+    if as_json:
+        typer.echo(to_json({"table": str(result["table"]), "picture": str(result["picture"]), "rows": result["rows"]}))
+        return
+    for line in result["table"].with_suffix(".md").read_text(encoding="utf-8").splitlines():
+        typer.echo(line)
+    for policy in result["policies"]:
+        for name, values in breaks(result["rows"], policy).items():
+            below = ", ".join(f"{value:.3g}" for value in values) or "no value"
+            typer.echo(f"{policy}, {name}: success rate below 90 % at {below}")
+    typer.echo(result["table"])
+    typer.echo(result["picture"])
+
+
+@cli.command("certify runs/passage --attack 1000000")
+def certify(
+    subject: Annotated[str, argument("Folder of a run; or a task, with --out: {tasks}.", "RUN or TASK")],
+    env: cli.Env = None,
+    out: Annotated[Path | None, option("Folder to write.  [default: certificate in the run]")] = None,
+    start_within: Annotated[
+        float | None,
+        option("Largest start offset of the robot, in the outputs' units.  [default: that of a reset]"),
+    ] = None,
+    attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
+    imports: cli.TaskImports = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Compute bounds on all commands of a skill, for any action, and check them with an independent program.
+
+    The certificate lists its assumptions. It can be checked on any machine: python checker.py FOLDER needs NumPy alone.
+    An attack shows how tight the bounds are: the table compares them with the worst commands an adversary found.
+    """
+    from guiderail.tools.certify import certify_skill
+
+    task = cli.find_task(subject, imports)[0]
+    result = certify_skill(task, cli.parse_environment(env), out=out, start_within=start_within, attack=attack)
+    rows = result.get("attack", [])
+    if as_json:
+        typer.echo(to_json(result))
+    else:
+        for name, value in result.items():
+            if name == "attack":
+                continue
+            text = ", ".join("–" if x is None else f"{x:.4g}" for x in value) if isinstance(value, list) else value
+            typer.echo(f"{name.replace('_', ' ')}: {text}")
+        if rows:
+            typer.echo(Path(result["certificate"]).with_name("attack.md").read_text(encoding="utf-8"))
+    if result["checker"] != "yes" or any(row["left"] for row in rows):
+        raise typer.Exit(1)

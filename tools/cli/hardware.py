@@ -1,0 +1,120 @@
+"""`guiderail deploy`, `guiderail teleoperate`, `guiderail sim-driver` and `guiderail safety-monitor`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli import app as cli
+from guiderail.tools.cli.app import argument, option
+from guiderail.tools.cli.output import print_progress, print_result
+
+Url = Annotated[str, option("LCM URL of the driver's bus.  [default: LCM's default]")]
+
+
+@cli.command("deploy runs/connector --sim --yes")
+def deploy(
+    run: cli.Run,
+    station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
+    lcm_url: cli.LcmUrl = None,
+    robot: cli.Robot = None,
+    sim: cli.Sim = False,
+    synchronous: cli.Synchronous = False,
+    rate: cli.Rate = None,
+    scenario: cli.Scenario = None,
+    yes: cli.Yes = False,
+    out: Annotated[Path | None, option("Folder of the recording.  [default: hardware in the run]")] = None,
+) -> None:
+    """Execute a policy on a robot.
+
+    The assumptions about the robot are printed and have to be confirmed. Then the arm is controlled where it is,
+    approaches the start slowly and executes the skill; every control step is recorded. The exit code is 0 if the skill
+    was executed to its end, and 1 if a limit, a fault or a key stopped it.
+    """
+    from guiderail.tools.hardware.connection import RobotConnection
+    from guiderail.tools.hardware.executor import run_policy
+
+    environment = cli.parse_environment(None, lcm_url=lcm_url, robot=robot)
+    given = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
+    connection = RobotConnection.in_scenario(scenario, **given)
+    raise typer.Exit(run_policy(run, connection, station=station, yes=yes, out=out, say=print_progress))
+
+
+@cli.command("teleoperate ./peg --record demonstrations.npz")
+def teleoperate(
+    task: Annotated[str, argument("Folder of a task, or one of {tasks}.", "TASK", "tasks")],
+    record: Annotated[
+        Path | None, option("Demonstrate in the browser and write the demonstrations to this file, .npz or .csv.")
+    ] = None,
+    guidance: cli.Guidance = None,
+    env: cli.Env = None,
+    imports: cli.TaskImports = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Act in place of the policy, or demonstrate a task.
+
+    Without --record, a gamepad or the keyboard gives the action of the task's guidance. With --record, sliders, keys or
+    a gamepad in the browser move the desired pose, the robot follows by its impedance, and the page shows the force.
+    Each demonstration is kept or discarded, and written as soon as it is kept.
+    """
+    name = cli.find_task(task, imports)[0]
+    environment = cli.parse_environment(env, guidance=guidance)
+    if record is None:
+        if as_json:
+            raise InputError("--json prints what was demonstrated: give --record too")
+        from guiderail.tools.teleop.teleoperator import drive_by_hand
+
+        drive_by_hand(name, environment)
+        return
+    if guidance is not None:
+        raise InputError("a demonstration is recorded without guidance: leave --guidance out")
+    from guiderail.tools.teleop.teach import teach
+
+    print_result(teach(name, environment, record, print_progress), as_json)
+
+
+@cli.command("sim-driver --seconds 60", "sim-driver")
+def sim_driver(
+    url: Url = "",
+    seconds: Annotated[float, option("Duration in simulated time [s].")] = 3600.0,
+    command_timeout: Annotated[float, option("Longest wait for a command [s].")] = 5.0,
+    task: Annotated[
+        str, option("Task whose fixture is in front of the robot: {tasks}.", choices="tasks")
+    ] = "BncConnector",
+    rate: Annotated[
+        float | None, option("Follow the wall clock at this rate, at most 1, without waiting for commands.")
+    ] = None,
+    offset: Annotated[str | None, option("x,y offset of the fixture [m], such as 0.001,-0.0005.")] = None,
+    scenario: Annotated[Path | None, option("Scenario file with the robot's surroundings.")] = None,
+    imports: cli.Imports = None,
+) -> None:
+    """Simulate the driver of an iiwa on LCM, with a safety monitor.
+
+    The robot stands in front of a task's fixture. The exit code is 1 if commands stopped arriving.
+    """
+    from guiderail.tools.hardware.sim_driver import serve_iiwa
+
+    name = cli.find_task(task, imports)[0]
+    xy = None if offset is None else tuple(cli.parse_floats(offset, 2, "--offset"))
+    completed = serve_iiwa(
+        url, seconds, command_timeout, name, rate=rate, offset=xy, scenario=scenario, say=print_progress
+    )
+    raise typer.Exit(0 if completed else 1)
+
+
+@cli.command("safety-monitor --task BncConnector", "safety-monitor")
+def safety_monitor(
+    url: Url = "",
+    robot: Annotated[str, option("Robot arm.", choices="robots")] = "iiwa14",
+    task: Annotated[str, option("Task whose workpiece the arm carries: {tasks}.", choices="tasks")] = "BncConnector",
+    imports: cli.Imports = None,
+) -> None:
+    """Bring a robot to rest when torque commands stop arriving.
+
+    For a driver that repeats the last torque when the program that sent it has ended. It runs next to the driver, on
+    the same machine, until it is terminated; without it, guiderail deploy moves nothing.
+    """
+    from guiderail.tools.hardware.safety_monitor import stand_by
+
+    stand_by(url, robot, cli.find_task(task, imports)[0], say=print_progress)

@@ -1,0 +1,159 @@
+"""`guiderail train` and `guiderail demo`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli import app as cli
+from guiderail.tools.cli.app import argument, option
+from guiderail.tools.cli.output import print_message, print_progress, print_result
+
+
+@cli.command("train NarrowPassage --guidance skgrl --episodes 60 --out runs/passage")
+def train(
+    task: Annotated[str | None, argument("Task to learn: {tasks}.", "TASK", "tasks")] = None,
+    out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None,
+    guidance: cli.Guidance = None,
+    algorithm: Annotated[
+        str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")
+    ] = None,
+    episodes: Annotated[int | None, option("Total number of episodes.  [default: 60]")] = None,
+    seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None,
+    preset: Annotated[
+        str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        option("Setting of the learner, such as batch_size=128; repeatable.", "--set", metavar="name=value"),
+    ] = None,
+    env: cli.Env = None,
+    action_repeat: Annotated[int | None, option("Control steps per action.")] = None,
+    reward: Annotated[
+        str | None, option("Reward: {rewards}; guiderail list TASK lists those of a task.", choices="rewards")
+    ] = None,
+    observation: Annotated[
+        str | None,
+        option("Observation: {observations}; guiderail list TASK lists those of a task.", choices="observations"),
+    ] = None,
+    fixture_offset: Annotated[
+        str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
+    ] = None,
+    station: Annotated[str | None, option("Station: {stations}.  [default: the task's]", choices="stations")] = None,
+    step_log: Annotated[
+        bool | None,
+        option("Write every control step into the run's steps/.  [default: yes]", "--step-log/--no-step-log"),
+    ] = None,
+    human_in_the_loop: Annotated[
+        bool,
+        option("A supervisor watches in the browser, corrects, stops and labels successes.", "--human-in-the-loop"),
+    ] = False,
+    lcm_url: cli.LcmUrl = None,
+    robot: cli.Robot = None,
+    sim: cli.Sim = False,
+    synchronous: cli.Synchronous = False,
+    rate: cli.Rate = None,
+    scenario: cli.Scenario = None,
+    yes: cli.Yes = False,
+    resume: Annotated[bool, option("Resume the run in --out.", "--resume")] = False,
+    imports: cli.Imports = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Train a policy and write a run folder.
+
+    The folder contains the configuration, a table with one row per episode, a log with one row per control step,
+    a checkpoint, the policy, a learning curve and a page that shows held-out episodes. An interrupted run is resumed
+    with --resume and ends in the same result.
+    """
+    task, folders = (None, ()) if task is None else cli.find_task(task)
+    modules = (*folders, *(imports or ()))
+    if imports:
+        from guiderail.tools.environments import import_modules
+
+        modules = import_modules(modules)  # first, because one of them may register the station
+    environment = cli.parse_environment(
+        env,
+        guidance=guidance,
+        action_repeat=action_repeat,
+        reward=reward,
+        observation=observation,
+        fixture_offset=fixture_offset,
+        station=station,
+        robot=robot,
+        lcm_url=lcm_url,
+    )
+    settings = cli.parse_pairs(setting, "--set", "batch_size=128")
+    if (folders or "demonstrations" in environment) and task is not None and not resume:
+        from guiderail.tools.datasets.validate import leaves_demonstrations
+
+        if (warning := leaves_demonstrations(task, environment)) is not None:
+            print_message(warning)
+    if cli.is_hardware(environment.get("station")):
+        if task is None or out is None or resume or human_in_the_loop:
+            raise InputError(
+                "training on hardware needs a task and a new folder: leave --resume and --human-in-the-loop out"
+            )
+        from guiderail.tools.hardware.connection import RobotConnection
+        from guiderail.tools.hardware.train import train_on_robot
+
+        given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
+        given |= {"ledger": step_log, "imports": modules}
+        connection = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
+        result = train_on_robot(
+            task,
+            out,
+            RobotConnection.in_scenario(scenario, **connection),
+            environment=environment,
+            given={name: value for name, value in given.items() if value is not None},
+            settings=settings,
+            yes=yes,
+            say=print_message,
+        )
+        print_result(result, as_json)
+        return
+    cli.refuse_hardware_options(sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes)
+    from guiderail.tools.learning.train import run
+
+    summary = run(
+        task,
+        out,
+        environment=environment,
+        algorithm=algorithm,
+        preset=preset,
+        settings=settings,
+        episodes=episodes,
+        seed=seed,
+        resume=resume,
+        imports=modules,
+        ledger=step_log,
+        person=_wait_for_supervisor if human_in_the_loop else None,
+        demonstrator=_scripted_policy,
+    )
+    print_result(summary, as_json)
+
+
+def _wait_for_supervisor() -> Any:
+    """Block until a browser connects; return the supervisor."""
+    from guiderail.tools.teleop.supervisor import MeshcatSupervisor
+
+    supervisor = MeshcatSupervisor(print_progress)
+    supervisor.wait()
+    return supervisor
+
+
+def _scripted_policy(task: str) -> Any:
+    """Return the scripted policy of a task, which demonstrates it to a learner."""
+    from guiderail.tools.evaluation.scripted import make_baseline
+
+    return make_baseline(task, "scripted")
+
+
+@cli.command("demo --out demo")
+def demo(
+    out: Annotated[Path, option("Folder of the run; an earlier demo in it is replaced.")] = Path("demo"),
+    episodes: Annotated[int, option("Number of training episodes.")] = 32,
+    seed: Annotated[int, option("Seed of all random numbers.")] = 0,
+) -> None:
+    """Train sKGRL to avoid an obstacle, in a minute or two, and show the result."""
+    from guiderail.tools.cli.demo import run_demo
+
+    run_demo(out, episodes=episodes, seed=seed)

@@ -1,0 +1,93 @@
+"""`guiderail visualize` and `guiderail report`."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from guiderail.tools.cli import app as cli
+from guiderail.tools.cli.app import argument, option
+from guiderail.tools.cli.output import to_json
+
+
+@cli.command("visualize runs/passage --html replay.html")
+def visualize(
+    subject: cli.Shown,
+    html: Annotated[
+        Path | None,
+        option("Page to write, .html.  [default: replay.html in the run, or none with --image or --video]"),
+    ] = None,
+    image: Annotated[Path | None, option("Picture of six camera frames to write: {pictures}.")] = None,
+    video: Annotated[Path | None, option("Animated camera image to write: {videos}.")] = None,
+    seed: cli.Seed = 1_000_000,
+    env: cli.Env = None,
+    station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
+    policy: cli.Baseline = "scripted",
+    episodes: Annotated[int | None, option("Number of held-out episodes on the page.  [default: 4]")] = None,
+    imports: cli.TaskImports = None,
+) -> None:
+    """Show held-out episodes as a page that any browser opens, and redraw the learning curve of a run.
+
+    The page compares episodes before and after learning on one time axis: robots in motion, demonstrations, paths,
+    constraints, and plots of force, violation, action and phase. It is self-contained. "Before" is the demonstration
+    alone where the guidance has one, and random actions otherwise.
+    """
+    from guiderail.tools.files import check_picture, check_video
+    from guiderail.tools.visualization.camera import write_image, write_video
+    from guiderail.tools.visualization.curves import plot_run
+    from guiderail.tools.visualization.replay import default_page, write_page
+
+    environment = cli.parse_environment(env, station=station)
+    episode = _episode(subject, policy, environment, seed, imports)
+    if image is not None:
+        check_picture(image)
+    if video is not None:
+        check_video(video)
+    if html is None and image is None and video is None:
+        html = default_page(Path(subject), environment)
+    if html is not None:
+        if episode.run is not None:
+            typer.echo(plot_run(episode.run))
+        write_page(html, episode, episodes=episodes)
+        typer.echo(html)
+    for path, write in ((image, write_image), (video, write_video)):
+        if path is not None:
+            write(path, episode)
+            typer.echo(path)
+
+
+def _episode(
+    subject: str, policy: str, environment: Mapping[str, Any], seed: int, imports: Sequence[str] | None
+) -> Any:
+    """Return the specification of an episode: of a run, or of a task with a baseline policy."""
+    from guiderail.tools.visualization.episode_spec import EpisodeSpec
+
+    subject = cli.find_task(subject, imports)[0]
+    if Path(subject).is_dir() or subject not in cli.CHOICES["tasks"]():
+        return EpisodeSpec.of_run(Path(subject), environment, seed)
+    from guiderail.tools.environments import check_environment
+    from guiderail.tools.evaluation.scripted import make_baseline
+
+    arguments = check_environment(subject, environment)
+    return EpisodeSpec(subject, arguments, make_baseline(subject, policy), policy, policy, seed=seed)
+
+
+@cli.command("report studies --out report.html")
+def report(
+    runs: Annotated[list[Path], argument("Folders of runs, or of a study.", "RUN...")],
+    out: Annotated[Path, option("Page to write, .html.")] = Path("report.html"),
+    episodes: Annotated[
+        int, option("Held-out episodes for each run that no study evaluated; evaluated episodes are used again.")
+    ] = 0,
+    as_json: cli.Json = False,
+) -> None:
+    """Write the results of runs or of a study as one self-contained page.
+
+    It contains learning curves with bootstrap bands, episodes to convergence, held-out success together with baseline
+    policies, safety statistics of every control step, configuration, versions, and the commands that reproduce it.
+    """
+    from guiderail.tools.visualization.report import write_report
+
+    page = write_report(runs, out, episodes=episodes)
+    typer.echo(to_json({"page": str(page)}) if as_json else page)

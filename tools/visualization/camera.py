@@ -1,0 +1,145 @@
+"""Camera images of an episode: some frames in one picture, or all of them as an animation."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.rollout import EnvCallback, Transition, rollout
+from guiderail.tools.files import check_picture, check_video, write_atomically
+from guiderail.tools.visualization.episode_spec import EpisodeSpec, outcome
+from guiderail.tools.visualization.style import new_figure, save_figure
+
+ROWS, COLUMNS = 2, 3
+MAX_FRAMES = 24  # frames stored for a picture
+MAX_VIDEO_FRAMES = 240
+LAST_FRAME = 1000  # duration of a video's last frame [ms]
+PATH = "#00a33a"  # color of the robot's path
+
+
+class Frames(EnvCallback):
+    """Camera frames of an episode, evenly spaced over its length, which is not known in advance.
+
+    The environment is created with `render_mode="rgb_array"`.
+
+    Attributes:
+        frames: Time [s], contact force [N] and image of each frame.
+    """
+
+    def __init__(self, env: Any, max_frames: int = MAX_FRAMES):
+        """Construct the callback.
+
+        Args:
+            env: Environment.
+            max_frames: Largest number of frames, even.
+        """
+        super().__init__(env)
+        self._max_frames = max_frames
+
+    def on_episode_start(self) -> None:
+        """Render the first frame."""
+        self.frames: list[Any] = [(0.0, 0.0, self.env.render())]
+        self._stride, self._actions = 1, 0
+
+    def on_step(self, decision: Transition) -> None:
+        """Render a frame if it is due; when `max_frames` are stored, drop every second one and double the interval."""
+        self._actions += 1
+        if not decision.is_last and self._actions % self._stride:
+            return
+        if len(self.frames) == self._max_frames:
+            self.frames, self._stride = self.frames[::2], 2 * self._stride
+        time = len(self.base.trace) * self.base.task.control_period
+        self.frames.append((time, decision.info["contact_force"], self.env.render()))
+
+    def select(self, number: int) -> list[Any]:
+        """Return `number` evenly spaced frames, from the first to the last."""
+        return [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, number).round().astype(int)]
+
+
+def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
+    """Run an episode and write `ROWS` × `COLUMNS` camera frames of it as one picture; return its row.
+
+    Raises:
+        InputError: If this machine cannot render, or the picture cannot be written.
+    """
+    check_picture(picture)
+    row, frames = record_frames(episode, ROWS * COLUMNS)
+    figure, axes = new_figure(ROWS, COLUMNS, (3.6 * COLUMNS, 2.95 * ROWS))
+    figure.suptitle(f"{episode.heading}: {outcome(row)}", fontsize=10)
+    draw_frames(axes.flat, frames)
+    save_figure(figure, picture)
+    return row
+
+
+def write_video(video: Path, episode: EpisodeSpec) -> dict[str, Any]:
+    """Run an episode and write its camera frames as an animated image in real time; return its row.
+
+    Raises:
+        InputError: If this machine cannot render, or the video cannot be written.
+    """
+    from PIL import Image
+
+    check_video(video)
+    row, frames = _run(episode, MAX_VIDEO_FRAMES)
+    images = [Image.fromarray(image) for _, _, image in frames.frames]
+    times = np.array([time for time, _, _ in frames.frames])
+    durations = [max(int(1e3 * step), 20) for step in np.diff(times)]  # [ms]; browsers slow shorter frames down
+    content = io.BytesIO()
+    images[0].save(
+        content,
+        format=video.suffix[1:],
+        save_all=True,
+        append_images=images[1:],
+        duration=[*durations, LAST_FRAME],
+        loop=0,
+    )
+    write_atomically(video, content.getvalue())
+    return row
+
+
+def record_frames(episode: EpisodeSpec, number: int) -> tuple[dict[str, Any], list[Any]]:
+    """Run an episode; return its row and `number` camera frames: time, force, image and path of each.
+
+    The path (n, 2) is the robot's path up to the frame, in pixels of the image.
+
+    Raises:
+        InputError: If this machine cannot render.
+    """
+    row, frames = _run(episode, MAX_FRAMES)
+    path = path_in_picture(frames.base)
+    period = frames.base.trace.period
+    return row, [(*frame, path[: round(frame[0] / period)]) for frame in frames.select(number)]
+
+
+def _run(episode: EpisodeSpec, max_frames: int) -> tuple[dict[str, Any], Frames]:
+    env = make_environment(episode.task, episode.environment, render_mode="rgb_array")
+    env.reset(seed=episode.run_seed)
+    frames = Frames(env, max_frames)
+    row = rollout(env, episode.policy(env), frames, seed=episode.seed, held_out=True)
+    env.close()
+    return row, frames
+
+
+def path_in_picture(base: Any) -> np.ndarray:
+    """Return the poses of an environment's trace in the image of its task's camera, (n, 2) [pixel].
+
+    The result is empty if the task has no camera.
+    """
+    task = base.task.declaration
+    camera = None if task is None else task.camera()
+    return np.empty((0, 2)) if camera is None else camera.project(task.scene().to_world(base.trace.measured))
+
+
+def draw_frames(axes: Iterable[Axes], frames: list[Any], letter: str = "") -> None:
+    """Draw a frame with its path into each of the axes, numbered if a letter is given."""
+    for number, (axis, (time, force, image, path)) in enumerate(zip(axes, frames, strict=True), start=1):
+        axis.imshow(image)
+        axis.plot(*path.T, color=PATH, linewidth=1.0, scalex=False, scaley=False)
+        axis.set_title(f"{letter}{number}: " * bool(letter) + f"{time:.1f} s, {force:.0f} N", fontsize=9)
+        axis.set_axis_off()
