@@ -24,14 +24,14 @@ from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment, task_named
-from guiderail.tools.evaluation.baselines import BaselinePolicy, still, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, still, uniform_random
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.evaluation.scripted import make_baseline
 from guiderail.tools.learning.train import run
 from guiderail.tools.parts.create_task import create_task
-from guiderail.tools.visualization.curves import draw_world
 from guiderail.tools.visualization.camera import path_in_picture
+from guiderail.tools.visualization.curves import draw_world
 
 HERE = Path(__file__).parent
 FOLDER = HERE / "pictures"
@@ -155,7 +155,7 @@ def save(path: Path, frames: Sequence[Image.Image], seconds: float) -> None:
 
 
 def _white(seed: int) -> Callable[[Any], PolicyFn]:
-    return lambda env: BaselinePolicy(white, env, seed)
+    return lambda env: BaselinePolicy(uniform_random, env, seed)
 
 
 def _jerk(row: dict[str, Any]) -> str:

@@ -17,7 +17,7 @@ MAY_IMPORT = {
 }
 # Inside tools: what a person works with never needs what was studied with it. The command is every entry point.
 RESEARCH = {"studies", "figures", "stress", "benchmarks"}
-ENTRY_POINTS = {"tools/command.py"}
+ENTRY_POINTS = {"tools/cli/main.py"}
 LEARNERS = ("stable_baselines3", "sb3_contrib", "torch")
 
 

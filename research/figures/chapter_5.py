@@ -18,14 +18,14 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import LcNsKmp
 from guiderail.models.primitives.gains import rms_gains
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import BaselinePolicy, white
+from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.experiments.declaration import LearnerChoice
 from guiderail.tools.experiments.study import each, run_study
+from guiderail.tools.visualization.camera import draw_frames, record_frames
 from guiderail.tools.visualization.curves import draw_world
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
-from guiderail.tools.visualization.camera import draw_frames, record_frames
 from guiderail.tools.visualization.style import colour, label, new_figure
 from research.figures.chapter_4 import CONNECTOR, FORCE, HOLD, LEARNED, TASK, figure_4_3, random_episodes
 from research.figures.runs import episodes_of, figure_study, learning_curves, leave, mean_of_last, said
@@ -331,7 +331,7 @@ def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
         figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], judged=False), out
     )
     learned = EpisodeSpec.of_run(Path(found["folder"].iloc[0]))
-    unlearned = replace(learned, policy=partial(BaselinePolicy, white), acting="before learning")
+    unlearned = replace(learned, policy=partial(BaselinePolicy, uniform_random), acting="before learning")
     figure, axes = new_figure(2, 4, (13, 6.2))
     rows = []
     for shown, panels, letter in ((unlearned, axes[0], "A"), (learned, axes[1], "B")):

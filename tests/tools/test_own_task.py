@@ -246,7 +246,7 @@ def test_nothing_is_claimed_for_a_task_that_declares_no_held_out_conditions():
     assert words["reward"] == "reward of the task, which has one unnamed reward"
     declare(has_held_out_distribution=True)
     assert evaluation_scope("lab/Own", {}, resample_offsets=False) == "a policy for starts that training never drew"
-    assert describe_task_options("lab/Own")["reset: held_out"].startswith("draw from conditions that training never")
+    assert describe_task_options("lab/Own")["reset: held_out"].startswith("sample held-out conditions")
 
 
 def test_collisions_are_counted_only_where_a_task_says_what_they_are():

@@ -42,7 +42,7 @@ def list_(
     elif name in cli.LISTED:
         print_result({name: cli.LISTED[name]()}, as_json)
     elif name in cli.LISTED["tasks"]():
-        from guiderail.tools.cli.catalog import describe_task_options, describe_task, is_declared
+        from guiderail.tools.cli.catalog import describe_task, describe_task_options, is_declared
 
         print_result(describe_task(name) if as_json and is_declared(name) else describe_task_options(name), as_json, "_")
     else:

@@ -9,7 +9,7 @@ def test_a_regularization_that_pulls_everything_to_zero_is_said_with_a_remedy():
     assert leaves_demonstrations("NarrowPassage", {}) is None
     said = leaves_demonstrations("NarrowPassage", {"lambda_": 1e4, "beta": 1e4})
     assert said.startswith("without actions, ")
-    assert "check FILE --fit" in said
+    assert "dataset validate FILE --fit" in said
 
 
 def test_a_task_without_demonstrations_has_nothing_to_leave():
