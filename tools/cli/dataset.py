@@ -104,7 +104,7 @@ def fit_bounds(
 @command("template validate pouring --draw pouring.svg", "validate", template)
 def validate_template(
     file: Annotated[Path, argument("Template (.yaml), or one of {templates}.", "FILE")],
-    draw: Annotated[Path | None, option("Picture of the state machine to write: .png, .svg, .pdf or .dot.")] = None,
+    draw: Annotated[Path | None, option("Picture of the states to write: .png, .svg, .pdf or .dot.")] = None,
     as_json: cli.Json = False,
 ) -> None:
     """Validate and summarize a shared control template before it is used."""
