@@ -15,7 +15,7 @@ demonstrations = Demonstrations(
 reference = ReferenceTrajectory.from_demonstrations(demonstrations, components=6, floor=0.005)
 primitive = LcNsKmp(
     reference,
-    SquaredExponential(inverse_length=2.0),
+    SquaredExponential(length_scale=0.5),
     history=10,
     history_variance=1e-6,
     constraints=LinearConstraints.box([-np.inf, -1.0], [np.inf, 0.9]),

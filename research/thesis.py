@@ -23,6 +23,7 @@ HISTORY = ("history", "history_variance", "history_source", "adaptive_history")
 NEUTRAL = {
     "guidance": "the method, whose name stands beside",
     "solver": "three of one problem, with one solution",
+    "kernel_parameters": "of a kernel that is not the thesis's, which has none",
     "lcm_url": "where a robot's messages are",
     "robot_timeout": "after which a robot that is silent is given up",
 }
@@ -65,7 +66,8 @@ _PRIMITIVE = {
     "horizon": (40,),
     "lambda_": (6.0,),
     "beta": (6.0,),
-    "inverse_length": (2.0,),  # section 4.3.3, "the same kernel in all our experiments"
+    "kernel": ("squared_exponential",),  # section 4.3.3, "the same kernel in all our experiments"
+    "length_scale": (0.5,),  # its l = 2 is 1 / (2 ℓ²)
 }
 _TOLD = ("action_scale", "mouth_chamfer", "difficulty")  # options that remarks tell the value of
 _SCALE = (

@@ -15,7 +15,7 @@ from pydrake.systems.primitives import ZeroOrderHold
 from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
 from guiderail.diagrams.envs.env import RECORDED, SAID
 from guiderail.diagrams.envs.observation import Observation, affine
-from guiderail.diagrams.envs.options import validate_options
+from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.primitive_config import PrimitiveConfig
@@ -26,7 +26,7 @@ from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.primitives import LinearConstraints
-from guiderail.models.primitives.reference import through
+from guiderail.models.primitives.reference import pass_through
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
 from guiderail.systems.policy_system import PolicySystem
@@ -78,12 +78,15 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     skill = None
     if "demonstrations" in provides:
         options = task.config.part("primitive")
-        reference = through(task.reference(), options.pop("via_points", ()), options.get("inverse_length", 2.0))
+        kernel = kernel_from_options(options)
+        reference = pass_through(task.reference(), options.get("via_points", ()), kernel)
+        options = {name: value for name, value in options.items() if name not in (*KERNEL_OPTIONS, "via_points")}
         _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
             _refuse_half_turns(reference.means)
         skill = PrimitiveConfig(
             reference=reference,
+            kernel=kernel,
             constraints=task.constraints() or LinearConstraints.none(station.pose_size),
             control_period=station.control_period,
             isotropic_groups=task.isotropic_groups,

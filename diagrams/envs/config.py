@@ -162,6 +162,8 @@ def _freeze(value: Any) -> tuple[str, Any]:
     Raises:
         TypeError: If the value is not plain.
     """
+    if isinstance(value, dict):
+        return "dict", tuple(sorted((name, _freeze(entry)) for name, entry in value.items()))
     if isinstance(value, list | tuple):
         return "list", tuple(_freeze(entry) for entry in value)
     if value is not None and type(value) not in (bool, int, float, str):

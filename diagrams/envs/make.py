@@ -187,7 +187,9 @@ def _build(task: Task, render_mode: str | None) -> _Built:
 def _key(task: Task, render_mode: str | None) -> Hashable:
     """Return a key that is equal for environments whose diagrams are the same."""
     config = task.config
-    key = (type(task), config.guidance_kind, config.station_kind, render_mode, *sorted(config.options.items()))
+    options = config.options
+    options |= {name: tuple(sorted(value.items())) for name, value in options.items() if isinstance(value, dict)}
+    key = (type(task), config.guidance_kind, config.station_kind, render_mode, *sorted(options.items()))
     try:
         hash(key)
     except TypeError:

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.primitives.kernels import DEFAULT_KERNEL, DEFAULT_LENGTH_SCALE, Kernel, make_kernel
 
 STANDARD = "standard"
 """Default difficulty; every task has it."""
@@ -68,11 +69,36 @@ class PrimitiveOptions(Options):
     horizon: Integer = Field(40, ge=0, le=1000, description="H, future points at which constraints are satisfied")
     lambda_: Number = Field(6.0, ge=0, description="λ of problem 4.5")
     beta: Number = Field(6.0, gt=0, description="β of problem 4.5")
-    inverse_length: Number = Field(2.0, gt=0, description="of the kernel")
+    kernel: str = Field(DEFAULT_KERNEL, description="name of a registered kernel k(ζ, ζ')")
+    length_scale: Number = Field(
+        DEFAULT_LENGTH_SCALE, gt=0, description="ℓ of the kernel [s]; the thesis's l is 1 / (2 ℓ²)"
+    )
+    kernel_parameters: dict[str, Number] = Field(
+        {}, validate_default=True, description="further parameters of a kernel that has more than a length scale"
+    )
     via_points: Numbers = Field(
         (), description="points of the mean: a control step and an output each, one after another"
     )
     solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")
+
+    @field_validator("kernel_parameters")
+    @classmethod
+    def _check_kernel(cls, parameters: dict[str, float], info: ValidationInfo) -> dict[str, float]:
+        if all(name in info.data for name in ("kernel", "length_scale")):
+            kernel_from_options({**info.data, "kernel_parameters": parameters})
+        return parameters
+
+
+KERNEL_OPTIONS = ("kernel", "length_scale", "kernel_parameters")
+
+
+def kernel_from_options(options: Mapping[str, Any]) -> Kernel:
+    """Build the kernel that `PrimitiveOptions` name; a missing option has its default.
+
+    Raises:
+        InputError: As `make_kernel`.
+    """
+    return make_kernel(*(options.get(name, PrimitiveOptions.model_fields[name].default) for name in KERNEL_OPTIONS))
 
 
 class TemplateOptions(Options):
@@ -158,6 +184,8 @@ def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any])
     """Return pydantic's error as a sentence that names the option and the remedy."""
     name = str(error["loc"][0])
     value, kind, context = values.get(name), error["type"], error.get("ctx", {})
+    if isinstance(context.get("error"), InputError):
+        return str(context["error"])
     if kind == "literal_error":
         choices = [word.strip().strip("'") for word in context["expected"].replace(" or ", ", ").split(",")]
         return f"there is no {name} {brief(value)}: {did_you_mean(value, choices)}"

@@ -7,7 +7,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
+from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.lc_ns_kmp import shared_primitive
 
@@ -29,7 +29,7 @@ class PrimitiveConfig:
             command follows the robot, and the push dies); measured where a person may push a robot that tracks well.
         horizon: H, future points that constraints are kept at.
         lambda_, beta: λ and β of problem 4.5.
-        inverse_length: of the kernel.
+        kernel: k of the movement primitive.
         action_scale: κ, where a constant action of ±1 ends up: √3 κ demonstration standard deviations away.
         explored: indices of the outputs that the policy moves; all unless given. An action has one entry for each.
         gains: (O,) raw null-space units per action, instead of those computed from κ.
@@ -50,7 +50,7 @@ class PrimitiveConfig:
     horizon: int = 40
     lambda_: float = 6.0
     beta: float = 6.0
-    inverse_length: float = 2.0
+    kernel: Kernel = SquaredExponential()  # noqa: RUF009 (it is immutable)
     action_scale: float = 1.0
     action_dims: tuple[int, ...] | None = None
     gains: tuple[float, ...] | None = None
@@ -111,7 +111,7 @@ class PrimitiveConfig:
         return shared_primitive(
             self.reference,
             self.constraints if constrained else LinearConstraints.none(self.num_outputs),
-            self.inverse_length,
+            self.kernel,
             lambda_=self.lambda_,
             beta=self.beta,
             horizon=self.horizon,

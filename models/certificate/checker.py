@@ -1,9 +1,7 @@
-"""Checks a certificate: `python checker.py FOLDER`. It needs NumPy alone, and nothing of what made the certificate.
+"""Check a certificate with NumPy alone: `python checker.py FOLDER`; exit code 0: yes, 1: no, 2: no such files.
 
-It forms problem 4.5 at every step anew from the kernel and the demonstrations, and adds up what all sequences of
-actions can come to. It says yes, or no and where. Exit code 0 or 1; 2 if a file can't be read:
-    y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹
-W maps the history h on the window, C is the kernel given h; multipliers α ≥ 0 of constraints move it by v = S Gᵀ α.
+It bounds all sequences of actions, W h being what the history h implies of the window and C the kernel given h:
+    y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 """
 
 import hashlib
@@ -16,6 +14,7 @@ from typing import Any
 import numpy as np
 
 Arrays = dict[str, np.ndarray]
+KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: np.exp(-np.longdouble(0.5 / length**2) * d**2)}
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
 AGREES = 1e-4  # of a quantity's largest value: how well two ways of calculating it agree
 KEEPS = 1e-7  # of a constraint's size: how well a correction that is shown must keep it
@@ -61,24 +60,24 @@ def solve(A: np.ndarray, B: np.ndarray) -> np.ndarray:
 class Primitive:
     """Problem 4.5 at every step."""
 
-    def __init__(self, p: Arrays):
+    def __init__(self, p: Arrays, kernel: str):
         self.means, self.covariances = p["means"], p["covariances"]
         self.steps, self.outputs = self.means.shape
         self.past, self.horizon = int(p["history"]), int(p["horizon"])
         self.beta, self.hbar = float(p["beta"]), float(p["lambda"]) + float(p["beta"])
-        self.noise, self.inverse_length = self.hbar * float(p["history_variance"]), float(p["inverse_length"])
-        self.inputs = p["inputs"].astype(np.longdouble)
+        self.noise, self.length_scale = self.hbar * float(p["history_variance"]), float(p["length_scale"])
+        self.kernel, self.inputs = KERNELS[kernel], p["inputs"].astype(np.longdouble)
         clock, times = np.diff(self.inputs.astype(float)), self.past + self.steps + self.horizon
         require(len(clock) == times - 1 and np.allclose(clock, clock[0]), "the clock is not even, or not the steps'")
         self.G, self.c = (np.broadcast_to(p[k], (self.steps, *p[k].shape[-n:])) for k, n in (("G", 2), ("c", 1)))
         self.known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-    def kernel(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+    def features(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """W (H+1, P), and features F of the kernel given the history, F Fᵀ = C."""
         P, t = self.past, self.inputs[n : n + self.past + self.horizon + 1]
         key = np.round((t - t[0]).astype(float), 12).tobytes()
         if key not in self.known:
-            k = np.exp(-np.longdouble(self.inverse_length) * (t[:, None] - t[None, :]) ** 2)
+            k = self.kernel(t[:, None] - t[None, :], self.length_scale)
             W = solve(k[:P, :P] + self.noise * np.eye(P, dtype=k.dtype), k[:P, P:]).T
             values, vectors = np.linalg.eigh((k[P:, P:] - W @ k[:P, P:]).astype(float))
             kept = values > 1e-15 * values[-1]
@@ -87,7 +86,7 @@ class Primitive:
 
     def window(self, n: int) -> tuple[np.ndarray, ...]:
         """The window's maps from history and action, its offset, L with S = L Lᵀ, and constraints on it, as rows."""
-        W, F = self.kernel(n)
+        W, F = self.features(n)
         outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
         precision, F_bar = np.linalg.inv(self.covariances[at]), np.kron(F, np.eye(outs))
         M = np.einsum("ja,jb,jop->aobp", F, F, precision).reshape(F.shape[1] * outs, -1)
@@ -219,8 +218,9 @@ def compare(claims: dict[str, Any], found: dict[str, Arrays]) -> None:
 def check(folder: Path) -> None:
     """Raises `Rejected` unless the certificate in a folder holds."""
     p, witness, claims = read(folder)
-    primitive, period = Primitive(p), float(claims["period"])
-    require(0 < period < np.inf and claims["format"] == "guiderail certificate 2", "the format or the period is none")
+    require(claims["format"] == "guiderail certificate 3" and 0 < claims["period"] < np.inf, "wrong format or period")
+    require(claims["kernel"] in KERNELS, f"the kernel is {claims['kernel']!r}, not one of {list(KERNELS)}")
+    primitive, period = Primitive(p, claims["kernel"]), float(claims["period"])
     given = True, "budgeted" in claims, abs(period / np.diff(p["inputs"]).mean() - 1) > 1e-6
     told = ["\n".join(claims["assumes"][:6]), *claims["assumes"][6:]]
     same = [hashlib.sha256(each.encode()).hexdigest()[:32] for each in told] == list(itertools.compress(ASSUMES, given))

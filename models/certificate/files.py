@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from guiderail.models.certificate import checker
 from guiderail.models.certificate.bounds import Certified
 from guiderail.models.certificate.loop import Bounds, SharedControlTemplate
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.kernels import SquaredExponential
+from guiderail.models.primitives.kernels import kernel_name
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"
-FORMAT = "guiderail certificate 2"
+FORMAT = "guiderail certificate 3"
 ASSUMPTIONS = (
     "actions are numbers in [-1, 1], as the environment and the skill's diagram clip them, held for any time",
     "the skill is executed from its first step to its last, at the period given, and begins at rest within the start",
@@ -56,15 +57,16 @@ def certificate_files(
         InputError: if the primitive's kernel is none that the checker knows.
     """
     primitive = skill.primitive
-    kernel = primitive.kernel
-    if not isinstance(kernel, SquaredExponential):
-        raise InputError(f"a certificate is about squared exponential kernels, and this is {type(kernel).__name__}")
+    kernel: Any = primitive.kernel
+    name = kernel_name(kernel)
+    if name not in checker.KERNELS:
+        raise InputError(f"the checker of certificates has no kernel {kernel}: choose {' or '.join(checker.KERNELS)}")
     reference, constraints = primitive.reference, primitive.constraints
     numbers = {
         "inputs": reference.inputs(np.arange(-primitive.history, primitive.num_steps + primitive.horizon)),
         "means": reference.means,
         "covariances": reference.covariances,
-        "inverse_length": kernel.inverse_length,
+        "length_scale": kernel.length_scale,
         "lambda": primitive.lambda_,
         "beta": primitive.beta,
         "horizon": primitive.horizon,
@@ -84,6 +86,7 @@ def certificate_files(
         "about": dict(about),
         "assumes": list(ASSUMPTIONS),
         "digests": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+        "kernel": name,
         "period": skill.period,
         "free": _bounds(certified.free),
         "always": _bounds(certified.always),

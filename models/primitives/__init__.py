@@ -2,7 +2,7 @@
 
 from guiderail.models.primitives.constraints import LinearConstraints
 from guiderail.models.primitives.demonstrations import Demonstrations
-from guiderail.models.primitives.kernels import Kernel, Matern52, SquaredExponential
+from guiderail.models.primitives.kernels import Kernel, Matern52, SquaredExponential, make_kernel, register_kernel
 from guiderail.models.primitives.kmp import Kmp
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp, Modification, Prediction
 from guiderail.models.primitives.poses import pose_demonstrations, pose_outputs, pose_rotation
@@ -21,7 +21,9 @@ __all__ = [
     "ReferenceTrajectory",
     "SquaredExponential",
     "UnsolvableError",
+    "make_kernel",
     "pose_demonstrations",
     "pose_outputs",
     "pose_rotation",
+    "register_kernel",
 ]

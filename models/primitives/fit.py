@@ -7,15 +7,16 @@ others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
-from guiderail.models.primitives.kernels import SquaredExponential
+from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.mixture import fit_mixture, information_criteria, regress
 from guiderail.models.primitives.reference import ReferenceTrajectory
@@ -35,7 +36,7 @@ class Candidate:
     """One kernel and regularization that were tried.
 
     Attributes:
-        inverse_length: of the squared exponential kernel [1/input²].
+        length_scale: ℓ of the kernel [input].
         lambda_: λ = β.
         error: RMS distance between left-out demonstrations and what the others reproduce, in standard deviations of
             the demonstrations, correlations counted; infinite where the motion leaves all of them anyway.
@@ -43,7 +44,7 @@ class Candidate:
         share: of the steps at which the motion without actions is within one standard deviation of the mean.
     """
 
-    inverse_length: float
+    length_scale: float
     lambda_: float
     error: float
     worse: float
@@ -58,6 +59,7 @@ class Selection:
         reference: of all demonstrations.
         components: C of its mixture.
         kernel: with this λ the widest that reproduces the demonstrations as well as any.
+        length_scale: ℓ of the kernel [input].
         lambda_, beta: λ and β, the same; the strongest that does.
         share: of the steps at which the motion without actions is within one standard deviation of the mean.
         criteria: Bayesian information criterion of each number of components that was tried.
@@ -67,7 +69,8 @@ class Selection:
 
     reference: ReferenceTrajectory
     components: int
-    kernel: SquaredExponential
+    kernel: Kernel
+    length_scale: float
     lambda_: float
     beta: float
     share: float
@@ -90,7 +93,9 @@ def fit(
     demonstrations: Demonstrations,
     *,
     components: int | None = None,
-    inverse_length: float | None = None,
+    kernel: str = DEFAULT_KERNEL,
+    length_scale: float | None = None,
+    kernel_parameters: Mapping[str, float] | None = None,
     lambda_: float | None = None,
     horizon: int = 40,
     num_steps: int | None = None,
@@ -106,7 +111,8 @@ def fit(
 
     Args:
         demonstrations: at least three.
-        components, inverse_length, lambda_: what is given is taken as it is, and the rest chosen for it.
+        components, length_scale, lambda_: what is given is taken as it is, and the rest chosen for it.
+        kernel, kernel_parameters: as in `make_kernel`.
         horizon: H of the primitive that is meant.
         num_steps, floor, seed: as in `ReferenceTrajectory.from_demonstrations`.
 
@@ -127,13 +133,25 @@ def fit(
 
     reference = ReferenceTrajectory.from_demonstrations(shown, components, seed, floor=floor)
     without = [_reference(times, np.delete(outputs, m, axis=0), components, seed, floor) for m in range(len(outputs))]
-    candidates = _tried(reference, without, outputs, horizon, _grid(shown, inverse_length, lambda_))
+    make = partial(make_kernel, kernel, parameters=kernel_parameters)
+    candidates = _tried(reference, without, outputs, horizon, _grid(shown, length_scale, lambda_), make)
     chosen = _chosen(candidates)
-    kernel = SquaredExponential(chosen.inverse_length)
-    primitive = LcNsKmp(reference, kernel, chosen.lambda_, chosen.lambda_, horizon)
+    length_scale = chosen.length_scale
+    primitive = LcNsKmp(reference, make(length_scale), chosen.lambda_, chosen.lambda_, horizon)
     share = share_within_spread(primitive)
     why = _why(components, criteria, chosen, candidates, share, times)
-    return Selection(reference, components, kernel, chosen.lambda_, chosen.lambda_, share, criteria, candidates, why)
+    return Selection(
+        reference=reference,
+        components=components,
+        kernel=primitive.kernel,
+        length_scale=length_scale,
+        lambda_=chosen.lambda_,
+        beta=chosen.lambda_,
+        share=share,
+        criteria=criteria,
+        candidates=candidates,
+        why=why,
+    )
 
 
 def share_within_spread(primitive: LcNsKmp) -> float:
@@ -147,16 +165,16 @@ def share_within_spread(primitive: LcNsKmp) -> float:
 
 
 def estimated_share(
-    reference: ReferenceTrajectory, inverse_length: float, lambda_: float, beta: float, horizon: int = 40
+    reference: ReferenceTrajectory, kernel: Kernel, lambda_: float, beta: float, horizon: int = 40
 ) -> float:
     """About what `share_within_spread` is of a primitive without a history, from forty of its steps.
 
     Args:
         reference: of the primitive.
-        inverse_length, lambda_, beta, horizon: as in `LcNsKmp`.
+        kernel, lambda_, beta, horizon: as in `LcNsKmp`.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
-    motion = _motion(reference, SquaredExponential(inverse_length), lambda_ + beta, horizon, steps)
+    motion = _motion(reference, kernel, lambda_ + beta, horizon, steps)
     return float(_within(reference, motion, steps).mean())
 
 
@@ -191,13 +209,13 @@ def _squared(covariances: np.ndarray, error: np.ndarray) -> np.ndarray:
     return (np.einsum("nij,...nj->...ni", whiten, error) ** 2).sum(axis=-1)
 
 
-def _grid(shown: Demonstrations, inverse_length: float | None, lambda_: float | None) -> list[tuple[float, float]]:
+def _grid(shown: Demonstrations, length_scale: float | None, lambda_: float | None) -> list[tuple[float, float]]:
     """Kernels and ħ to try, in the motion's own duration and size, or what was given."""
     duration = float(shown.times[0][-1] - shown.times[0][0])
     size = float(np.sqrt((np.stack(shown.outputs) ** 2).mean(axis=(0, 1)).max())) or 1.0
-    kernels = [0.5 / (length * duration) ** 2 for length in _LENGTHS] if inverse_length is None else [inverse_length]
+    lengths = [length * duration for length in _LENGTHS] if length_scale is None else [length_scale]
     strengths = [hbar / size**2 for hbar in _REGULARIZATIONS] if lambda_ is None else [2.0 * lambda_]
-    return [(kernel, hbar) for kernel in kernels for hbar in strengths]
+    return [(length, hbar) for length in lengths for hbar in strengths]
 
 
 def _tried(
@@ -206,13 +224,14 @@ def _tried(
     outputs: np.ndarray,
     horizon: int,
     grid: Sequence[tuple[float, float]],
+    make: Callable[[float], Kernel],
 ) -> tuple[Candidate, ...]:
     """Every kernel and regularization, with how well it reproduces what was left out.
 
     One whose motion leaves the spread of all demonstrations is not asked what it does without one of them.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
-    kernels = [SquaredExponential(inverse_length) for inverse_length, _ in grid]
+    kernels = [make(length_scale) for length_scale, _ in grid]
     motions = [_motion(reference, k, hbar, horizon, steps) for k, (_, hbar) in zip(kernels, grid, strict=True)]
     shares = np.array([_within(reference, motion, steps).mean() for motion in motions])
     asked = shares >= min(ENOUGH, shares.max())
@@ -227,14 +246,12 @@ def _tried(
     worse[asked] = np.divide(behind.mean(axis=1), standard_error, out=np.zeros(len(behind)), where=standard_error > 0)
     rms = np.sqrt(errors.mean(axis=1) / outputs.shape[-1])
     return tuple(
-        Candidate(inverse_length, hbar / 2, float(rms[i]), float(worse[i]), float(shares[i]))
-        for i, (inverse_length, hbar) in enumerate(grid)
+        Candidate(length_scale, hbar / 2, float(rms[i]), float(worse[i]), float(shares[i]))
+        for i, (length_scale, hbar) in enumerate(grid)
     )
 
 
-def _motion(
-    reference: ReferenceTrajectory, kernel: SquaredExponential, hbar: float, horizon: int, steps: np.ndarray
-) -> np.ndarray:
+def _motion(reference: ReferenceTrajectory, kernel: Kernel, hbar: float, horizon: int, steps: np.ndarray) -> np.ndarray:
     """(n, O): k* (K + ħΣ)⁻¹ μ of the windows at `steps`, all at once and in plain doubles."""
     outputs = reference.num_outputs
     window = np.minimum(steps[:, None] + np.arange(horizon + 1), reference.num_steps - 1)
@@ -253,7 +270,7 @@ def _chosen(candidates: Sequence[Candidate]) -> Candidate:
     """The strongest regularization, and with it the widest kernel, among those that are as good as any."""
     good = [c for c in candidates if c.worse <= 1.0 and c.share >= ENOUGH]
     if good:
-        return min(good, key=lambda c: (-c.lambda_, c.inverse_length))
+        return min(good, key=lambda c: (-c.lambda_, -c.length_scale))
     return max(candidates, key=lambda c: (c.share, -c.error))
 
 
@@ -265,7 +282,7 @@ def _why(
     share: float,
     times: np.ndarray,
 ) -> str:
-    length = 1 / np.sqrt(2 * chosen.inverse_length)
+    length = chosen.length_scale
     best = min(candidate.error for candidate in candidates)
     many = len(criteria) > 1
     said = (

@@ -114,7 +114,7 @@ def _explored(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray:
         outputs = np.flatnonzero(outputs)
     indices = np.arange(primitive.num_outputs) if outputs is None else np.asarray(outputs, dtype=int)
     if not len(indices) or indices.min() < 0 or indices.max() >= primitive.num_outputs:
-        raise InputError(f"explored outputs must be among 0 … {primitive.num_outputs - 1}: {indices.tolist()}")
+        raise InputError(f"action_dims must be among 0 … {primitive.num_outputs - 1}: {indices.tolist()}")
     mask[indices] = True
     return mask
 
@@ -141,7 +141,7 @@ def _constant_response(primitive: LcNsKmp) -> np.ndarray:
 def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:
     """(O, O): mean square of output i over the motion per squared gain of output j, uniform white actions, held."""
     if int(action_repeat) != action_repeat or action_repeat < 1:
-        raise InputError(f"hold is how many control steps an action lasts, at least 1, not {action_repeat}")
+        raise InputError(f"action_repeat is how many control steps an action lasts, at least 1, not {action_repeat}")
     steps, outputs = primitive.num_steps, primitive.num_outputs
     decisions = -(-steps // action_repeat)
     pulses = np.repeat(np.eye(decisions), action_repeat, axis=0)[:steps]

@@ -1,10 +1,17 @@
-"""Kernels k(ζ, ζ') of a kernelized movement primitive (thesis, section 2.2.7)."""
+"""Kernels k(ζ, ζ') of a kernelized movement primitive (thesis, section 2.2.7), and their registry."""
 
-from typing import Protocol
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import Registry, did_you_mean
 
 
 class Kernel(Protocol):
@@ -14,8 +21,112 @@ class Kernel(Protocol):
     stationary: bool
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """k between rows of `a` (N, I) or (N,) and `b` (M, I) or (M,): (N, M), in the precision of the inputs."""
+        """Return k between the rows of `a` and `b`.
+
+        Args:
+            a: Inputs (N,) or (N, I).
+            b: Inputs (M,) or (M, I).
+
+        Returns:
+            (N, M), in the precision of the inputs.
+        """
         ...
+
+
+KERNELS: Registry[Callable[..., Kernel]] = Registry("kernel", entry_points="guiderail.kernels")
+"""Kernels by the name that `kernel=` of an environment takes.
+
+An entry is called with `length_scale=` and with its own further parameters, all of them numbers, and returns a kernel.
+"""
+register_kernel = KERNELS.register
+DEFAULT_KERNEL = "squared_exponential"
+DEFAULT_LENGTH_SCALE = 0.5
+
+
+def make_kernel(
+    name: str = DEFAULT_KERNEL,
+    length_scale: float = DEFAULT_LENGTH_SCALE,
+    parameters: Mapping[str, float] | None = None,
+) -> Kernel:
+    """Build a registered kernel; equal arguments return the same object.
+
+    Args:
+        name: Name that the kernel is registered by.
+        length_scale: ℓ, in the unit of the input, positive.
+        parameters: Further parameters of the kernel by name.
+
+    Raises:
+        InputError: If there is no such kernel, it does not have one of the parameters, or a value is out of range.
+    """
+    factory = KERNELS.get(name)
+    parameters = parameters or {}
+    accepted = [key for key in inspect.signature(factory).parameters if key != "length_scale"]
+    for key in parameters:
+        if key not in accepted:
+            raise InputError(f"the kernel {name!r} has no parameter {brief(key)}: {did_you_mean(key, accepted)}")
+    return _build(factory, length_scale, tuple(sorted(parameters.items())))
+
+
+@lru_cache(maxsize=100)
+def _build(factory: Callable[..., Kernel], length_scale: float, parameters: tuple[tuple[str, Any], ...]) -> Kernel:
+    return factory(length_scale=length_scale, **dict(parameters))
+
+
+def kernel_name(kernel: Kernel) -> str | None:
+    """Return the name that the class of `kernel` is registered by, or None."""
+    return next((name for name in KERNELS.names() if KERNELS.get(name) is type(kernel)), None)
+
+
+@register_kernel("squared_exponential")
+@dataclass(frozen=True)
+class SquaredExponential:
+    """The thesis's kernel k(ζ, ζ') = exp(−‖ζ − ζ'‖² / (2 ℓ²)) (section 4.3.3).
+
+    The thesis writes it as exp(−l ‖ζ − ζ'‖²): l = 1 / (2 ℓ²), and its l = 2 is ℓ = 0.5.
+
+    Args:
+        length_scale: ℓ, in the unit of the input, positive.
+
+    Raises:
+        InputError: If the length scale is not positive and finite.
+    """
+
+    length_scale: float = DEFAULT_LENGTH_SCALE
+    stationary = True
+
+    def __post_init__(self) -> None:
+        _check_positive("length_scale", self.length_scale)
+
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return k between the rows of `a` and `b`, as `Kernel` declares it."""
+        return np.exp(-(0.5 / self.length_scale**2) * _squared_distance(a, b))
+
+
+@register_kernel("matern52")
+@dataclass(frozen=True)
+class Matern52:
+    """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
+
+    It is twice differentiable only: for motions that the squared exponential kernel is too smooth for, such as those
+    with a contact in the middle.
+
+    Args:
+        length_scale: ℓ, in the unit of the input, positive.
+
+    Raises:
+        InputError: If the length scale is not positive and finite.
+    """
+
+    length_scale: float = DEFAULT_LENGTH_SCALE
+    stationary = True
+
+    def __post_init__(self) -> None:
+        _check_positive("length_scale", self.length_scale)
+
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return k between the rows of `a` and `b`, as `Kernel` declares it."""
+        s = np.sqrt(5 * _squared_distance(a, b)) / self.length_scale
+        return (1 + s + s * s / 3) * np.exp(-s)
 
 
 def _squared_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -23,55 +134,6 @@ def _squared_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=-1)
 
 
-def _positive(name: str, value: float) -> float:
+def _check_positive(name: str, value: float) -> None:
     if not (np.isfinite(value) and value > 0):
-        raise InputError(f"{name} must be positive and finite, not {value}")
-    return float(value)
-
-
-class SquaredExponential:
-    """k(ζ, ζ') = exp(−l ‖ζ − ζ'‖²), the thesis's own kernel (section 4.3.3)."""
-
-    stationary = True
-
-    def __init__(self, inverse_length: float = 2.0):
-        """
-        Args:
-            inverse_length: l [1/input²], positive. The length scale in the usual convention is 1/√(2l).
-
-        Raises:
-            InputError: if l is not positive and finite.
-        """
-        self.inverse_length = _positive("the kernel's inverse_length", inverse_length)
-
-    def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.exp(-self.inverse_length * _squared_distance(a, b))
-
-    def __repr__(self) -> str:
-        return f"SquaredExponential(inverse_length={self.inverse_length})"
-
-
-class Matern52:
-    """k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / length: twice differentiable only.
-
-    For motions that the squared exponential kernel is too smooth for, such as those with a contact in the middle.
-    """
-
-    stationary = True
-
-    def __init__(self, length: float = 0.5):
-        """
-        Args:
-            length: length scale [input], positive.
-
-        Raises:
-            InputError: if the length is not positive and finite.
-        """
-        self.length = _positive("the kernel's length", length)
-
-    def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        s = np.sqrt(5 * _squared_distance(a, b)) / self.length
-        return (1 + s + s * s / 3) * np.exp(-s)
-
-    def __repr__(self) -> str:
-        return f"Matern52(length={self.length})"
+        raise InputError(f"the kernel's {name} must be positive and finite, not {value}")

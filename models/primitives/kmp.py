@@ -40,7 +40,7 @@ class Kmp:
             inputs: (N,) or (N, I): times, or states.
             means: (N, O).
             covariances: (N, O, O), positive definite.
-            kernel: k; `SquaredExponential(inverse_length=2.0)` unless given.
+            kernel: k; `SquaredExponential(length_scale=0.5)` unless given.
             lambda_: λ, positive.
             covariance_lambda: λ_c, positive; λ unless given.
 

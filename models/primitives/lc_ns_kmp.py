@@ -130,7 +130,7 @@ class LcNsKmp:
         """
         Args:
             reference: means and covariances of the demonstrations, N steps of O outputs.
-            kernel: k; `SquaredExponential(inverse_length=2.0)`, the thesis's, unless given.
+            kernel: k; `SquaredExponential(length_scale=0.5)`, the thesis's, unless given.
             lambda_: λ, the regularization of problem 4.5, not negative.
             beta: β, how strongly a null-space action pulls, not negative; λ + β is positive.
             horizon: H, future points behind the executed one.
@@ -427,7 +427,7 @@ _USED: WeakValueDictionary[tuple[Any, ...], LcNsKmp] = WeakValueDictionary()
 
 
 def shared_primitive(
-    reference: ReferenceTrajectory, constraints: LinearConstraints, inverse_length: float, **arguments: Any
+    reference: ReferenceTrajectory, constraints: LinearConstraints, kernel: Kernel, **arguments: Any
 ) -> LcNsKmp:
     """The primitive of these numbers: the one that is in use, or a new one.
 
@@ -436,7 +436,7 @@ def shared_primitive(
 
     Args:
         reference, constraints: of `LcNsKmp`.
-        inverse_length: of its squared exponential kernel.
+        kernel: of `LcNsKmp`; kernels that compare equal are the same.
         arguments: numbers and names, of `LcNsKmp`.
 
     Raises:
@@ -446,10 +446,9 @@ def shared_primitive(
     digest = hashlib.blake2b(digest_size=16)
     for array in arrays:
         digest.update(repr(array.shape).encode() + np.ascontiguousarray(array, dtype=float).tobytes())
-    key = (digest.digest(), float(inverse_length), *sorted(arguments.items()))
+    key = (digest.digest(), kernel, *sorted(arguments.items()))
     found = _USED.get(key)
     if found is None:
-        kernel = SquaredExponential(inverse_length=inverse_length)
         found = LcNsKmp(reference, kernel=kernel, constraints=constraints, **arguments)
         _USED[key] = found
     return found

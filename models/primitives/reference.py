@@ -9,7 +9,7 @@ import numpy as np
 from guiderail.models.common.arrays import numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
-from guiderail.models.primitives.kernels import SquaredExponential
+from guiderail.models.primitives.kernels import Kernel
 from guiderail.models.primitives.mixture import fit_mixture, regress
 
 # Below this, relative to a covariance's own largest variance, a direction is singular in double precision.
@@ -135,7 +135,7 @@ class ReferenceTrajectory:
 EXACTNESS = 1e-4  # variance of a via-point, as a part of the kernel's own: how far several that disagree are averaged
 
 
-def through(reference: ReferenceTrajectory, points: Sequence[float], inverse_length: float) -> ReferenceTrajectory:
+def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel: Kernel) -> ReferenceTrajectory:
     """The reference with a mean that passes through via-points; its covariances stay.
 
     The displacement between via-points is the mean of a Gaussian process that is zero far from all of them.
@@ -143,7 +143,7 @@ def through(reference: ReferenceTrajectory, points: Sequence[float], inverse_len
     Args:
         reference: what was demonstrated.
         points: for each via-point its step and its output, 1 + O numbers, one after another.
-        inverse_length: of the squared exponential kernel [1/input²].
+        kernel: Covariance of the process.
 
     Raises:
         InputError: if these are not rows of a step and O finite numbers, or there is no such step.
@@ -158,7 +158,7 @@ def through(reference: ReferenceTrajectory, points: Sequence[float], inverse_len
     if (steps % 1 != 0).any() or steps.min() < 0 or steps.max() >= reference.num_steps:
         raise InputError(f"a via-point's step is a whole number from 0 to {reference.num_steps - 1}")
     at = steps.astype(int)
-    kernel, times = SquaredExponential(inverse_length), reference.times
+    times = reference.times
     K = kernel(times[at], times[at]) + EXACTNESS * np.eye(len(at))
     displacement = kernel(times, times[at]) @ np.linalg.solve(K, rows[:, 1:] - reference.means[at])
     return ReferenceTrajectory(times, reference.means + displacement, reference.covariances)

@@ -30,6 +30,7 @@ from .models.primitives import LinearConstraints as LinearConstraints
 from .models.primitives import Matern52 as Matern52
 from .models.primitives import ReferenceTrajectory as ReferenceTrajectory
 from .models.primitives import SquaredExponential as SquaredExponential
+from .models.primitives import register_kernel as register_kernel
 from .models.templates import SharedControlTemplate as SharedControlTemplate
 from .models.templates import load_template as load_template
 from .systems.episode_monitor import TerminationTerm as TerminationTerm

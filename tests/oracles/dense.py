@@ -56,7 +56,7 @@ class DenseWindow:
     def __init__(
         self,
         kernel,
-        inverse_length,
+        length_scale,
         inputs,
         means,
         covariances,
@@ -71,7 +71,7 @@ class DenseWindow:
         t = np.asarray(inputs, dtype=precision)
         mu = np.asarray(means, dtype=precision)
         o = mu.shape[1]
-        k = kernel(inverse_length, t)
+        k = kernel(length_scale, t)
         K = np.kron(k, np.eye(o, dtype=precision))
         self._K, self._blocks = K, np.asarray(covariances, dtype=precision)
         sigma = block_diagonal(self._blocks)
@@ -106,5 +106,5 @@ class DenseWindow:
         return pushed[start:].reshape(-1, o)
 
 
-def squared_exponential(inverse_length, t):
-    return np.exp(-t.dtype.type(inverse_length) * (t[:, None] - t[None, :]) ** 2)
+def squared_exponential(length_scale, t):
+    return np.exp(-t.dtype.type(0.5 / length_scale**2) * (t[:, None] - t[None, :]) ** 2)

@@ -14,7 +14,7 @@ class Problem:
     step: int
     action: np.ndarray
     history: np.ndarray | None
-    inverse_length: float
+    length_scale: float
 
     def solve(self):
         return self.primitive.predict(self.step, self.action, self.history)
@@ -30,7 +30,7 @@ class Problem:
             past = p.history_variance * np.broadcast_to(np.eye(p.num_outputs), (P, p.num_outputs, p.num_outputs))
             means, covariances = np.vstack([self.history, means]), np.concatenate([past, covariances])
         return DenseWindow(
-            squared_exponential, self.inverse_length, inputs, means, covariances, P, p.lambda_, p.beta, self.action,
+            squared_exponential, self.length_scale, inputs, means, covariances, P, p.lambda_, p.beta, self.action,
             precision,
         )  # fmt: skip
 
@@ -42,7 +42,7 @@ def random_problem(
     seed: int,
     history_variance: float = 1e-4,
     history_noise: float = 1e-3,
-    inverse_length: float | None = None,
+    length_scale: float | None = None,
     box: bool = False,
 ) -> Problem:
     """O = 1…6, F = 0…8, H = 5…60, P = 0…15, correlated covariances, horizons past the end, constraints that bite.
@@ -66,11 +66,11 @@ def random_problem(
     c = G @ inside - rng.uniform(0.1, 0.8, rows)
     if box:
         G, c = _slabs(seed, rows, scale, inside)
-    inverse_length = rng.uniform(1, 6) if inverse_length is None else inverse_length
+    length_scale = np.sqrt(0.5 / rng.uniform(1, 6)) if length_scale is None else length_scale
     step = int(rng.integers(0, N))
     primitive = LcNsKmp(
         ReferenceTrajectory(t, means, covariances),
-        kernel=SquaredExponential(inverse_length),
+        kernel=SquaredExponential(length_scale),
         lambda_=rng.uniform(1, 10),
         beta=rng.uniform(1, 10),
         horizon=int(H),
@@ -83,7 +83,7 @@ def random_problem(
         past = np.clip(np.arange(step - P, step), 0, N - 1)
         history = means[past] + history_noise * scale * rng.standard_normal((P, outputs))
     action = rng.standard_normal(outputs) * 30 / scale * rng.choice([0.1, 1, 10])
-    return Problem(primitive, step, action, history, inverse_length)
+    return Problem(primitive, step, action, history, length_scale)
 
 
 def _slabs(seed: int, rows: int, scale: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

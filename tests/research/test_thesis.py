@@ -83,6 +83,7 @@ def _another(task, name, field, default):
     words = {"reward": TASKS.get(task).rewards, "observation": TASKS.get(task).observations, "difficulty": ("hard",)}
     words["history_source"], words["impedance_control"] = ("commanded", "measured"), ("joint", "cartesian")
     words["fixture_offset"], words["solver"] = ("per_run", "per_episode", "none"), ("daqp", "osqp")
+    words["kernel"] = ("squared_exponential", "matern52")
     if isinstance(default, bool):
         values = (True, False)
     elif name in words:

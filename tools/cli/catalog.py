@@ -16,6 +16,7 @@ from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.diagrams.tasks.task import Task
+from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import end_effector_names, find_end_effector, find_robot, robot_names
 from guiderail.tools.environments import task_options
 from guiderail.tools.learning.learner import LEARNERS
@@ -32,6 +33,7 @@ def describe_all() -> dict[str, Any]:
         },
         "end_effectors": {name: {"is": find_end_effector(name).title} for name in end_effector_names()},
         "learners": {name: {} for name in LEARNERS.names()},
+        "kernels": {name: {"is": _first_line(KERNELS.get(name))} for name in KERNELS.names()},
         "options": {
             "of every environment": describe_options(CommonOptions),
             "of guidance made of demonstrations": describe_options(PrimitiveOptions),

@@ -26,19 +26,20 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
         InputError: For an unknown task or option.
     """
     from guiderail.diagrams.envs.config import EnvConfig  # Drake takes a second
+    from guiderail.diagrams.envs.options import kernel_from_options
 
     config = EnvConfig.resolve(task, environment)
     declared = config.make_task()
     if "demonstrations" not in declared.provides():
         return None
     values = config.options
-    chosen = {name: values[name] for name in ("inverse_length", "lambda_", "beta", "horizon")}
-    share = estimated_share(declared.reference(), **chosen)
+    chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
+    share = estimated_share(declared.reference(), kernel_from_options(values), **chosen)
     if share >= ENOUGH:
         return None
     return (
         f"without actions, {share:.0%} of the steps stay within a standard deviation of the demonstrations: let "
-        "guiderail dataset validate FILE --fit choose inverse_length, lambda_ and beta, and give them by --env"
+        "guiderail dataset validate FILE --fit choose length_scale, lambda_ and beta, and give them by --env"
     )
 
 
@@ -97,11 +98,11 @@ def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
     verdict = "follows the demonstrations" if share >= ENOUGH else "LEAVES the demonstrations: use these values"
     return {
         "components": chosen.components,
-        "inverse_length": float(f"{chosen.kernel.inverse_length:.4g}"),
+        "length_scale": float(f"{chosen.length_scale:.4g}"),
         "lambda_": float(f"{chosen.lambda_:.4g}"),
         "beta": float(f"{chosen.beta:.4g}"),
         "why": chosen.why,
-        "with the defaults": f"λ = β = 6 and inverse_length = 2: {share:.1%} of the steps within; {verdict}",
+        "with the defaults": f"λ = β = 6 and length_scale = 0.5: {share:.1%} of the steps within; {verdict}",
     }
 
 

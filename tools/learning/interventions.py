@@ -16,8 +16,9 @@ import gymnasium
 import numpy as np
 
 from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.options import kernel_from_options
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.reference import through
+from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.learning.run_folder import RunConfig
@@ -142,7 +143,7 @@ class ViaPointCorrections:
         values = config.options
         self.points = tuple(values["via_points"])
         shown = declared.reference()
-        self._reference = through(shown, self.points, values["inverse_length"])
+        self._reference = pass_through(shown, self.points, kernel_from_options(values))
         action_dims = values["action_dims"]
         self._explored = list(range(shown.num_outputs)) if action_dims is None else list(action_dims)
         spread = np.sqrt(np.mean(shown.standard_deviations**2, axis=0))

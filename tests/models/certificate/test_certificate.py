@@ -19,7 +19,8 @@ from guiderail.models.certificate.bounds import certify
 from guiderail.models.certificate.files import BUDGET, CERTIFICATE, OTHER_CLOCK, certificate_files, digest
 from guiderail.models.certificate.lagrange_bounds import Budget, _Market, _of_residue
 from guiderail.models.certificate.loop import SharedControlTemplate, reach
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, Matern52, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority_gains
 
 PERIOD, STEPS = 0.02, 60
@@ -278,7 +279,8 @@ TAMPERED = {
     "a covariance": lambda c: signed(altered(c, "primitive.npz", covariances=at((30, 0, 0), factor=3.0))),
     "the gains": lambda c: signed(altered(c, "primitive.npz", gains=lambda gains: 1.1 * gains)),
     "beta": lambda c: signed(altered(c, "primitive.npz", beta=lambda beta: 1.2 * beta)),
-    "the kernel": lambda c: signed(altered(c, "primitive.npz", inverse_length=lambda length: 1.5 * length)),
+    "the length scale": lambda c: signed(altered(c, "primitive.npz", length_scale=lambda length: 0.8 * length)),
+    "the kernel": lambda c: signed(c, kernel=lambda _: "matern52"),
     "the constraint's bound": lambda c: signed(altered(c, "constraints.npz", c=lambda c: 1.2 * c)),
     "the constraint's matrix": lambda c: signed(altered(c, "constraints.npz", G=lambda G: G[:, ::-1].copy())),
     "which steps are touched": lambda c: signed(altered(c, "witness.npz", touched=lambda t: np.zeros_like(t))),
@@ -295,6 +297,14 @@ TAMPERED = {
     "a sentence too many": lambda c: signed(c, assumes=lambda sentences: [*sentences, OTHER_CLOCK]),
     "a file, unsigned": lambda c: altered(c, "primitive.npz", gains=lambda gains: 1.0 * gains + 1e-9),
 }
+
+
+def test_certificate_refuses_a_kernel_without_a_checker():
+    made = skill(0)
+    primitive = LcNsKmp(made.primitive.reference, kernel=Matern52(0.5), horizon=10)
+    made = replace(made, primitive=primitive)
+    with pytest.raises(InputError, match="squared_exponential"):
+        files(made, certify(made))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from guiderail.models.primitives import Matern52, SquaredExponential
 from guiderail.models.primitives.features import KernelBasis, window_features
 
-KERNELS = [SquaredExponential(2.0), SquaredExponential(50.0), Matern52(0.4)]
+KERNELS = [SquaredExponential(0.5), SquaredExponential(0.1), Matern52(0.4)]
 
 
 def conditioned(kernel, past, future, noise):
@@ -44,8 +44,8 @@ def test_without_a_history_they_are_the_kernel(kernel):
 
 
 def test_there_are_no_more_of_them_than_the_kernel_has_directions():
-    smooth = window_features(SquaredExponential(0.1), np.zeros(0), np.linspace(0, 1, 60), 0.0)
-    rough = window_features(SquaredExponential(1e5), np.zeros(0), np.linspace(0, 1, 60), 0.0)
+    smooth = window_features(SquaredExponential(np.sqrt(5)), np.zeros(0), np.linspace(0, 1, 60), 0.0)
+    rough = window_features(SquaredExponential(np.sqrt(5e-6)), np.zeros(0), np.linspace(0, 1, 60), 0.0)
     assert smooth.features.shape[1] <= 12
     assert rough.features.shape[1] == 60
 
@@ -53,7 +53,7 @@ def test_there_are_no_more_of_them_than_the_kernel_has_directions():
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3))
 def test_a_basis_represents_what_it_was_given_and_says_how_much_of_anything_else(seed, dimensions):
     rng = np.random.default_rng(seed)
-    kernel = SquaredExponential(float(rng.uniform(0.1, 5)))
+    kernel = SquaredExponential(np.sqrt(0.5 / rng.uniform(0.1, 5)))
     inputs, elsewhere = rng.uniform(-1, 1, (15, dimensions)), rng.uniform(-3, 3, (7, dimensions))
     basis = KernelBasis(kernel, inputs)
     F = basis.features(inputs)
@@ -81,7 +81,7 @@ def test_a_basis_represents_what_it_was_given_and_says_how_much_of_anything_else
 
 
 def test_points_far_apart_each_need_a_feature_and_the_same_point_twice_needs_one():
-    kernel = SquaredExponential(1.0)
+    kernel = SquaredExponential(np.sqrt(0.5))
     assert KernelBasis(kernel, np.array([[0.0], [100.0], [200.0]])).size == 3
     assert KernelBasis(kernel, np.array([[1.0], [1.0], [1.0]])).size == 1
     empty = KernelBasis(kernel, np.zeros((0, 1)))

@@ -55,15 +55,13 @@ def test_outputs_that_differ_together_are_reproduced_together(together, selectio
 
 def test_what_was_chosen_is_among_what_was_tried_and_nothing_smoother_is_as_good(selection):
     chosen = next(
-        c
-        for c in selection.candidates
-        if (c.inverse_length, c.lambda_) == (selection.kernel.inverse_length, selection.lambda_)
+        c for c in selection.candidates if (c.length_scale, c.lambda_) == (selection.length_scale, selection.lambda_)
     )
     assert chosen.worse <= 1
     assert chosen.share >= ENOUGH
     for other in selection.candidates:
         if other.worse <= 1 and other.share >= ENOUGH:
-            assert (-other.lambda_, other.inverse_length) >= (-chosen.lambda_, chosen.inverse_length)
+            assert (-other.lambda_, -other.length_scale) >= (-chosen.lambda_, -chosen.length_scale)
     assert min(c.worse for c in selection.candidates) == 0
     assert selection.beta == selection.lambda_
     assert selection.components == min(selection.criteria, key=lambda count: selection.criteria[count])
@@ -75,7 +73,7 @@ def test_a_unit_of_length_changes_nothing_but_the_unit(together, selection):
     """A hundred times the numbers: a hundred times the motion, and λ in the inverse square of the unit."""
     larger = fit(Demonstrations(together.times, [100 * y for y in together.outputs]))
     assert larger.components == selection.components
-    assert larger.kernel.inverse_length == selection.kernel.inverse_length
+    assert larger.length_scale == selection.length_scale
     assert larger.lambda_ == pytest.approx(selection.lambda_ / 1e4, rel=1e-6)
     np.testing.assert_allclose(
         motion_without_actions(larger.primitive()), 100 * motion_without_actions(selection.primitive()), atol=1e-3
@@ -85,7 +83,7 @@ def test_a_unit_of_length_changes_nothing_but_the_unit(together, selection):
 def test_a_unit_of_time_changes_the_kernel_alone(together, selection):
     slower = fit(Demonstrations([10 * t for t in together.times], together.outputs))
     assert slower.components == selection.components
-    assert slower.kernel.inverse_length == pytest.approx(selection.kernel.inverse_length / 100, rel=1e-9)
+    assert slower.length_scale == pytest.approx(10 * selection.length_scale, rel=1e-9)
     assert slower.lambda_ == pytest.approx(selection.lambda_, rel=1e-9)
 
 
@@ -105,14 +103,14 @@ def hook(steps=60, deviation=0.05):
 
 def test_a_primitive_that_leaves_the_spread_says_so():
     """The share falls where the kernel cuts the corner, and where λ pulls everything to zero."""
-    good = LcNsKmp(hook(), SquaredExponential(50.0), 0.05, 0.05)
+    good = LcNsKmp(hook(), SquaredExponential(0.1), 0.05, 0.05)
     assert share_within_spread(good) == 1.0
-    too_wide = LcNsKmp(hook(deviation=0.005), SquaredExponential(1e-3), 6.0, 6.0)
+    too_wide = LcNsKmp(hook(deviation=0.005), SquaredExponential(22.4), 6.0, 6.0)
     assert share_within_spread(too_wide) < 0.7
-    too_strong = LcNsKmp(hook(), SquaredExponential(50.0), 1e5, 1e5)
+    too_strong = LcNsKmp(hook(), SquaredExponential(0.1), 1e5, 1e5)
     assert share_within_spread(too_strong) < 0.2
     for primitive in (good, too_wide, too_strong):
-        kernel, hbar = primitive.kernel.inverse_length, primitive.lambda_
+        kernel, hbar = primitive.kernel, primitive.lambda_
         estimate = estimated_share(primitive.reference, kernel, hbar, hbar)
         assert estimate == pytest.approx(share_within_spread(primitive), abs=0.1)
 

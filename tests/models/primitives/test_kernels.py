@@ -9,14 +9,14 @@ DISTANCE = np.array([[np.linalg.norm(a - b) for b in B] for a in A])
 
 
 def test_the_squared_exponential_is_its_closed_form():
-    np.testing.assert_allclose(SquaredExponential(3.0)(A, B), np.exp(-3.0 * DISTANCE**2), rtol=1e-14)
+    np.testing.assert_allclose(SquaredExponential(0.4)(A, B), np.exp(-(DISTANCE**2) / (2 * 0.4**2)), rtol=1e-14)
 
 
 def test_matern_is_its_closed_form():
     s = np.sqrt(5) * DISTANCE / 0.7
     np.testing.assert_allclose(Matern52(0.7)(A, B), (1 + s + s**2 / 3) * np.exp(-s), rtol=1e-14)
     assert Matern52()(A, A).diagonal().tolist() == [1.0, 1.0]
-    assert Matern52().length == 0.5
+    assert Matern52().length_scale == 0.5
 
 
 @pytest.mark.parametrize("kernel", [SquaredExponential, Matern52])

@@ -29,7 +29,7 @@ def textbook(kernel, t, means, covariances, queries, lambda_, covariance_lambda)
     return mean, len(t) / covariance_lambda * np.einsum("noni->noi", blocks)
 
 
-@pytest.mark.parametrize("kernel", [SquaredExponential(2.0), Matern52(0.7)])
+@pytest.mark.parametrize("kernel", [SquaredExponential(0.5), Matern52(0.7)])
 def test_equations_2_17_and_2_18(kernel):
     t, means, covariances = data(80, 3)
     queries = np.linspace(-0.3, 8.3, 17)
@@ -41,7 +41,7 @@ def test_equations_2_17_and_2_18(kernel):
 
 def test_via_points_are_as_if_they_had_always_been_there():
     """Added, moved and removed, inside the reference and beyond it: each time what a fresh primitive says."""
-    kernel = SquaredExponential(2.0)
+    kernel = SquaredExponential(0.5)
     t, means, covariances = data(60, 2)
     queries = np.linspace(-0.5, 9.5, 23)
     tight = 1e-6 * np.eye(2)

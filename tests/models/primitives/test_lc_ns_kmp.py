@@ -75,7 +75,7 @@ def test_agrees_with_a_generic_qp_solver_over_kernel_weights(seed):
 
     With a short length scale the kernel matrix is regular, so that a solver in double precision is good to 1e-8 too.
     """
-    problem = random_problem(seed, history_variance=1e-2, inverse_length=1500.0)
+    problem = random_problem(seed, history_variance=1e-2, length_scale=np.sqrt(0.5 / 1500))
     p, P, num_outputs = problem.primitive, problem.primitive.history, problem.primitive.num_outputs
     n, H = problem.step, p.horizon
     t = p.reference.inputs(np.arange(n - P, n + H + 1))
@@ -131,7 +131,7 @@ def real_problem(history, seed) -> Problem:
     rng = np.random.default_rng(seed)
     primitive = LcNsKmp(
         reference,
-        kernel=SquaredExponential(20.0),
+        kernel=SquaredExponential(np.sqrt(0.025)),
         history=history,
         history_variance=1e-6,
         constraints=LinearConstraints(np.eye(6)[:3], inside[:3] - 0.02),

@@ -31,7 +31,7 @@ def dense(problem, step, horizon, at, actions):
         past = p.history_variance * np.broadcast_to(np.eye(p.num_outputs), (P, p.num_outputs, p.num_outputs))
         means, covariances = np.vstack([problem.history, means]), np.concatenate([past, covariances])
     return DenseWindow(
-        squared_exponential, problem.inverse_length, inputs, means, covariances, P, p.lambda_, p.beta, actions,
+        squared_exponential, problem.length_scale, inputs, means, covariances, P, p.lambda_, p.beta, actions,
         at=P + np.asarray(at) - step,
     )  # fmt: skip
 
@@ -117,7 +117,7 @@ def test_actions_add_up_where_nothing_binds():
 
 def test_actions_at_every_point_are_taken_as_they_are():
     """K̲ is then K itself, and cancels: β Σ A ξ̂, however rough the actions are."""
-    p = plain(kernel=SquaredExponential(3.0))
+    p = plain(kernel=SquaredExponential(0.4))
     rng = np.random.default_rng(0)
     order = rng.permutation(40)
     actions = rng.standard_normal((40, 2))

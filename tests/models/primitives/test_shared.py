@@ -8,6 +8,7 @@ from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTra
 from guiderail.models.primitives.lc_ns_kmp import shared_primitive
 
 STEPS = 30
+KERNEL = SquaredExponential(0.5)
 
 
 def reference(height=1.0):
@@ -21,40 +22,40 @@ def box(half=0.9):
 
 
 def test_the_same_numbers_are_one_primitive_while_somebody_uses_it():
-    first = shared_primitive(reference(), box(), 2.0, history=2, lambda_=6)
-    assert shared_primitive(reference(), box(), 2.0, lambda_=6.0, history=2) is first
+    first = shared_primitive(reference(), box(), KERNEL, history=2, lambda_=6)
+    assert shared_primitive(reference(), box(), KERNEL, lambda_=6.0, history=2) is first
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        lambda: shared_primitive(reference(1.1), box(), 2.0, history=2),
-        lambda: shared_primitive(reference(), box(0.8), 2.0, history=2),
-        lambda: shared_primitive(reference(), box(), 3.0, history=2),
-        lambda: shared_primitive(reference(), box(), 2.0, history=3),
-        lambda: shared_primitive(reference(), box(), 2.0, history=2, solver="osqp"),
+        lambda: shared_primitive(reference(1.1), box(), KERNEL, history=2),
+        lambda: shared_primitive(reference(), box(0.8), KERNEL, history=2),
+        lambda: shared_primitive(reference(), box(), SquaredExponential(0.4), history=2),
+        lambda: shared_primitive(reference(), box(), KERNEL, history=3),
+        lambda: shared_primitive(reference(), box(), KERNEL, history=2, solver="osqp"),
     ],
 )
 def test_any_other_number_makes_another(other):
-    assert other() is not shared_primitive(reference(), box(), 2.0, history=2)
+    assert other() is not shared_primitive(reference(), box(), KERNEL, history=2)
 
 
 def test_it_answers_as_one_that_nobody_else_uses():
-    shared = shared_primitive(reference(), box(), 2.0, history=2)
+    shared = shared_primitive(reference(), box(), KERNEL, history=2)
     past, action = np.array([[0.0, 0.0], [0.01, 0.01]]), np.array([3.0, -2.0])
     shared.predict(7, -action, past)  # what was asked before does not matter
-    own = LcNsKmp(reference(), kernel=SquaredExponential(2.0), constraints=box(), history=2)
+    own = LcNsKmp(reference(), kernel=KERNEL, constraints=box(), history=2)
     np.testing.assert_array_equal(shared.predict(5, action, past).output, own.predict(5, action, past).output)
 
 
 def test_what_nobody_uses_is_not_kept():
     from guiderail.models.primitives.lc_ns_kmp import _USED
 
-    shared_primitive(reference(1.7), box(), 2.0)
+    shared_primitive(reference(1.7), box(), KERNEL)
     gc.collect()
     assert not [primitive for primitive in _USED.values() if primitive.reference.means[-1, 1] == 1.7]
 
 
 def test_what_a_primitive_refuses_is_refused():
     with pytest.raises(InputError, match="lambda_"):
-        shared_primitive(reference(), box(), 2.0, lambda_=-1.0)
+        shared_primitive(reference(), box(), KERNEL, lambda_=-1.0)

@@ -16,6 +16,6 @@ def test_a_task_without_demonstrations_has_nothing_to_leave():
     assert leaves_demonstrations("Pouring", {}) is None
 
 
-@pytest.mark.parametrize("inverse_length", [2e-4])
-def test_a_kernel_that_cuts_all_corners_is_said(inverse_length):
-    assert "standard deviation" in leaves_demonstrations("NarrowPassage", {"inverse_length": inverse_length})
+@pytest.mark.parametrize("length_scale", [50.0])
+def test_a_kernel_that_cuts_all_corners_is_said(length_scale):
+    assert "standard deviation" in leaves_demonstrations("NarrowPassage", {"length_scale": length_scale})

@@ -5,8 +5,8 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
-from guiderail.models.primitives import ReferenceTrajectory
-from guiderail.models.primitives.reference import through
+from guiderail.models.primitives import ReferenceTrajectory, SquaredExponential
+from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.learning.interventions import APART, WORTH, Supervisor, ViaPointCorrections
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.run_folder import RunFolder
@@ -107,13 +107,13 @@ def test_via_points_are_passed_and_forgotten_far_from_them():
     t = 0.02 * np.arange(400)
     reference = ReferenceTrajectory(t, np.column_stack([np.sin(t), t]), np.tile(0.01 * np.eye(2), (400, 1, 1)))
     points = [200, 1.5, 3.9, 205, 1.5, 4.0]
-    moved = through(reference, points, 2.0)
+    moved = pass_through(reference, points, SquaredExponential(0.5))
     np.testing.assert_allclose(moved.means[[200, 205]], [[1.5, 3.9], [1.5, 4.0]], atol=2e-2)
     np.testing.assert_allclose(moved.means[[0, 399]], reference.means[[0, 399]], atol=1e-6)
     np.testing.assert_array_equal(moved.covariances, reference.covariances)
     for wrong in ([1.0, 2.0], [0.5, 0.0, 0.0], [400, 0.0, 0.0], [3, np.nan, 0.0]):
         with pytest.raises(InputError, match="via-point"):
-            through(reference, wrong, 2.0)
+            pass_through(reference, wrong, SquaredExponential(0.5))
 
 
 def test_whoever_has_not_let_go_at_the_end_means_the_rest_and_newer_pushes_replace_older_ones():
