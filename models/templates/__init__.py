@@ -1,4 +1,4 @@
-"""Shared control templates: what is known about a task, as data (thesis, section 2.3)."""
+"""Shared control templates (SCT): prior knowledge of a task as data (thesis, section 2.3)."""
 
 from guiderail.models.templates.schema import load_template, parse_template
 from guiderail.models.templates.template import Command, SharedControlTemplate, TemplateState, Transition

@@ -1,4 +1,4 @@
-"""Tilt, bearing and interpolation of poses: the geometry that mappings and constraints share.
+"""Frames, tilt, bearing and interpolation of poses, shared by mappings and constraints.
 
 Frames: W world, E the end effector (or the tip of what it holds), F an object. A tilt is a rotation about the
 horizontal axis that is perpendicular to the bearing, the horizontal direction from E to the object.
@@ -16,25 +16,25 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 Frames = Mapping[str, RigidTransform]
 WORLD = "world"
 
-NEAR_AXIS = 1e-9  # [m] closer to the axis than this, there is no bearing
+NEAR_AXIS = 1e-9  # distance from the axis below which the bearing is undefined [m]
 
 
 @lru_cache(maxsize=64)
 def rotation_deg(rpy_deg: tuple[float, ...]) -> RotationMatrix:
-    """The rotation with these roll, pitch and yaw angles (x, y, z, about fixed axes) in degrees."""
+    """Return the rotation of roll, pitch and yaw angles (about fixed axes x, y, z) [deg]."""
     return RotationMatrix(RollPitchYaw(*np.deg2rad(rpy_deg)))
 
 
 @lru_cache(maxsize=64)
 def matrix_deg(rpy_deg: tuple[float, ...]) -> np.ndarray:
-    """`rotation_deg` as a matrix (3, 3), which nobody may write to."""
+    """Return `rotation_deg` as a read-only matrix (3, 3)."""
     matrix = rotation_deg(rpy_deg).matrix()
     matrix.setflags(write=False)
     return matrix
 
 
 def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
-    """p_FE [m]: where the end effector's origin is in the frame F called `frame`."""
+    """Return p_FE (3,) [m], the end effector's origin in the frame F called `frame`."""
     if frame == WORLD:
         return X_WE.translation()
     X_WF = frames[frame]
@@ -42,7 +42,7 @@ def position_in(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
 
 
 def pose_in(frame: str, X_WE: RigidTransform, frames: Frames) -> tuple[np.ndarray, np.ndarray]:
-    """R_FE (3, 3) and p_FE (3,) [m]: the end effector's pose in the frame F called `frame`."""
+    """Return R_FE (3, 3) and p_FE (3,) [m], the end effector's pose in the frame F called `frame`."""
     R_WE = X_WE.rotation().matrix()
     if frame == WORLD:
         return R_WE, X_WE.translation()
@@ -52,7 +52,7 @@ def pose_in(frame: str, X_WE: RigidTransform, frames: Frames) -> tuple[np.ndarra
 
 
 def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-    """X_WE moved so that its origin is at p_FE [m] in the frame F; the orientation is kept."""
+    """Return X_WE with its origin moved to p_FE [m] in the frame F and its orientation unchanged."""
     if frame == WORLD:
         return RigidTransform(X_WE.rotation(), p_FE)
     X_WF = frames[frame]
@@ -60,7 +60,7 @@ def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames:
 
 
 def bearing(p_FE: np.ndarray) -> np.ndarray:
-    """The horizontal unit vector in F from E to F's origin; +x where E is on F's z axis."""
+    """Return the horizontal unit vector in F from E to F's origin; +x if E is on F's z axis."""
     horizontal = math.hypot(p_FE[0], p_FE[1])
     if horizontal < NEAR_AXIS:
         return np.array([1.0, 0.0, 0.0])
@@ -68,23 +68,23 @@ def bearing(p_FE: np.ndarray) -> np.ndarray:
 
 
 def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
-    """The axis in F about which a positive angle tips an upright thing towards F's origin: z × bearing."""
+    """Return the axis in F about which a positive angle tilts an upright tool towards F's origin: z × bearing."""
     towards = bearing(p_FE)
     return np.array([-towards[1], towards[0], 0.0])
 
 
 def about(axis: Any, angle: float) -> RotationMatrix:
-    """The rotation by `angle` [rad] about the unit vector `axis`."""
+    """Return the rotation by `angle` [rad] about the unit vector `axis`."""
     return RotationMatrix(AngleAxis(angle, axis))
 
 
 def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
-    """The angle [rad] of the rotation from A to B, accurate for small angles too."""
+    """Return the angle [rad] of the rotation from A to B; accurate for small angles too."""
     return chord_angle(R_WA.matrix(), R_WB.matrix())
 
 
 def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
-    """`angle_between` of rotation matrices (3, 3)."""
+    """Return the `angle_between` two rotation matrices (3, 3) [rad]."""
     # ‖A − B‖ = 2√2 sin(θ/2) in the Frobenius norm; a trace loses half of the digits near zero.
     difference = R_WA - R_WB
     chord = math.sqrt(float(np.vdot(difference, difference)))
@@ -92,7 +92,7 @@ def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
 
 
 def largest(violations: Iterable[float]) -> float:
-    """The largest of them, at least 0; not a number where one of them is none, which `max` would hide."""
+    """Return the largest violation, at least 0; NaN if any is NaN, which `max` would hide."""
     worst = 0.0
     for violation in violations:
         if math.isnan(violation):
@@ -102,7 +102,7 @@ def largest(violations: Iterable[float]) -> float:
 
 
 def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> RigidTransform:
-    """The pose a fraction of the way from A to B: straight in position, about one axis in orientation."""
+    """Return the pose a fraction of the way from A to B: on a line in position, about one axis in orientation."""
     if fraction == 1.0:
         return X_WB
     p_WA, p_WB = X_WA.translation(), X_WB.translation()

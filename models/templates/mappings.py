@@ -1,10 +1,11 @@
-"""Input mappings: what a person's or a policy's few inputs move (thesis, equations 2.19 and 2.20)."""
+"""Input mappings: from the few inputs of a user or a policy to displacements (thesis, equations 2.19 and 2.20)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
+from typing_extensions import override
 
 from guiderail.models.templates.geometry import WORLD, Frames, about, bearing, interpolate, position_in, tilt_axis
 from guiderail.models.templates.kinds import INPUT_MAPPINGS, register, require, require_three
@@ -13,7 +14,7 @@ TOOL = "tool"
 
 
 class InputMapping(ABC):
-    """map_q of equation 2.19 for some of the inputs.
+    """One mapping of map_q (equation 2.19), for some of the inputs.
 
     A displacement ΔH is a RigidTransform whose translation is added to p_WE and whose rotation is applied to R_WE
     from the left, that is about the end effector's origin and expressed in the world.
@@ -21,22 +22,22 @@ class InputMapping(ABC):
 
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
-        """ΔH during one period, from all of the template's inputs, each in [−1, 1]."""
+        """Return ΔH during one period for all inputs of the template, each in [−1, 1]."""
 
     @property
     @abstractmethod
     def used_inputs(self) -> tuple[int, ...]:
-        """Which inputs it listens to."""
+        """Numbers of the inputs that the mapping uses."""
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """The objects' frames it needs."""
+        """Names of the object frames that the mapping refers to."""
         frame = getattr(self, "frame", WORLD)
         return () if frame in (WORLD, TOOL) else (frame,)
 
 
 def axes_in_world(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
-    """R_WF, its columns the axes of `frame`, which may be `world`, `tool` or an object's."""
+    """Return R_WF (3, 3), whose columns are the axes of `frame`: `world`, `tool` or that of an object."""
     if frame == WORLD:
         return np.eye(3)
     return (X_WE if frame == TOOL else frames[frame]).rotation().matrix()
@@ -50,30 +51,32 @@ def _require_axes(inputs: tuple[int, ...], axes: tuple[tuple[float, ...], ...]) 
 
 
 def _require_object(frame: str) -> None:
-    require(frame != TOOL, "frame must be an object's, not the tool's own.")
+    require(frame != TOOL, "frame must be that of an object, not the tool's own.")
 
 
 @register(INPUT_MAPPINGS, "translation")
 @dataclass(frozen=True)
 class Translation(InputMapping):
-    """Each input moves the end effector along one axis of a frame (`world`, `tool`, or an object's).
+    """Translation of the end effector along one axis of a frame for each input.
 
-    A full input means `speed_m_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    A full input commands `speed_m_per_s` times the length of its axis: an axis of length 2 doubles the speed.
     """
 
-    inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
-    speed_m_per_s: float  # at full input
-    frame: str = WORLD  # in which axes are given: an object's, `world` or `tool`
-    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one for each input
+    inputs: tuple[int, ...]  # numbers of the inputs, from 0
+    speed_m_per_s: float  # speed at full input
+    frame: str = WORLD  # frame of the axes: `world`, `tool` or that of an object
+    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one axis for each input
 
     def __post_init__(self) -> None:
         _require_axes(self.inputs, self.axes)
         require(self.speed_m_per_s > 0, f"speed_m_per_s must be positive, not {self.speed_m_per_s}.")
 
     @property
+    @override
     def used_inputs(self) -> tuple[int, ...]:
         return self.inputs
 
+    @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         v_FE = self.speed_m_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
         return RigidTransform(RotationMatrix(), axes_in_world(self.frame, X_WE, frames) @ v_FE * period_s)
@@ -82,24 +85,26 @@ class Translation(InputMapping):
 @register(INPUT_MAPPINGS, "rotation")
 @dataclass(frozen=True)
 class Rotation(InputMapping):
-    """Each input turns the end effector about one axis of a frame (`world`, `tool`, or an object's).
+    """Rotation of the end effector about one axis of a frame for each input.
 
-    A full input means `speed_rad_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    A full input commands `speed_rad_per_s` times the length of its axis: an axis of length 2 doubles the speed.
     """
 
-    inputs: tuple[int, ...]  # numbers of the inputs that it listens to, from 0
-    speed_rad_per_s: float  # at full input
-    frame: str = WORLD  # in which axes are given: an object's, `world` or `tool`
-    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one for each input
+    inputs: tuple[int, ...]  # numbers of the inputs, from 0
+    speed_rad_per_s: float  # speed at full input
+    frame: str = WORLD  # frame of the axes: `world`, `tool` or that of an object
+    axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one axis for each input
 
     def __post_init__(self) -> None:
         _require_axes(self.inputs, self.axes)
         require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
 
     @property
+    @override
     def used_inputs(self) -> tuple[int, ...]:
         return self.inputs
 
+    @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         w_FE = self.speed_rad_per_s * np.array(self.axes).T @ inputs[list(self.inputs)]
         turn = axes_in_world(self.frame, X_WE, frames) @ w_FE * period_s
@@ -110,11 +115,11 @@ class Rotation(InputMapping):
 @register(INPUT_MAPPINGS, "tilt_towards")
 @dataclass(frozen=True)
 class TiltTowards(InputMapping):
-    """Two inputs, a horizontal vector in the frame, are projected on the direction to it: tilt follows that scalar."""
+    """Tilt towards a frame, at the component along the bearing of the horizontal vector that two inputs give in it."""
 
     inputs: tuple[int, ...]  # numbers of two inputs, from 0
-    speed_rad_per_s: float  # at full input
-    frame: str  # an object's: tilted towards it
+    speed_rad_per_s: float  # speed at full input
+    frame: str  # frame of the object to tilt towards
 
     def __post_init__(self) -> None:
         _require_object(self.frame)
@@ -122,9 +127,11 @@ class TiltTowards(InputMapping):
         require(self.speed_rad_per_s > 0, f"speed_rad_per_s must be positive, not {self.speed_rad_per_s}.")
 
     @property
+    @override
     def used_inputs(self) -> tuple[int, ...]:
         return self.inputs
 
+    @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         p_FE = position_in(self.frame, X_WE, frames)
         along = float(np.clip(inputs[list(self.inputs)] @ bearing(p_FE)[:2], -1.0, 1.0))
@@ -135,12 +142,12 @@ class TiltTowards(InputMapping):
 @register(INPUT_MAPPINGS, "scaled")
 @dataclass(frozen=True)
 class Scaled(InputMapping):
-    """Another mapping, its inputs multiplied by a factor that depends on the distance to a frame: slower when near."""
+    """Another mapping with its inputs multiplied by a factor that depends on the distance to a frame."""
 
-    frame: str  # an object's, to which the distance is
+    frame: str  # frame of the object to which the distance is measured
     distance_m: tuple[float, ...]  # increasing
-    factor: tuple[float, ...]  # in [0, 1], one for each distance, linear in between
-    of: InputMapping  # the mapping, as an entry of its own
+    factor: tuple[float, ...]  # factors in [0, 1], one for each distance; linear in between
+    of: InputMapping  # the scaled mapping, an entry with its own kind
 
     def __post_init__(self) -> None:
         _require_object(self.frame)
@@ -151,13 +158,16 @@ class Scaled(InputMapping):
         require(min(self.factor) >= 0 and max(self.factor) <= 1, "every factor must be between 0 and 1.")
 
     @property
+    @override
     def used_inputs(self) -> tuple[int, ...]:
         return self.of.used_inputs
 
     @property
+    @override
     def frame_names(self) -> tuple[str, ...]:
         return (*super().frame_names, *self.of.frame_names)
 
+    @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         distance = float(np.linalg.norm(position_in(self.frame, X_WE, frames)))
         factor = interpolate(distance, self.distance_m, self.factor)
@@ -167,26 +177,29 @@ class Scaled(InputMapping):
 @register(INPUT_MAPPINGS, "uneven")
 @dataclass(frozen=True)
 class Uneven(InputMapping):
-    """Another mapping, its inputs above and below zero multiplied by factors: one way slower than the other.
+    """Another mapping with different factors for positive and negative inputs.
 
-    Zero still is to stand still, but inputs without a preference lead the faster way on average: what explores at
-    random otherwise walks away from a goal as often as towards it.
+    A zero input still commands no motion, but random inputs drift in the faster direction on average. Otherwise random
+    exploration would move away from a goal as often as towards it.
     """
 
-    above: float  # in (0, 1]
-    below: float  # in (0, 1]
-    of: InputMapping  # the mapping, as an entry of its own
+    above: float  # factor of positive inputs, in (0, 1]
+    below: float  # factor of negative inputs, in (0, 1]
+    of: InputMapping  # the scaled mapping, an entry with its own kind
 
     def __post_init__(self) -> None:
         require(0 < self.above <= 1 and 0 < self.below <= 1, "both factors must be above 0 and at most 1.")
 
     @property
+    @override
     def used_inputs(self) -> tuple[int, ...]:
         return self.of.used_inputs
 
     @property
+    @override
     def frame_names(self) -> tuple[str, ...]:
         return self.of.frame_names
 
+    @override
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
         return self.of.displacement(np.where(inputs < 0.0, self.below, self.above) * inputs, X_WE, frames, period_s)

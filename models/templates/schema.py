@@ -199,7 +199,7 @@ def _field_type(hint: Any) -> Any:
     if get_origin(hint) is tuple:
         element: Any = _field_type(get_args(hint)[0])
         return tuple[element, ...]
-    return FIELD_TYPES[hint]
+    return FIELD_TYPES.get(hint, hint)
 
 
 class _State(_Entry):

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, grouped
+from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
 from guiderail.models.templates.geometry import Frames, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
 from guiderail.models.templates.transitions import TransitionDistance
@@ -54,7 +54,7 @@ class TemplateState:
     @cached_property
     def grouped_constraints(self) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
         """The active constraints, those in one frame together."""
-        return grouped(self.active_constraints)
+        return group_constraints(self.active_constraints)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Transition distances: how far it is to the end of a state (thesis, section 2.3)."""
+"""Transition distances: the distance to the end of a state (thesis, section 2.3)."""
 
 import math
 from abc import ABC, abstractmethod
@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from pydrake.math import RigidTransform
+from typing_extensions import override
 
 from guiderail.models.templates.constraints import TiltLimits, axes
 from guiderail.models.templates.geometry import WORLD, Frames, angle_between, position_in, rotation_deg
@@ -14,17 +15,21 @@ from guiderail.models.templates.kinds import TRANSITION_DISTANCES, register, req
 
 
 class TransitionDistance(ABC):
-    """d_t: decreases monotonically as the task gets on, in metres or in radians."""
+    """Transition distance d_t, which decreases as the task progresses.
 
-    unit: str = "m"  # or "deg": the unit of the thresholds in the file; values are in m or rad
+    Attributes:
+        unit: "m" or "deg", the unit of thresholds in a file; values are in metres or radians.
+    """
+
+    unit: str = "m"
 
     @abstractmethod
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
-        """The distance at X_WE, [m] or [rad]."""
+        """Return the distance at X_WE, [m] or [rad]."""
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """The objects' frames it needs."""
+        """Names of the object frames that the distance refers to."""
         frame = getattr(self, "frame", WORLD)
         return () if frame == WORLD else (frame,)
 
@@ -32,14 +37,15 @@ class TransitionDistance(ABC):
 @register(TRANSITION_DISTANCES, "distance")
 @dataclass(frozen=True)
 class Distance(TransitionDistance):
-    """‖p_FE‖, from the end effector's origin to a point of F."""
+    """Distance ‖p_FE − point_m‖ of the end effector's origin from a point of F."""
 
-    frame: str  # F: an object's, or `world`
-    point_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # in F
+    frame: str  # F: frame of an object, or `world`
+    point_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # the point, in F
 
     def __post_init__(self) -> None:
         require_three(self.point_m, "point_m")
 
+    @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         p_PE = position_in(self.frame, X_WE, frames) - self.point_m
         return math.sqrt(p_PE @ p_PE)
@@ -48,10 +54,11 @@ class Distance(TransitionDistance):
 @register(TRANSITION_DISTANCES, "height")
 @dataclass(frozen=True)
 class Height(TransitionDistance):
-    """z of p_FE: how high above F."""
+    """Height of the end effector's origin above F, the z component of p_FE."""
 
-    frame: str  # F: an object's, or `world`
+    frame: str  # F: frame of an object, or `world`
 
+    @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return float(position_in(self.frame, X_WE, frames)[2])
 
@@ -59,10 +66,11 @@ class Height(TransitionDistance):
 @register(TRANSITION_DISTANCES, "axis_distance")
 @dataclass(frozen=True)
 class AxisDistance(TransitionDistance):
-    """How far the end effector's origin is from F's z axis."""
+    """Distance of the end effector's origin from F's z axis."""
 
-    frame: str  # F: an object's, or `world`
+    frame: str  # F: frame of an object, or `world`
 
+    @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return float(np.hypot(*position_in(self.frame, X_WE, frames)[:2]))
 
@@ -70,12 +78,12 @@ class AxisDistance(TransitionDistance):
 @register(TRANSITION_DISTANCES, "tilt_to_go")
 @dataclass(frozen=True)
 class TiltToGo(TransitionDistance):
-    """What is missing of the tilt `until_deg` towards F's z axis."""
+    """Remaining tilt towards F's z axis, until_deg minus the present one."""
 
-    frame: str  # F: an object's, or `world`
-    until_deg: float  # the tilt at which nothing is missing
+    frame: str  # F: frame of an object, or `world`
+    until_deg: float  # tilt at which the distance is zero
     rpy_deg: tuple[float, ...] = (0.0, 0.0, 0.0)  # R_FE at zero tilt
-    turns_along: bool = False  # as in the constraint on the tilt
+    turns_along: bool = False  # as in `tilt_limits`
     unit = "deg"
 
     def __post_init__(self) -> None:
@@ -86,6 +94,7 @@ class TiltToGo(TransitionDistance):
     def _any_tilt(self) -> TiltLimits:
         return TiltLimits(self.frame, -180.0, 180.0, self.rpy_deg, self.turns_along)
 
+    @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return math.radians(self.until_deg) - self._any_tilt.tilt(X_WE, frames)
 
@@ -93,14 +102,15 @@ class TiltToGo(TransitionDistance):
 @register(TRANSITION_DISTANCES, "rotation_to_go")
 @dataclass(frozen=True)
 class RotationToGo(TransitionDistance):
-    """The angle between the end effector's orientation and a given one."""
+    """Angle between the end effector's orientation and a given one."""
 
-    rpy_deg: tuple[float, ...]  # the given orientation, R_FE
-    frame: str = WORLD  # F: an object's, or `world`
+    rpy_deg: tuple[float, ...]  # given orientation R_FE
+    frame: str = WORLD  # F: frame of an object, or `world`
     unit = "deg"
 
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")
 
+    @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
         return angle_between(X_WE.rotation(), axes(self.frame, frames).multiply(rotation_deg(self.rpy_deg)))

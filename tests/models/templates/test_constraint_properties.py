@@ -309,7 +309,7 @@ def test_constraints_that_share_a_frame_do_together_what_they_do_one_by_one(seed
         Tilted(rng.uniform(0.0, 1.0)),
         ac.KeepAbove(0.02, WORLD, ((0.0, 0.0, -0.1), (0.0, 0.1, 0.0))),
     ]
-    together = ac.grouped(constraints)
+    together = ac.group_constraints(constraints)
     assert [len(g.constraints) if isinstance(g, ac.ConstraintGroup) else 0 for g in together] == [3, 0, 1]
     X_WP = X_WQ = X_WE
     for constraint in constraints:
