@@ -1,4 +1,4 @@
-"""Projects requested poses into the active constraints (thesis, equation 2.21)."""
+"""Projection of requested poses into the active constraints (thesis, equation 2.21)."""
 
 import math
 from collections.abc import Mapping
@@ -24,16 +24,16 @@ from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class ActiveConstraintProjector(LeafSystem):
-    """Applies the active constraints of a shared control template's current state to requested poses.
+    """Project requested poses into the active constraints of a shared control template's current state.
 
         H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
-    (`SharedControlTemplate.command`). The last command is state; it is initialized with the measured pose, as far inside the
-    constraints as one period leads. Between two control instants the output is a pure function of it and of the
-    request. The last safe command is repeated, and ``fallback`` is 1, where a request or the measured pose is not
-    finite, and where the tracking error exceeds its bound and the request would not reduce it: the command waits for a
-    robot that is held back. Constraints hold while it waits, too: where a transition or a moved object leaves the last
-    command outside of them, it is led inside.
+    (`SharedControlTemplate.command`). The last command is state, initialized with the measured pose, as far inside
+    the constraints as one period leads. Between control instants the output is a pure function of it and the request.
+
+    The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite, or if the
+    tracking error exceeds its bound and the request would not reduce it, as when the robot is blocked. If a transition
+    or a moved object leaves the repeated command outside the constraints, it is led inside.
 
     .. pydrake_system::
 
@@ -50,10 +50,10 @@ class ActiveConstraintProjector(LeafSystem):
         - measured_violation
 
     All poses are (6,), [x y z Rz Ry Rx] in metres and radians; the other ports are (1,). ``state`` is the number of the
-    template's state. Violations are the larger of metres and radians from the projection, 0 inside.
+    template's state. A violation is the distance from the projection, the larger of metres and radians, 0 inside.
 
     Attributes:
-        frames: the poses of the template's objects, which a reset can set.
+        frames: Parameters with the poses of the template's object frames, which a reset can set.
     """
 
     def __init__(
@@ -63,28 +63,29 @@ class ActiveConstraintProjector(LeafSystem):
         period: float,
         max_tracking_error: float = np.inf,
     ):
-        """
+        """Construct the system.
+
         Args:
-            template: the template.
-            frames: the poses of its objects by name, in the frame that poses are given in.
-            period: between two control steps [s], positive.
-            max_tracking_error: distance of the robot from its command beyond which that waits [m], positive.
+            template: The template.
+            frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+            period: Control period [s], positive.
+            max_tracking_error: Distance between the robot and its command beyond which the command waits [m], positive.
 
         Raises:
-            InputError: if an argument is out of range, or a frame is missing or not finite. At initialization, if the
+            InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the
                 measured pose is not finite.
         """
         super().__init__()
         check_period(period)
         if not max_tracking_error > 0.0:
-            raise InputError(f"the greatest tracking error must be positive, not {max_tracking_error} m")
+            raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
         self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
         self.frames = TemplateFrames(self, template, frames)
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
 
-        # The last command, and the pose that was measured when it was given.
+        # The last command, and the pose measured at that time.
         self._last = self.DeclareDiscreteState(12)
         last = self.discrete_state_ticket(self._last)
         constraints = {self._state_port.ticket(), self.frames.ticket}
@@ -117,35 +118,35 @@ class ActiveConstraintProjector(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_requested_pose_input_port(self) -> InputPort:
-        """The requested pose H^im, (6,)."""
+        """Return the port of the requested pose H^im, (6,)."""
         return self._requested_pose_port
 
     def get_pose_input_port(self) -> InputPort:
-        """The measured pose, (6,)."""
+        """Return the port of the measured pose, (6,)."""
         return self._pose_port
 
     def get_state_input_port(self) -> InputPort:
-        """The number of the template's state, (1,)."""
+        """Return the port of the number of the template's state, (1,)."""
         return self._state_port
 
     def get_desired_pose_output_port(self) -> OutputPort:
-        """The command H^ac, (6,), inside the active constraints."""
+        """Return the port of the command H^ac, (6,), inside the active constraints."""
         return self._desired_pose_port
 
     def get_last_desired_pose_output_port(self) -> OutputPort:
-        """The command before this one, (6,): what an input displaces. It is state and never feeds through."""
+        """Return the port of the previous command, (6,), which an input displaces; no direct feedthrough."""
         return self._last_desired_pose_port
 
     def get_fallback_output_port(self) -> OutputPort:
-        """1 while the last safe command is repeated, (1,)."""
+        """Return the port of the fallback flag, (1,): 1 while the last safe command is repeated."""
         return self._fallback_port
 
     def get_commanded_violation_output_port(self) -> OutputPort:
-        """How far the command is outside of the constraints, (1,)."""
+        """Return the port of the violation of the command, (1,)."""
         return self._commanded_violation_port
 
     def get_measured_violation_output_port(self) -> OutputPort:
-        """How far the measured pose is outside of the constraints, (1,)."""
+        """Return the port of the violation of the measured pose, (1,)."""
         return self._measured_violation_port
 
     def _violation(self, context: Context, pose: np.ndarray) -> float:
@@ -153,24 +154,25 @@ class ActiveConstraintProjector(LeafSystem):
         return self._template.violation(state, pose_to_transform(pose), self.frames.eval(context))
 
     def _calc_command(self, context: Context) -> np.ndarray:
-        """The command (6,), and 1 if it waits, else 0."""
+        """Return the command (6,) and, as the seventh number, the fallback flag."""
         value = context.get_discrete_state(self._last).value()
         last, measured = value[:6], value[6:]
         requested = self._requested_pose_port.Eval(context)
         if np.isfinite(requested).all() and np.isfinite(measured).all():
             desired = self._constrained(context, last, requested)
             tracking_error = math.dist(last[:3], measured[:3])
-            waits = tracking_error > self._max_tracking_error and math.dist(desired[:3], measured[:3]) >= tracking_error
-            if not waits and np.isfinite(desired).all():
+            reduces_error = math.dist(desired[:3], measured[:3]) < tracking_error
+            is_waiting = tracking_error > self._max_tracking_error and not reduces_error
+            if not is_waiting and np.isfinite(desired).all():
                 return np.array([*desired, 0.0])
-        # Only where it has to: projecting what is inside already would let it creep by rounding.
+        # Projecting a command that is inside already would let it creep by rounding.
         if self._violation(context, last) > INSIDE:
             inside = self._constrained(context, last, last)
             last = inside if np.isfinite(inside).all() else last
         return np.array([*last, 1.0])
 
     def _constrained(self, context: Context, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
-        """What the constraints and one period make of a request, (6,)."""
+        """Return the allowed pose (6,) for a request, reachable in one period."""
         command = self._template.command(
             int(self._state_port.Eval(context)[0]),
             pose_to_transform(last),
@@ -198,16 +200,16 @@ class ActiveConstraintProjector(LeafSystem):
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         measured = self._pose_port.Eval(context)
         if not np.isfinite(measured).all():
-            raise InputError(f"a template begins where the robot is: its measured pose must be finite, not {measured}")
+            raise InputError(f"a template begins at the robot's pose: the measured pose must be finite, not {measured}")
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
-        # Not the state port's value: that is decided at this same instant.
+        # Not the value of the state port, which is initialized at this same instant.
         state = self._template.state_at(X_WE, frames)
         command = self._template.command(state, X_WE, X_WE, frames, self._period)
         discrete_state.set_value(np.concatenate([transform_to_pose(command.X_WE), measured]))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
+        # No step has ended at time zero. An event offset of one period would not fall on k * period exactly.
         if context.get_time() > 0:
             command, measured = self._command.Eval(context)[:6], self._pose_port.Eval(context)
             discrete_state.set_value(np.concatenate([command, measured]))

@@ -1,4 +1,4 @@
-"""Maps a few inputs to a requested pose (thesis, equations 2.19 and 2.20)."""
+"""Input mapping of a shared control template (thesis, equations 2.19 and 2.20)."""
 
 from collections.abc import Mapping
 
@@ -13,12 +13,12 @@ from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class SctInputMapping(LeafSystem):
-    """Applies the input mapping of a shared control template's current state to a policy's or a person's inputs.
+    """Apply the input mapping of a template's current state to the inputs of a policy or a user.
 
         H^im = displace_q(H, map_q(u))    (equations 2.19 and 2.20)
 
-    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. An input that is not finite results
-    in a pose that is not finite, so that the projector behind it refuses it.
+    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. A NaN or infinite input results in a
+    NaN pose, which the `ActiveConstraintProjector` refuses.
 
     .. pydrake_system::
 
@@ -34,18 +34,19 @@ class SctInputMapping(LeafSystem):
     ``state`` is (1,), the number of the template's state.
 
     Attributes:
-        frames: the poses of the template's objects, which a reset can set.
+        frames: Parameters with the poses of the template's object frames, which a reset can set.
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
-        """
+        """Construct the system.
+
         Args:
-            template: the template.
-            frames: the poses of its objects by name, in the frame that poses are given in.
-            period: for which an input is held [s], positive.
+            template: The template.
+            frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+            period: Time for which an input is held [s], positive.
 
         Raises:
-            InputError: if the period is not positive, or a frame is missing or not finite.
+            InputError: If the period is not positive, or a frame is missing or not finite.
         """
         super().__init__()
         check_period(period)
@@ -68,19 +69,19 @@ class SctInputMapping(LeafSystem):
         )
 
     def get_action_input_port(self) -> InputPort:
-        """The inputs u of a policy or a person, (n,), in [−1, 1]."""
+        """Return the port of the inputs u of a policy or a user, (n,), in [−1, 1]."""
         return self._action_port
 
     def get_pose_input_port(self) -> InputPort:
-        """The pose H to displace, (6,)."""
+        """Return the port of the pose H to displace, (6,)."""
         return self._pose_port
 
     def get_state_input_port(self) -> InputPort:
-        """The number of the template's state, (1,)."""
+        """Return the port of the number of the template's state, (1,)."""
         return self._state_port
 
     def get_requested_pose_output_port(self) -> OutputPort:
-        """The requested pose H^im, (6,), not yet constrained."""
+        """Return the port of the requested pose H^im, (6,), not constrained."""
         return self._requested_pose_port
 
     def _calc_requested_pose(self, context: Context, output: BasicVector) -> None:

@@ -1,4 +1,4 @@
-"""The finite state machine of a shared control template (thesis, section 2.3)."""
+"""State machine of a shared control template (thesis, section 2.3)."""
 
 from collections.abc import Mapping
 
@@ -20,13 +20,13 @@ from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class SctStateMachine(LeafSystem):
-    """Runs the finite state machine of a shared control template, by its transition distances.
+    """Run the finite state machine of a shared control template.
 
-        q → q' where d_q < threshold of the transition to q',  q' → q where d_q > threshold + hysteresis
+        q → q' if d_q < threshold of the transition to q',  q' → q if d_q > threshold + hysteresis
 
-    (`SharedControlTemplate.next_state`), for the pose just before the control instant, and at most one transition at each. A transition
-    waits until one period leads from that pose into the next state's active constraints: so no command has to leave
-    them, however the template's states meet. An episode begins in the state that the initial pose is in.
+    (`SharedControlTemplate.next_state`), evaluated at every control instant for the pose just before it, with at most
+    one transition. A transition waits until one period leads from that pose into the next state's active constraints,
+    so that every command can satisfy them. An episode begins in the state of the initial pose.
 
     .. pydrake_system::
 
@@ -39,25 +39,25 @@ class SctStateMachine(LeafSystem):
         - transition_distance
         - progress
 
-    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians; the latter is measured, and read at
-    initialization, when a commanded ``pose`` may not be initialized yet. ``state`` is (1,), the number of the state,
-    and never feeds through. ``transition_distance`` is (1,), d_t of the current state in metres or radians.
-    ``progress`` is (1,) and rises as the distances fall, over all states on one scale: its increase is d_{t−1} − d_t of
-    equation 3.2.
+    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians. ``initial_pose`` is measured and
+    only read at initialization, when a commanded ``pose`` may not be initialized yet. ``state`` is (1,), the number of
+    the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_t of the current state in metres or
+    radians. ``progress`` is (1,), on one scale for all states: its increase is d_{t−1} − d_t of equation 3.2.
 
     Attributes:
-        frames: the poses of the template's objects, which a reset can set.
+        frames: Parameters with the poses of the template's object frames, which a reset can set.
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
-        """
+        """Construct the system.
+
         Args:
-            template: the template.
-            frames: the poses of its objects by name, in the frame that poses are given in.
-            period: between two control steps [s], positive.
+            template: The template.
+            frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+            period: Control period [s], positive.
 
         Raises:
-            InputError: if the period is not positive, or a frame is missing or not finite.
+            InputError: If the period is not positive, or a frame is missing or not finite.
         """
         super().__init__()
         check_period(period)
@@ -78,23 +78,23 @@ class SctStateMachine(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_pose_input_port(self) -> InputPort:
-        """The pose that the transition distances are measured from, (6,)."""
+        """Return the port of the pose at which transition distances are evaluated, (6,)."""
         return self._pose_port
 
     def get_initial_pose_input_port(self) -> InputPort:
-        """The measured pose, (6,): it determines the state in which an episode begins."""
+        """Return the port of the measured pose, (6,), which determines the first state of an episode."""
         return self._initial_pose_port
 
     def get_state_output_port(self) -> OutputPort:
-        """The number of the template's state, (1,)."""
+        """Return the port of the number of the template's state, (1,)."""
         return self._state_port
 
     def get_transition_distance_output_port(self) -> OutputPort:
-        """The current state's transition distance d_t, (1,) [m] or [rad]."""
+        """Return the port of the current state's transition distance d_t, (1,) [m] or [rad]."""
         return self._transition_distance_port
 
     def get_progress_output_port(self) -> OutputPort:
-        """The progress in the task, (1,), over all states on one scale."""
+        """Return the port of the progress in the task, (1,)."""
         return self._progress_port
 
     def _state_pose_frames(self, context: Context) -> tuple[int, RigidTransform, dict[str, RigidTransform]]:
@@ -113,7 +113,7 @@ class SctStateMachine(LeafSystem):
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
+        # No step has ended at time zero. An event offset of one period would not fall on k * period exactly.
         if context.get_time() > 0:
             state = self._template.next_state(*self._state_pose_frames(context), self._period)
             discrete_state.set_value([float(state)])

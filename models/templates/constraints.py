@@ -1,7 +1,8 @@
 """Active constraints: projections of the end effector's pose into an allowed set (thesis, equation 2.21).
 
 Each projection is idempotent: an allowed pose is returned unchanged. The constraints of a state are applied in the
-order of the file. Constraints on the orientation that depend on the position therefore come after those on the position.
+order of the file. A constraint on the orientation that depends on the position therefore comes after those on the
+position.
 """
 
 import math
@@ -169,7 +170,7 @@ class Box(PositionConstraint):
     @override
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
         inside = p_FE.tolist()
-        # Plain Python: NumPy is many times slower for three numbers, and each command evaluates a constraint repeatedly.
+        # Plain Python: NumPy is many times slower for three numbers, and each command evaluates this repeatedly.
         if all(low <= x <= high for low, x, high in zip(self.lower_m, inside, self.upper_m, strict=True)):
             return p_FE
         return np.clip(p_FE, self.lower_m, self.upper_m)

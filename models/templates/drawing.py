@@ -1,5 +1,6 @@
-"""A template's state machine, drawn: as Graphviz text for those who have it, as a picture for everyone."""
+"""Drawings of a template's state machine, as Graphviz text or as a picture."""
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,56 +12,60 @@ from guiderail.models.templates.template import SharedControlTemplate, TemplateS
 
 
 def state_lines(state: TemplateState) -> list[str]:
-    """What a state does, one short line a mapping, constraint and distance, in the order they apply."""
+    """Describe a state in short lines: its mappings, constraints and distance, in the order in which they apply."""
     mappings = [f"{type(m).__name__} ← {', '.join(f'u{i + 1}' for i in m.used_inputs)}" for m in state.input_mapping]
     constraints = [f"{i + 1}. {type(c).__name__}" for i, c in enumerate(state.active_constraints)]
     return [*mappings, *constraints, f"d: {type(state.transition_distance).__name__}"]
 
 
-def edges(template: SharedControlTemplate) -> list[tuple[str, str, str]]:
-    """(from, to, condition) of every transition, the ways back included."""
-    arrows = []
+def list_edges(template: SharedControlTemplate) -> list[tuple[str, str, str]]:
+    """Return (from, to, condition) of every transition, including returns."""
+    edges = []
     for state in template.states:
         unit = state.transition_distance.unit
-        scale = 1.0 if unit == "m" else 57.29577951308232
+        scale = 1.0 if unit == "m" else math.degrees(1.0)
         for transition in state.transitions:
-            arrows.append((state.name, transition.to, f"d < {scale * transition.below:.3g} {unit}"))
+            edges.append((state.name, transition.to, f"d < {scale * transition.below:.3g} {unit}"))
             if transition.hysteresis is not None:
                 back = scale * (transition.below + transition.hysteresis)
-                arrows.append((transition.to, state.name, f"d({state.name}) > {back:.3g} {unit}"))
-    return arrows
+                edges.append((transition.to, state.name, f"d({state.name}) > {back:.3g} {unit}"))
+    return edges
 
 
 def to_dot(template: SharedControlTemplate) -> str:
-    """The state machine in Graphviz's language."""
-    lines = [f"digraph {_quoted(template.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
+    """Return the state machine in Graphviz's language."""
+    lines = [f"digraph {_quote(template.name)} {{", "  rankdir=LR;", "  node [shape=box, style=rounded];"]
     for number, state in enumerate(template.states):
         label = "\n".join([state.name.upper(), *state_lines(state)])
         emphasis = ", penwidth=2" if number == template.initial_state else ""
-        lines.append(f"  {_quoted(state.name)} [label={_quoted(label)}{emphasis}];")
-    lines += [f"  {_quoted(start)} -> {_quoted(end)} [label={_quoted(said)}];" for start, end, said in edges(template)]
+        lines.append(f"  {_quote(state.name)} [label={_quote(label)}{emphasis}];")
+    lines += [f"  {_quote(a)} -> {_quote(b)} [label={_quote(condition)}];" for a, b, condition in list_edges(template)]
     return "\n".join([*lines, "}"]) + "\n"
 
 
-def _quoted(text: str) -> str:
-    """A name or a label in Graphviz's language, whatever a person called their states."""
+def _quote(text: str) -> str:
+    """Quote a name or a label for Graphviz."""
     escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
     return f'"{escaped}"'
 
 
 def draw(template: SharedControlTemplate, path: str | Path) -> None:
-    """Writes the state machine to a file: .dot or .gv as text, .png, .svg or .pdf as a picture."""
+    """Write the state machine to a .dot or .gv file as text, or to a .png, .svg or .pdf file as a picture.
+
+    Raises:
+        InputError: If the file has another ending.
+    """
     path = Path(path)
     if path.suffix in (".dot", ".gv"):
         path.write_text(to_dot(template), encoding="utf-8")
         return
     if path.suffix not in (".png", ".svg", ".pdf"):
         raise InputError(f"A state machine can't be drawn as {path.suffix or 'that'}; use .png, .svg, .pdf or .dot.")
-    drawn(template).savefig(path, dpi=120)
+    draw_figure(template).savefig(path, dpi=120)
 
 
-def drawn(template: SharedControlTemplate) -> "Figure":
-    """The state machine as a Matplotlib figure, which a notebook shows."""
+def draw_figure(template: SharedControlTemplate) -> "Figure":
+    """Return the state machine as a Matplotlib figure, for a notebook."""
     from matplotlib.figure import Figure
 
     width, gap = 1.8, 1.7
@@ -71,8 +76,8 @@ def drawn(template: SharedControlTemplate) -> "Figure":
     axes.set_axis_off()
     axes.set_xlim(-width / 2 - 0.2, (len(template.states) - 1) * (width + gap) + width / 2 + 0.2)
     axes.set_ylim(-1.4, 1.4)
-    plain: Any = {"parse_math": False}  # a name with a dollar is a name
-    where = {state.name: i * (width + gap) for i, state in enumerate(template.states)}
+    plain: Any = {"parse_math": False}  # a dollar sign in a name is no math
+    x = {state.name: i * (width + gap) for i, state in enumerate(template.states)}
     for number, state in enumerate(template.states):
         box = {
             "boxstyle": "round,pad=0.5",
@@ -81,15 +86,13 @@ def drawn(template: SharedControlTemplate) -> "Figure":
             "linewidth": 2.2 if number == template.initial_state else 1.0,
         }
         text = "\n".join([state.name.upper(), *state_lines(state)])
-        axes.text(
-            where[state.name], 0.0, text, ha="center", va="center", fontsize=8, linespacing=1.4, bbox=box, **plain
-        )
-    for start, end, condition in edges(template):
-        forward = where[end] > where[start]
+        axes.text(x[state.name], 0.0, text, ha="center", va="center", fontsize=8, linespacing=1.4, bbox=box, **plain)
+    for start, end, condition in list_edges(template):
+        forward = x[end] > x[start]
         side = 1.0 if forward else -1.0
         y = 0.25 * side
         left, right = (start, end) if forward else (end, start)
-        span = (where[left] + width / 2, where[right] - width / 2)
+        span = (x[left] + width / 2, x[right] - width / 2)
         axes.annotate(
             "",
             xy=(span[1] if forward else span[0], y),

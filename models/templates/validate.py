@@ -1,7 +1,7 @@
-"""What `guiderail check TEMPLATE.yaml` asks of a template, beyond what loading it refuses.
+"""Checks of a template that go beyond those of reading its file.
 
-The checks sample: they place the template's objects and the end effector at random near each other and look at what the
-laws do. A mistake that shows in one pose of a few hundred is found, a rarer one may not be.
+The checks place the template's objects and the end effector at random near each other and evaluate the template's laws.
+They find a fault that shows in one pose of a few hundred; a rarer one may remain.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,65 +14,65 @@ from scipy.spatial.transform import Rotation
 from guiderail.models.templates.geometry import Frames, angle_between
 from guiderail.models.templates.template import SharedControlTemplate
 
-SAMPLES = 200
-REACH = 0.6  # [m] how far from an object poses are sampled
+SAMPLES = 200  # poses of the end effector
+REACH = 0.6  # largest distance of a sampled pose from an object [m]
 TOLERANCE = 1e-9  # [m or rad]
-GREEDY_STEPS = 400
+GREEDY_STEPS = 400  # steps of a search for a transition
 GREEDY_PERIOD = 0.05  # [s]
 CONTROL_PERIOD = 0.01  # [s]
-ARRIVALS = 5  # at each transition
+ARRIVALS = 5  # approaches of each transition
 
 Scenes = Sequence[tuple[RigidTransform, Frames]]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong, or odd."""
+    """An error, or a remark."""
 
     is_error: bool
     message: str
 
 
 def validate(template: SharedControlTemplate, seed: int = 0) -> list[Finding]:
-    """Everything that was found, errors first."""
+    """Return the errors and remarks about a template, errors first."""
     rng = np.random.default_rng(seed)
-    scenes = [_scene(template, rng) for _ in range(SAMPLES)]
+    scenes = [_sample_scene(template, rng) for _ in range(SAMPLES)]
     findings = [
-        *_unused(template),
-        *_unreachable(template),
-        *_constraints(template, scenes),
-        *_transitions(template, scenes, rng),
-        *_jumps(template, scenes),
+        *_find_unused(template),
+        *_find_unreachable(template),
+        *_check_constraints(template, scenes),
+        *_check_transitions(template, scenes),
+        *_check_arrivals(template, scenes),
     ]
     return sorted(findings, key=lambda finding: not finding.is_error)
 
 
-def _scene(
+def _sample_scene(
     template: SharedControlTemplate, rng: np.random.Generator
 ) -> tuple[RigidTransform, dict[str, RigidTransform]]:
-    """An end effector at random near upright objects that stand at random."""
+    """Return a random pose of the end effector near upright objects at random poses."""
     frames = {}
     for name in template.frames:
         yaw = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
         frames[name] = RigidTransform(yaw, rng.uniform(-0.3, 0.3, 3))
     X_WF = frames[template.frames[rng.integers(len(frames))]] if frames else RigidTransform()
-    # As many poses near as far: constraints are closest to each other near an object.
+    # Uniform in the distance: constraints are closest to each other near an object.
     p_FE = rng.normal(size=3)
     p_FE *= REACH * rng.uniform() / np.linalg.norm(p_FE)
     R_FE = RotationMatrix(Rotation.random(rng=rng).as_matrix())
     return RigidTransform(X_WF.rotation() @ R_FE, X_WF @ p_FE), frames
 
 
-def _unused(template: SharedControlTemplate) -> Iterator[Finding]:
+def _find_unused(template: SharedControlTemplate) -> Iterator[Finding]:
     used = {i for state in template.states for mapping in state.input_mapping for i in mapping.used_inputs}
     for i in sorted(set(range(template.inputs)) - used):
-        yield Finding(False, f"input {i} moves nothing in any state; lower `inputs` or map it")
+        yield Finding(False, f"input {i} has no effect in any state; lower `inputs` or map it")
     named = {frame for state in template.states for frame in state.frame_names}
     for frame in sorted(set(template.frames) - named):
-        yield Finding(False, f"the frame {frame} is never used; leave it out")
+        yield Finding(False, f"the frame {frame} is never used; remove it")
 
 
-def _unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
+def _find_unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
     reached, waiting = set(), [template.initial_state]
     while waiting:
         number = waiting.pop()
@@ -81,11 +81,11 @@ def _unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
             waiting += [template.index(transition.to) for transition in template.states[number].transitions]
     for number, state in enumerate(template.states):
         if number not in reached:
-            yield Finding(True, f"no transition leads to the state {state.name}; add one, or leave the state out")
+            yield Finding(True, f"no transition leads to the state {state.name}; add one, or remove the state")
 
 
-def _constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
-    """Each constraint idempotent; their sequence too, and inside every one of them."""
+def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+    """Check that each constraint and their sequence are idempotent, and that the sequence satisfies all of them."""
     for number, state in enumerate(template.states):
         for i, constraint in enumerate(state.active_constraints):
             name = f"{state.name}: active constraint {i + 1} ({type(constraint).__name__})"
@@ -113,15 +113,15 @@ def _constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Fi
 
 
 def _difference(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
-    """The larger of metres and radians between two poses."""
+    """Return the distance of two poses, the larger of [m] and [rad]."""
     return max(
         float(np.linalg.norm(X_WA.translation() - X_WB.translation())),
         angle_between(X_WA.rotation(), X_WB.rotation()),
     )
 
 
-def _transitions(template: SharedControlTemplate, scenes: Scenes, rng: np.random.Generator) -> Iterator[Finding]:
-    """Some inputs, from some pose inside a state's constraints, bring its distance below every threshold."""
+def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+    """Check that inputs can lead from a pose inside a state's constraints to each of its transitions."""
     for number, state in enumerate(template.states):
         goals = [(f"the transition to {t.to}", t.below) for t in state.transitions]
         goals = goals or [("the end", state.ends_at + TOLERANCE)]
@@ -130,7 +130,7 @@ def _transitions(template: SharedControlTemplate, scenes: Scenes, rng: np.random
             ((template.project(number, X, frames), frames) for X, frames in scenes),
             key=lambda start: template.distance(number, *start),
         )
-        # From the nearest pose, and from where a phase begins: either proves that the distance can get there.
+        # From the nearest pose and from several others: one success proves that the threshold can be reached.
         best = np.inf
         for X, frames in [starts[0], *starts[len(starts) // 2 :: len(starts) // 8]]:
             best = min(best, _greedy(template, number, X, frames, lowest)[0])
@@ -146,7 +146,7 @@ def _transitions(template: SharedControlTemplate, scenes: Scenes, rng: np.random
                     True, f"{state.name}: {goal} never fires: {why} (nearest {best:.3g}, threshold {threshold:.3g})"
                 )
         if all(template.distance(number, X, frames) < lowest for X, frames in starts):
-            yield Finding(False, f"{state.name}: every pose is below the threshold; the state is left at once")
+            yield Finding(False, f"{state.name}: every pose is below the threshold; the state is left immediately")
 
 
 def _greedy(
@@ -157,7 +157,7 @@ def _greedy(
     enough: float,
     period: float = GREEDY_PERIOD,
 ) -> tuple[float, RigidTransform]:
-    """The least distance that the single input that lowers it most, chosen anew at every step, reaches, and where."""
+    """Return the least distance, and its pose, that a greedy choice of one full input at every step reaches."""
     candidates = [sign * row for row in np.eye(template.inputs) for sign in (1.0, -1.0)]
     best = template.distance(number, X_WE, frames)
     for _ in range(GREEDY_STEPS):
@@ -175,8 +175,8 @@ def _greedy(
     return best, X_WE
 
 
-def _jumps(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
-    """Where a transition is due, one control step leads into the next state's constraints; otherwise it waits."""
+def _check_arrivals(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+    """Check that a due transition does not wait: one control step must lead into the next state's constraints."""
     reach = GREEDY_PERIOD * max(template.max_speed_m_per_s, template.max_speed_rad_per_s)
     for number, state in enumerate(template.states):
         inside = [(template.project(number, X, frames), frames) for X, frames in scenes]
@@ -184,7 +184,7 @@ def _jumps(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]
             target, arrived, waiting, worst = template.index(transition.to), 0, 0, 0.0
             before = [start for start in inside if template.distance(number, *start) >= transition.below]
             for X, frames in before[:ARRIVALS]:
-                # Slowly where it comes near, or it would arrive farther beyond the threshold than a control step leads.
+                # The last part at the control period: a longer step would overshoot the threshold.
                 _, X_WE = _greedy(template, number, X, frames, transition.below + reach)
                 distance, X_WE = _greedy(template, number, X_WE, frames, transition.below, CONTROL_PERIOD)
                 if distance < transition.below:

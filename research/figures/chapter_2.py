@@ -5,7 +5,7 @@ from typing import Any
 
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring.options import make_template
-from guiderail.models.templates.drawing import draw, edges, state_lines
+from guiderail.models.templates.drawing import draw, list_edges, state_lines
 from guiderail.tools.tables import write_table
 
 
@@ -14,7 +14,7 @@ def figure_2_2(out: Path) -> dict[str, Any]:
     template = make_template(PouringConfig())
     rows = []
     for state in template.states:
-        following = [f"{to} where {condition}" for start, to, condition in edges(template) if start == state.name]
+        following = [f"{to} where {condition}" for start, to, condition in list_edges(template) if start == state.name]
         lines = "; ".join(state_lines(state))
         rows.append({"state": state.name, "what it does": lines, "goes on to": "; ".join(following)})
     picture = out / "figure_2_2.png"

@@ -1,4 +1,4 @@
-"""The poses of a template's objects, as parameters that a reset can set."""
+"""Poses of a template's objects as numeric parameters of a system."""
 
 from collections.abc import Mapping
 
@@ -13,21 +13,22 @@ from guiderail.systems.support.caching import declare_cache
 
 
 class TemplateFrames:
-    """Declares the frames of a template as numeric parameters of a LeafSystem, and returns them as poses.
+    """Object frames of a template, declared as numeric parameters of a LeafSystem.
 
-    They are parameters and not inputs because they are constant during an episode: a guidance diagram keeps the ports
-    that all guidance has, and a reset moves an object by `set`.
+    They are parameters because they are constant during an episode: a guidance diagram has the same ports as all
+    guidance, and a reset moves an object with `set`.
     """
 
     def __init__(self, system: LeafSystem, template: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
-        """
+        """Declare the parameters.
+
         Args:
-            system: the system that has the parameters; its outputs depend on `ticket`.
-            template: whose frames they are.
-            frames: their default poses, one for each name.
+            system: System that gets the parameters; its outputs depend on `ticket`.
+            template: Template with the frames.
+            frames: Default poses, one for each frame's name.
 
         Raises:
-            InputError: if a frame of the template is missing or not finite.
+            InputError: If a frame of the template is missing or not finite.
         """
         missing = [name for name in template.frames if name not in frames]
         if missing:
@@ -42,23 +43,23 @@ class TemplateFrames:
 
     @property
     def ticket(self) -> DependencyTicket:
-        """What is computed from the frames depends on this."""
+        """Dependency ticket of values computed from the frames."""
         return self._cache.ticket()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the frames."""
+        """Names of the frames."""
         return self._names
 
     def eval(self, context: Context) -> dict[str, RigidTransform]:
-        """The poses by name; `context` is the system's."""
+        """Return the poses by name; `context` is that of the system."""
         return self._cache.Eval(context)
 
     def set(self, context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Moves frames in the system's context; those that are not named stay where they are.
+        """Set the poses of some frames in the system's context; other frames do not move.
 
         Raises:
-            InputError: if the template has no such frame, or a pose is not finite.
+            InputError: If the template has no such frame, or a pose is not finite.
         """
         for name, X_WF in frames.items():
             if name not in self._names:
