@@ -1,4 +1,4 @@
-"""Figures and a table of the thesis, made anew: each a picture and a table with the numbers behind it."""
+"""Figures and tables of the thesis, each reproduced as a picture and a table with its numbers."""
 
 import inspect
 import json
@@ -14,7 +14,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.files import write_atomically
 from research.figures.thesis import THESIS
 
-# What makes each figure; imported when asked for, so that a list of figures costs nothing.
+# Function of each figure, in the module of its chapter; imported on use, so that listing figures is fast.
 FIGURES = {
     **{f"table {n}": f"table_{n.replace('.', '_')}" for n in ("3.2", "3.3", "4.1")},
     "2.2": "figure_2_2",
@@ -25,21 +25,20 @@ FIGURES = {
 
 
 def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: Path = Path("reproductions")) -> dict:
-    """Makes one figure or table.
+    """Reproduce one figure or table.
 
     Args:
-        figure: its number in the thesis, such as "4.2" or "table 3.3".
-        seeds: runs of each method, where the figure is about learning.
-        episodes: of each run; the figure's own number unless given.
-        out: where pictures, tables and runs go. Runs that are there and finished are used again, so that figures which
-            share runs share them.
+        figure: Its number in the thesis, such as "4.2" or "table 3.3".
+        seeds: Runs of each method, for figures that train.
+        episodes: Episodes of each run; the figure's own number by default.
+        out: Folder of pictures, tables and runs. Finished runs in it are reused, also by other figures.
 
     Returns:
-        `figure`, `picture`, `table`, what the numbers say, claim by claim, and what the thesis says. That is also left
-        as JSON beside the table, with the command and the time it took, for `guiderail results`.
+        `figure`, `picture`, `table`, the figure's own results, and what the thesis shows. The same is written as JSON
+        next to the table, with the command and its duration, for `python -m research.results`.
 
     Raises:
-        InputError: for an unknown figure or a number out of range.
+        InputError: For an unknown figure or a number out of range.
     """
     number = figure.lower().removeprefix("figure").strip()
     if number not in FIGURES:
@@ -49,27 +48,27 @@ def reproduce(figure: str, *, seeds: int = 3, episodes: int | None = None, out: 
     if out.exists() and not out.is_dir():
         raise InputError(f"{out} is a file: name a folder with --out")
     make = find_figure(number)
-    given: dict[str, Any] = {"seeds": seeds, "episodes": episodes}
-    taken = inspect.signature(make).parameters
-    given = {k: v for k, v in given.items() if k in taken and v is not None}
+    accepted = inspect.signature(make).parameters
+    options: dict[str, Any] = {"seeds": seeds, "episodes": episodes}
+    options = {name: value for name, value in options.items() if name in accepted and value is not None}
     started = time.perf_counter()
-    found = {"figure": number, **make(out, **given), "the thesis": THESIS[number]}
-    left = {
-        "command": " ".join([command_of(number), *(f"--{key} {value}" for key, value in given.items())]),
+    result = {"figure": number, **make(out, **options), "the thesis": THESIS[number]}
+    record = {
+        "command": " ".join([figure_command(number), *(f"--{name} {value}" for name, value in options.items())]),
         "seconds": round(time.perf_counter() - started, 1),
-        "seeds": given.get("seeds"),
-        **found,
+        "seeds": options.get("seeds"),
+        **result,
     }
-    write_atomically(out / f"{FIGURES[number]}.json", json.dumps(left, indent=1, default=str).encode() + b"\n")
-    return found
+    write_atomically(out / f"{FIGURES[number]}.json", json.dumps(record, indent=1, default=str).encode() + b"\n")
+    return result
 
 
-def command_of(number: str) -> str:
-    """The command that makes a figure as it is."""
-    return f"guiderail reproduce {shlex.quote(number)}"
+def figure_command(number: str) -> str:
+    """Return the command that makes a figure with its defaults."""
+    return f"python -m research.figures {shlex.quote(number)}"
 
 
 def find_figure(number: str) -> Callable[..., dict[str, Any]]:
-    """What makes a figure: a function of the module of its chapter."""
+    """Return the function that makes a figure."""
     chapter = number.removeprefix("table ").split(".")[0]
     return getattr(import_module(f"research.figures.chapter_{chapter}"), FIGURES[number])

@@ -1,3 +1,5 @@
+"""Differences between configurations and the thesis."""
+
 from dataclasses import replace
 
 import pytest
@@ -8,25 +10,25 @@ from guiderail.diagrams.stations.disturbances import Disturbances
 from guiderail.diagrams.stations.registry import stations_for
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.tools.learning.train import configure, with_defaults
-from research.thesis import HISTORY, NEUTRAL, THESIS, differences
+from research.thesis import HISTORY, NEUTRAL, THESIS, describe_differences
 
 
-def told(task, environment=None, **given):
-    return differences(configure(task, environment or {}, **with_defaults(task, given)))
+def differences_of(task, environment=None, **given):
+    return describe_differences(configure(task, environment or {}, **with_defaults(task, given)))
 
 
-def test_every_option_that_is_compared_is_one_of_its_task():
+def test_thesis_options_exist_and_take_the_values_of_the_thesis():
     for task, setting in THESIS.items():
         known = configure(task, {}).environment
         for name, values in setting.options.items():
             assert name in known, f"{task} has no option {name}"
             for value in values:
-                assert configure(task, {name: value}).environment[name] == value, "the thesis's value can be had"
+                assert configure(task, {name: value}).environment[name] == value
 
 
-def test_all_tasks_of_ours_are_in_the_thesis_and_others_are_said_not_to_be(bead_config):
+def test_thesis_has_every_shipped_task_and_names_others_as_missing(bead_config):
     assert {name for name in TASKS.names() if TASKS.get(name).__module__.startswith("guiderail.")} == set(THESIS)
-    assert differences(bead_config) == ["it has no task Bead"]
+    assert describe_differences(bead_config) == ["it has no task Bead"]
 
 
 AS_PRINTED = {
@@ -35,32 +37,30 @@ AS_PRINTED = {
 }  # fmt: skip
 
 
-def test_the_connector_as_the_thesis_has_it_differs_only_in_what_cannot_be_had():
-    words = told("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
+def test_printed_connector_settings_differ_in_remarks_only():
+    words = differences_of("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
     assert all("thesis: " in one for one in words)
     assert not any(one.startswith(("control steps", "ρ", "learning rate", "gamma", "station")) for one in words)
     assert any(one.startswith("simulated") for one in words)
-    command_timed_out = [
-        holds(configure("BncConnector", AS_PRINTED).environment) for _, holds in THESIS["BncConnector"].remarks
-    ]
-    assert len(words) == sum(command_timed_out)
+    applies = [holds(configure("BncConnector", AS_PRINTED).environment) for _, holds in THESIS["BncConnector"].remarks]
+    assert len(words) == sum(applies)
 
 
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
         ({"reward": "shaped"}, "reward shaped (thesis: sparse)"),
-        ({"action_repeat": 10}, "control steps of a decision 10 (thesis: 1)"),
-        ({"action_dims": (0, 1)}, "explored outputs 0, 1 (thesis: all)"),
+        ({"action_repeat": 10}, "control steps of an action 10 (thesis: 1)"),
+        ({"action_dims": (0, 1)}, "action dims 0, 1 (thesis: all)"),
         ({"history_variance": 1e-11}, "ρ = 1e-11 (thesis: 1e-08)"),
-        ({"history_source": "commanded"}, "history of poses that were commanded (thesis: measured)"),
-        ({"fixture_offset": "per_episode"}, "uncertainty disc (thesis: calibration)"),
-        ({"station": "gantry"}, "station rails (thesis: arm)"),
+        ({"history_source": "commanded"}, "history of poses: commanded (thesis: measured)"),
+        ({"fixture_offset": "per_episode"}, "fixture offset per_episode (thesis: per_run)"),
+        ({"station": "gantry"}, "station gantry (thesis: arm)"),
     ],
 )
-def test_each_option_that_differs_is_named_with_both_values(changed, words):
-    before = told("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
-    after = told("BncConnector", AS_PRINTED | changed, algorithm="tqc", preset="table_4_1_robot")
+def test_option_difference_is_described_with_both_values(changed, words):
+    before = differences_of("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
+    after = differences_of("BncConnector", AS_PRINTED | changed, algorithm="tqc", preset="table_4_1_robot")
     assert set(after) - set(before) == {words}
 
 
@@ -71,11 +71,11 @@ OTHER_VALUES = {
     "mug_error_least": 0.01, "mug_inner_diameter": 0.09, "mug_depth": 0.1, "demonstrations": "search",
 }  # fmt: skip
 TOGETHER = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}
-"""What an option of that name needs beside it, for a value that the thesis does not have."""
+"""Further options that an option needs to take a value that the thesis does not have."""
 
 
 def _another(task, name, field, default):
-    """A value of an option that differs from the thesis if its default does not, and the other way round."""
+    """Return a value that differs from the thesis if the default does not, and vice versa."""
     if name in OTHER_VALUES:
         return OTHER_VALUES[name]
     theirs = THESIS[task].options.get(name, (default,))
@@ -100,7 +100,7 @@ def _another(task, name, field, default):
 
 
 def _options():
-    """Every option of every task, once for each guidance, at the station that it is used at first."""
+    """Yield every option of every task, guidance and station."""
     for task in THESIS:
         declared = TASKS.get(task)
         for guidance in possible_guidance(declared.provides()):
@@ -110,20 +110,24 @@ def _options():
                         yield task, guidance, station, name, field
 
 
-def test_every_option_that_is_not_as_usual_is_named_unless_it_is_neutral():
+def test_every_non_default_option_is_described_unless_neutral():
     checked = set()
     for task, guidance, station, name, field in _options():
-        nothing_said = name in (*NEUTRAL, "station") or (name in HISTORY and guidance != "skgrl")
-        if nothing_said or (task, guidance, name) in checked or (task, name) == ("Pouring", "reward"):
+        is_skipped = name in (*NEUTRAL, "station") or (name in HISTORY and guidance != "skgrl")
+        if is_skipped or (task, guidance, name) in checked or (task, name) == ("Pouring", "reward"):
             continue
         usual = configure(task, {"guidance": guidance, "station": station})
         value = _another(task, name, field, usual.environment[name])
         if value is None:
-            assert name in ("reward", "observation"), f"a value of {name} that is not as usual is needed here"
+            assert name in ("reward", "observation"), f"add a non-default value of {name} here"
             continue
         beside = {"guidance": guidance, "station": station} | TOGETHER.get(name, {})
         before, after = configure(task, beside), configure(task, beside | {name: value})
-        assert set(differences(after, learns=False)) != set(differences(before, learns=False)), (task, guidance, name)
+        assert set(describe_differences(after, learns=False)) != set(describe_differences(before, learns=False)), (
+            task,
+            guidance,
+            name,
+        )
         checked.add((task, guidance, name))
     assert {name for task, _, name in checked if task == "BncConnector"} >= set(Disturbances.model_fields)
 
@@ -140,69 +144,71 @@ def test_every_option_that_is_not_as_usual_is_named_unless_it_is_neutral():
         ("NarrowPassage", {"second_obstacle": True}, "second obstacle yes (default: no)"),
     ],
 )
-def test_what_is_not_as_usual_is_named_with_what_is_usual(task, given, words):
-    assert words in told(task, given)
+def test_non_default_option_is_described_with_its_default(task, given, words):
+    assert words in differences_of(task, given)
 
 
 @pytest.mark.parametrize("task", THESIS)
-def test_what_a_difficulty_stands_for_is_one_statement(task):
-    words = told(task, {"difficulty": "hard"})
+def test_difficulty_is_described_once(task):
+    words = differences_of(task, {"difficulty": "hard"})
     assert sum("difficulty" in one for one in words) == 1
     assert not any("default:" in one for one in words)
 
 
-def test_kgrl_has_no_history_to_differ_in():
-    assert not any("ρ" in one or "history" in one for one in told("BncConnector", {"guidance": "kgrl"}))
+def test_history_is_not_compared_when_guidance_is_kgrl():
+    assert not any("ρ" in one or "history" in one for one in differences_of("BncConnector", {"guidance": "kgrl"}))
 
 
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
         ({"greedy_episode_fraction": 0.8}, "80% of the episodes are greedy"),
-        ({"symmetry": True}, "seen from other sides"),
+        ({"symmetry": True}, "symmetry data augmentation"),
         ({"selection_window": 8}, "checkpoint selection"),
         ({"learning_rate": 3e-4}, "learning rate 0.0003 (thesis: 0.001)"),
-        ({"gamma": 0.99}, "discount of a control step 0.99 (thesis: 0.995)"),
-        ({"n_steps": 3}, "returns are of 3 decisions"),
+        ({"gamma": 0.99}, "gamma of a control step 0.99 (thesis: 0.995)"),
+        ({"n_steps": 3}, "3-step returns"),
     ],
 )
-def test_each_setting_of_the_learner_that_differs_is_named(setting, words):
+def test_learner_setting_difference_is_described(setting, words):
     config = configure("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
     changed = replace(config, learner=replace(config.learner, **setting))
-    (added,) = set(differences(changed)) - set(differences(config))
+    (added,) = set(describe_differences(changed)) - set(describe_differences(config))
     assert words in added
 
 
 @pytest.mark.parametrize(
     ("task", "guidance", "sides"), [("BncConnector", "kgrl", 1), ("NarrowPassage", "kgrl", 0), ("GridClamp", "sct", 0)]
 )
-def test_other_sides_are_named_where_there_are_any(task, guidance, sides):
-    words = told(task, {"guidance": guidance}, algorithm="tqc", preset="tqc_contact")
-    assert sum("seen from other sides" in one for one in words) == sides
+def test_symmetry_is_described_when_the_task_has_one(task, guidance, sides):
+    words = differences_of(task, {"guidance": guidance}, algorithm="tqc", preset="tqc_contact")
+    assert sum("symmetry data augmentation" in one for one in words) == sides
 
 
-def test_a_discount_means_the_same_whatever_an_action_lasts():
-    words = told("BncConnector", {**AS_PRINTED, "action_repeat": 10}, algorithm="tqc", preset="table_4_1_robot")
+def test_gamma_is_compared_per_control_step():
+    words = differences_of(
+        "BncConnector", {**AS_PRINTED, "action_repeat": 10}, algorithm="tqc", preset="table_4_1_robot"
+    )
     assert not any("gamma" in one for one in words)
 
 
-def test_pouring_names_its_weights_and_its_speed():
-    assert any("equation 3.7 are weighted" in one for one in told("Pouring"))
-    sparse = told("Pouring", {"reward": "sparse"})
+def test_pouring_remarks_depend_on_reward():
+    assert any("weights in equation 3.7" in one for one in differences_of("Pouring"))
+    sparse = differences_of("Pouring", {"reward": "sparse"})
     assert any("1.7 times" in one for one in sparse)
     assert not any("equation 3.7" in one for one in sparse)
 
 
-def test_the_connectors_dimensions_are_the_runs_own():
-    told = " ".join(differences(configure("BncConnector", {"difficulty": "hard"})))
-    assert "chamfer of 0.1 mm" in told
-    assert "difficulty 'hard', which is ours" in told
-    assert "difficulty" not in " ".join(differences(configure("BncConnector", {})))
+def test_connector_remarks_have_the_dimensions_of_the_run():
+    text = " ".join(describe_differences(configure("BncConnector", {"difficulty": "hard"})))
+    assert "chamfer of 0.1 mm" in text
+    assert "difficulty 'hard', added here" in text
+    assert "difficulty" not in " ".join(describe_differences(configure("BncConnector", {})))
 
 
-def test_who_does_not_learn_differs_in_no_setting_of_a_learner():
+def test_learner_is_not_compared_when_nothing_is_trained():
     config = configure("Pouring", {"difficulty": "hard"}, algorithm="tqc", preset="tqc_contact")
-    without = differences(config, learns=False)
-    assert set(without) < set(differences(config))
+    without = describe_differences(config, learns=False)
+    assert set(without) < set(describe_differences(config))
     assert not any("learning rate" in one or "hidden units" in one for one in without)
     assert any("difficulty" in one for one in without)

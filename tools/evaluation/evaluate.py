@@ -25,7 +25,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.tables import read_table, table_text
 from guiderail.tools.visualization.style import is_demonstrated
-from research.thesis import differences
+from research.thesis import describe_differences
 
 CALIBRATION = "per_run"  # the uncertainty under which a run hides an offset of its own
 HELD_OUT_SEED = 1_000_000  # of the first held-out episode
@@ -179,7 +179,7 @@ def evaluate(
         "seed": seed,
         "episodes_to_convergence": episodes_to_convergence(trained),
         "trained_episodes": len(trained),
-        "differs_from_thesis": differences(replace(config, environment=where)),
+        "differs_from_thesis": describe_differences(replace(config, environment=where)),
     }
 
 

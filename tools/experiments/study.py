@@ -44,7 +44,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail.tools.learning.train import configure, with_defaults
 from guiderail.tools.tables import write_table
-from research.thesis import differences
+from research.thesis import describe_differences
 
 BEST_CONSTANT = "best_constant"
 SELECTION_EPISODES = 10  # of each constant, not held out, before the best one is judged
@@ -205,7 +205,7 @@ def differing(study: Study) -> dict[str, list[str]]:
 def differences_of(study: Study, method: str) -> list[str]:
     """In what a method differs from the thesis, in words; without a learner's settings where nobody learns."""
     job = Job(study, method, study.seeds[0], Path())
-    return differences(job.config(job.after_episodes[-1]), learns=job.learns)
+    return describe_differences(job.config(job.after_episodes[-1]), learns=job.learns)
 
 
 def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:

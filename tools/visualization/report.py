@@ -23,7 +23,7 @@ from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.tables import cell
 from guiderail.tools.visualization import report_figures as figures
 from guiderail.tools.visualization.report_data import LEARNED, Gathered, Run, command, finite, flat, gather
-from research.thesis import differences
+from research.thesis import describe_differences
 
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
@@ -214,7 +214,7 @@ def _source(safety: dict[str, list[dict[str, Any]]]) -> str:
 def _differences(methods: dict[str, list[Run]]) -> list[dict[str, Any]]:
     """What all methods differ in from the thesis, and then what single ones do."""
     told = {
-        name: list(dict.fromkeys(w for run in runs for w in differences(run.config))) for name, runs in methods.items()
+        name: list(dict.fromkeys(w for run in runs for w in describe_differences(run.config))) for name, runs in methods.items()
     }
     first = next(iter(told.values()))
     common = [words for words in first if all(words in others for others in told.values())]

@@ -1,0 +1,42 @@
+"""Command line of the pages of results."""
+
+from pathlib import Path
+
+from guiderail.tools.files import write_atomically
+from research.command import Parser, run_program
+from research.results.methods import readme_table, update_readme
+from research.results.page import store, write_pages
+
+TABLES = Path(__file__).parent
+ROOT = TABLES.parents[1]
+
+
+def main(arguments: list[str]) -> None:
+    """Run the program."""
+    parser = Parser(
+        "results",
+        "Store the tables of finished studies and figures, and write the pages of results. Without --out these are "
+        "research/results, docs/results and the table in README.md.",
+        "studies reproductions",
+    )
+    parser.add_argument(
+        "folders",
+        type=Path,
+        nargs="*",
+        metavar="FOLDER",
+        help="folder of finished studies or figures; without one the pages are written from what is stored",
+    )
+    parser.add_argument("--out", type=Path, help="folder of tables and pages instead")
+    given = parser.parse_args(arguments)
+    tables = given.out or TABLES
+    store(given.folders, tables)
+    for page in write_pages(tables, given.out or ROOT / "docs" / "results"):
+        print(page)
+    if given.out is None:
+        readme = ROOT / "README.md"
+        write_atomically(readme, update_readme(readme.read_text("utf-8"), readme_table(tables)).encode())
+        print(readme)
+
+
+if __name__ == "__main__":
+    run_program(main)

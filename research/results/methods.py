@@ -1,0 +1,347 @@
+"""Methods of every task in one table, and the table of the README."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.tables import read_table
+
+COLUMNS = (
+    "method", "training episodes (seeds)", "held-out success [%], each seed of 100", "episodes to convergence",
+    "max. commanded violation", "peak force held out (in training) [N]",
+)  # fmt: skip
+README_COLUMNS = (
+    "task (hard)", "guided [%]", "residual RL [%]", "scripted / random [%]", "training episodes",
+    "over-force, guided / residual",
+)  # fmt: skip
+BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
+BASELINES = ("demonstration alone", "uniform random actions", "best constant action", "scripted policy")
+NO_DEMONSTRATION = ("zero action", *BASELINES[1:])  # a template has no demonstration
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method of a study.
+
+    Attributes:
+        name: Name in the table.
+        study: Study that has its results.
+        method: Its name in the study.
+        eval_set: Evaluation set, if the study has several.
+    """
+
+    name: str
+    study: str
+    method: str
+    eval_set: str | None = None
+
+
+@dataclass(frozen=True)
+class Section:
+    """Methods that were trained and evaluated under the same conditions.
+
+    Attributes:
+        title: Title of the table.
+        rows: Methods, guided ones first.
+        guided: Names of the guided methods that the README's table has; empty if it leaves the section out.
+    """
+
+    title: str
+    rows: Sequence[Row]
+    guided: Sequence[str] = ()
+
+
+def _baselines(
+    study: str, methods: Sequence[str], eval_set: str | None = None, names: Sequence[str] = BASELINES
+) -> list[Row]:
+    return [Row(name, study, method, eval_set) for name, method in zip(names, methods, strict=True)]
+
+
+_ALL = ("demonstration", "uniform_random", "best_constant", "scripted")
+_ALL_ZERO = ("zero", "uniform_random", "best_constant", "scripted")
+_NOT_CONSTANT = ("demonstration", "uniform_random", "scripted")
+_NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
+
+SECTIONS: dict[str, list[Section]] = {
+    "BncConnector": [
+        Section(
+            "Connector, hard",
+            [
+                Row("KGRL", "connector_hard", "kgrl"),
+                Row("sKGRL, adaptive history", "connector_hard", "skgrl_adaptive"),
+                Row("sKGRL", "connector_hard", "skgrl"),
+                Row("residual RL", "connector_hard", "residual"),
+                Row("safe residual RL", "connector_hard", "safe_residual"),
+                Row("residual RL with a larger action scale", "connector_hard", "residual_far"),
+                *_baselines("connector_hard_nulls", _ALL),
+            ],
+            guided=("KGRL", "sKGRL, adaptive history"),
+        ),
+        Section(
+            "Connector, hard, trained with a finer contact model in Drake, evaluated in MuJoCo",
+            [
+                Row("KGRL", "connector_hard_fine", "kgrl", "MuJoCo"),
+                Row("KGRL, randomized contact", "connector_hard_fine", "kgrl_randomized", "MuJoCo"),
+                Row("sKGRL, adaptive history", "connector_hard_fine", "skgrl_adaptive", "MuJoCo"),
+                Row("residual RL", "connector_hard_fine", "residual", "MuJoCo"),
+                *_baselines("connector_hard_fine", _NOT_CONSTANT, "MuJoCo", _NAMES_NOT_CONSTANT),
+            ],
+            guided=("KGRL", "sKGRL, adaptive history"),
+        ),
+        Section(
+            "Connector, hard, commands within 2.8 mm",
+            [
+                Row("KGRL", "connector_hard_safety", "kgrl"),
+                Row("sKGRL, adaptive history", "connector_hard_safety", "skgrl_adaptive"),
+                Row("residual RL", "connector_hard_safety", "residual"),
+                Row("safe residual RL", "connector_hard_safety", "safe_residual"),
+                *_baselines("connector_hard_safety", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
+            ],
+        ),
+        Section(
+            "Connector, a hidden offset per run",
+            [
+                Row("KGRL", "connector", "kgrl"),
+                Row("sKGRL", "connector", "skgrl"),
+                Row("residual RL", "connector_guidance", "residual"),
+                *_baselines("connector_nulls", _ALL, "per_run"),
+            ],
+            guided=("KGRL", "sKGRL"),
+        ),
+        Section(
+            "Connector, a hidden offset per episode",
+            [
+                Row("KGRL", "connector_disc", "kgrl"),
+                Row("sKGRL", "connector_disc", "skgrl"),
+                *_baselines("connector_nulls", _ALL, "per_episode"),
+            ],
+        ),
+        Section(
+            "Connector, with every setting of the thesis",
+            [
+                Row("KGRL", "connector_thesis", "kgrl"),
+                Row("sKGRL", "connector_thesis", "skgrl"),
+                *_baselines("connector_thesis", _ALL[:2], names=BASELINES[:2]),
+            ],
+        ),
+    ],
+    "GridClamp": [
+        Section(
+            "Grid clamp, hard",
+            [
+                Row("RL-SCT, 3 demonstration episodes", "grid_clamp_hard", "sct"),
+                Row("residual RL", "grid_clamp_hard", "residual"),
+                Row("RL of 6D velocities", "grid_clamp_hard", "none"),
+                *_baselines("grid_clamp_hard_nulls", _ALL_ZERO, names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT, 3 demonstration episodes",),
+        ),
+        Section(
+            "Grid clamp",
+            [
+                Row("RL-SCT", "grid_clamp", "sct"),
+                Row("residual RL", "grid_clamp_guidance", "residual"),
+                Row("RL of 6D velocities", "grid_clamp_guidance", "none"),
+                *_baselines("grid_clamp_nulls", _ALL_ZERO, names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT",),
+        ),
+    ],
+    "Pouring": [
+        Section(
+            "Pouring, hard",
+            [
+                Row("RL-SCT", "pouring_hard", "rl_sct"),
+                Row("RL-SCT, more episodes", "pouring_hard", "rl_sct_longer"),
+                Row("RL, reward shaped by hand", "pouring_hard", "rl"),
+                *_baselines("pouring_hard_nulls", _ALL_ZERO, names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT",),
+        ),
+        Section(
+            "Pouring",
+            [
+                Row("RL-SCT, shaped reward", "pouring_sac", "rl_sct_shaped"),
+                Row("RL-SCT, sparse reward", "pouring_sac", "rl_sct_sparse"),
+                Row("RL, reward shaped by hand", "pouring_sac", "rl_shaped"),
+                *_baselines("pouring_nulls", (*_ALL_ZERO[:3], "scripted_pour"), names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT, shaped reward",),
+        ),
+    ],
+    "NarrowPassage": [
+        Section(
+            "Narrow passage, hard",
+            [
+                Row("KGRL, 10 demonstration episodes", "narrow_passage_hard", "kgrl"),
+                Row("sKGRL, 10 demonstration episodes", "narrow_passage_hard", "skgrl"),
+                Row("residual RL", "narrow_passage_hard", "residual"),
+                Row("safe residual RL", "narrow_passage_hard", "safe_residual"),
+                *_baselines("narrow_passage_hard_nulls", [f"skgrl_{name}" for name in _ALL]),
+            ],
+            guided=("sKGRL, 10 demonstration episodes", "KGRL, 10 demonstration episodes"),
+        ),
+        Section(
+            "Narrow passage",
+            [
+                Row("KGRL", "narrow_passage", "kgrl"),
+                Row("residual RL", "narrow_passage", "residual"),
+                Row("safe residual RL", "narrow_passage", "safe_residual"),
+                *_baselines("narrow_passage_nulls", _ALL[:3], names=BASELINES[:3]),
+            ],
+            guided=("KGRL",),
+        ),
+    ],
+}
+
+
+def task_table(task: str, tables: Path) -> str:
+    """Return the Markdown tables of a task's methods; empty if there is no result.
+
+    Args:
+        task: Name of the task.
+        tables: Folder of the studies' tables.
+    """
+    parts = []
+    for section in SECTIONS.get(task, ()):
+        rows = [(row.name, *_cells(seeds)) for row in section.rows if len(seeds := last_rows(tables, row))]
+        if rows:
+            parts.append(f"### {section.title}\n\n{_markdown(COLUMNS, rows)}\n")
+    return "\n".join(parts)
+
+
+def readme_table(tables: Path) -> str:
+    """Return the Markdown table of the README: a row a section, hard ones first."""
+    rows = []
+    for section in sorted((s for sections in SECTIONS.values() for s in sections), key=lambda s: "hard" not in s.title):
+        named = {row.name: last_rows(tables, row) for row in section.rows}
+        guided = [(name, named[name]) for name in section.guided if len(named[name])]
+        if not guided:
+            continue
+        residual, scripted, random = (named.get(n, pd.DataFrame()) for n in ("residual RL", BASELINES[3], BASELINES[1]))
+        rows.append(
+            (
+                section.title,
+                "; ".join(f"{name.split(',')[0]} {_success(seeds)}" for name, seeds in guided),
+                _percent(residual),
+                f"{_percent(scripted)} / {_percent(random)}",
+                ", ".join(dict.fromkeys(f"{n:g}" for _, seeds in guided for n in seeds["training_episodes"])),
+                f"{_stopped(pd.concat([seeds for _, seeds in guided]))} / {_stopped(residual)}",
+            )
+        )
+    return _markdown(README_COLUMNS, rows)
+
+
+def update_readme(text: str, table: str) -> str:
+    """Return the README's text with the table between its markers.
+
+    Raises:
+        ValueError: If the markers are missing.
+    """
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"the README has no place for the table: put {BEGIN!r} and {END!r} there")
+    return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
+
+
+def last_rows(tables: Path, row: Row) -> pd.DataFrame:
+    """Return the rows of a method after the last training episode of each seed; empty if there is no table."""
+    path = tables / f"{row.study}.csv"
+    if not path.is_file():
+        return pd.DataFrame()
+    found = read_table(path)
+    found = found[(found["method"] == row.method) & ((row.eval_set is None) | (found["eval_set"] == row.eval_set))]
+    return found.sort_values(["seed", "after_episodes"], kind="stable").drop_duplicates("seed", keep="last")
+
+
+def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _cells(seeds: pd.DataFrame) -> tuple[str, ...]:
+    """Return the cells of a method's row after its name."""
+    if not _is_trained(seeds):
+        parts = [_safety(seeds, "")]
+        return "–", "; ".join(map(_interval, seeds.to_dict("records"))), "–", _violation(parts), _forces(parts)
+    held_out = _is_evaluated(seeds)
+    episodes = "/".join(f"{n:g}" for n in dict.fromkeys(seeds["training_episodes"]))
+    column = "success_rate" if held_out else "training_success_rate"
+    number = "" if not held_out or (seeds["episodes"] == 100).all() else f" of {_join(seeds['episodes'])}"
+    success = _join(100 * seeds[column]) + (number if held_out else " in training")
+    converged = _join(seeds["training_episodes_to_convergence"])
+    parts = [_safety(seeds, prefix) for prefix in (("", "training_") if held_out else ("training_",))]
+    forces = _forces(parts) if held_out else f"({_forces(parts)})"
+    return f"{episodes} ({_span(seeds['seed'])})", success, converged, _violation(parts), forces
+
+
+def _is_trained(seeds: pd.DataFrame) -> bool:
+    return "training_episodes" in seeds and bool(seeds["training_episodes"].notna().any())
+
+
+def _is_evaluated(seeds: pd.DataFrame) -> bool:
+    return "success_rate" in seeds and bool(seeds["success_rate"].notna().all())
+
+
+_SAFETY = ("max_commanded_violation", "violating_episodes", "peak_force")
+
+
+def _safety(seeds: pd.DataFrame, prefix: str) -> pd.DataFrame:
+    return seeds[[f"{prefix}{name}" for name in _SAFETY]].set_axis(_SAFETY, axis=1)
+
+
+def _join(values: pd.Series) -> str:
+    return ", ".join("never" if pd.isna(value) else f"{value:.3g}" for value in values)
+
+
+def _span(seeds: pd.Series) -> str:
+    """Return consecutive seeds as a range, others as a list."""
+    numbers = sorted(int(seed) for seed in seeds)
+    if len(numbers) > 2 and numbers == list(range(numbers[0], numbers[-1] + 1)):
+        return f"{numbers[0]}–{numbers[-1]}"
+    return ", ".join(map(str, numbers))
+
+
+def _interval(row: dict) -> str:
+    """Return a success rate with its Wilson interval and its number of episodes."""
+    rate, low, high = (100 * row[name] for name in ("success_rate", "success_low", "success_high"))
+    return f"{rate:.3g} ({low:.1f}–{high:.1f}) of {row['episodes']:.0f}"
+
+
+def _violation(parts: Sequence[pd.DataFrame]) -> str:
+    """Return the largest commanded violation and its number of episodes, held out and in training together."""
+    worst = max(float(part["max_commanded_violation"].max()) for part in parts)
+    if worst <= TOLERANCE:
+        return "none"
+    episodes = sum(int(part["violating_episodes"].sum()) for part in parts)
+    return f"{1000 * worst:.2f} mm, in {episodes} episodes"
+
+
+def _forces(parts: Sequence[pd.DataFrame]) -> str:
+    held_out, *training = (f"{float(part['peak_force'].max()):.1f}" for part in parts)
+    return held_out + "".join(f" ({one})" for one in training)
+
+
+def _success(seeds: pd.DataFrame) -> str:
+    """Return the mean success [%], with the range over seeds where they differ."""
+    rates = 100 * seeds["success_rate" if _is_evaluated(seeds) else "training_success_rate"].astype(float)
+    span = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
+    return f"{rates.mean():.0f}{span}"
+
+
+def _percent(seeds: pd.DataFrame) -> str:
+    return _success(seeds) if len(seeds) else "–"
+
+
+def _stopped(seeds: pd.DataFrame) -> str:
+    """Return how many training episodes of all seeds ended in a collision; a dash where that is unknown."""
+    column = "training_ended_in_collision"
+    if column not in seeds or seeds[column].isna().any():
+        return "–"
+    return f"{seeds[column].sum():.0f} of {seeds['training_episodes'].sum():.0f}"

@@ -1,0 +1,117 @@
+"""The tables of all methods: on the pages of results and in the README."""
+
+from pathlib import Path
+
+import pytest
+
+from guiderail.tools.experiments.declaration import load_study
+from research.results.methods import (
+    BASELINES,
+    NO_DEMONSTRATION,
+    SECTIONS,
+    readme_table,
+    task_table,
+    update_readme,
+)
+from research.results.page import PAGES, write_pages
+from research.studies import study_path
+
+ROOT = Path(__file__).parents[3]
+TABLES, PAGES_FOLDER = ROOT / "research" / "results", ROOT / "docs" / "results"
+
+
+def rows(text):
+    """Split the lines of Markdown tables into cells, without heads, rulers and titles."""
+    lines = [line for line in text.splitlines() if line.startswith("| ") and not line.startswith("| ---")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    return [row for row in cells if row[0] not in ("method", "task (hard)")]
+
+
+def test_readme_has_the_table_of_the_stored_results():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert update_readme(readme, readme_table(TABLES)) == readme, "the README is stale: python -m research.results"
+
+
+def test_readme_table_has_at_most_ten_rows_with_hard_ones_first():
+    titles = [row[0] for row in rows(readme_table(TABLES))]
+    assert len(titles) <= 10
+    hard = ["hard" in title for title in titles]
+    assert hard == sorted(hard, reverse=True)
+
+
+def test_pages_are_those_of_the_stored_results(tmp_path):
+    for page in write_pages(TABLES, tmp_path):
+        stored = PAGES_FOLDER / page.name
+        assert page.read_text() == stored.read_text(), f"{stored} is stale: python -m research.results"
+
+
+def test_every_row_names_a_method_of_a_study():
+    assert set(SECTIONS) == set(PAGES)
+    for row in (row for sections in SECTIONS.values() for section in sections for row in section.rows):
+        study = load_study(study_path(row.study))
+        assert row.method in study.methods, f"{row.study} has no {row.method}"
+        assert row.eval_set is None or row.eval_set in [one.name for one in study.eval_set]
+        assert row.eval_set is not None or len(study.eval_set) < 2, f"{row.study} has several evaluation sets"
+
+
+def test_every_readme_row_names_methods_of_its_section():
+    for section in (section for sections in SECTIONS.values() for section in sections):
+        assert set(section.guided) <= {row.name for row in section.rows}
+
+
+def test_missing_study_is_left_out(tmp_path):
+    name = "connector_hard_nulls.csv"
+    (tmp_path / name).write_bytes((TABLES / name).read_bytes())
+    assert [row[0] for row in rows(task_table("BncConnector", tmp_path))] == list(BASELINES)
+    assert task_table("BncConnector", tmp_path / "nowhere") == ""
+    assert rows(readme_table(tmp_path)) == []
+    assert len(NO_DEMONSTRATION) == len(BASELINES)
+
+
+HEAD = (
+    "method,seed,after_episodes,eval_set,episodes,success_rate,success_low,success_high,max_commanded_violation,"
+    "violating_episodes,peak_force,training_episodes,training_success_rate,training_episodes_to_convergence,"
+    "training_max_commanded_violation,training_violating_episodes,training_peak_force,training_ended_in_collision\n"
+)
+
+
+def test_each_seed_is_listed_after_its_last_episode(tmp_path):
+    (tmp_path / "connector_hard.csv").write_text(
+        HEAD
+        + "residual,7,20,fresh,100,0.1,0,0,0,0,1.0,20,0.1,,0,0,2.0,1\n"
+        + "residual,7,60,fresh,100,0.98,0,0,0.0001,3,12.25,60,0.8,15,0.0004,5,31.0,4\n"
+        + "residual,8,60,fresh,100,1.0,0,0,-0.1,0,14.5,60,0.8,,0.0,0,20.0,3\n"
+        + "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,2\n"
+    )
+    kgrl, residual = rows(task_table("BncConnector", tmp_path))
+    assert kgrl[0] == "KGRL"
+    assert residual[1:] == [
+        "60 (7, 8)",
+        "98, 100",
+        "15, never",
+        "0.40 mm, in 8 episodes",
+        "14.5 (31.0)",
+    ]
+    (row,) = rows(readme_table(tmp_path))
+    assert row == ["Connector, hard", "KGRL 97", "99 (98–100)", "– / –", "60", "2 of 60 / 7 of 120"]
+
+
+def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
+    line = "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0\n"
+    (tmp_path / "connector_hard.csv").write_text(HEAD.replace(",training_ended_in_collision", "") + line)
+    assert rows(readme_table(tmp_path))[0][-1] == "– / –"
+
+
+def test_success_in_training_is_marked_when_nothing_was_evaluated(tmp_path):
+    (tmp_path / "narrow_passage.csv").write_text(
+        "method,seed,after_episodes,eval_set,training_episodes,training_success_rate,training_episodes_to_convergence,"
+        "training_max_commanded_violation,training_violating_episodes,training_peak_force\n"
+        "kgrl,0,60,,60,1.0,0,-0.01,0,0.0\nkgrl,1,60,,60,0.5,3,1e-12,0,0.0\nkgrl,2,60,,60,0.25,,0,0,3.0\n"
+    )
+    (row,) = rows(task_table("NarrowPassage", tmp_path))
+    assert row[1:] == ["60 (0–2)", "100, 50, 25 in training", "0, 3, never", "none", "(3.0)"]
+
+
+def test_update_readme_refuses_a_text_without_markers():
+    with pytest.raises(ValueError, match="no place for the table"):
+        update_readme("# guiderail\n", "")
