@@ -21,7 +21,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects.insertion import HISTORY_VARIANCE
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import still
+from guiderail.tools.evaluation.baselines import zero
 from guiderail.tools.evaluation.evaluate import cached
 from guiderail.tools.evaluation.metrics import jerk, summary
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring.scripted import ADVERSARIES, Inputs
 from guiderail.models.common.poses import pose_to_transform
-from guiderail.tools.evaluation.baselines import Choose, corners
+from guiderail.tools.evaluation.baselines import Choose, bang_bang
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import EnvCallback
 from research.action_fuzzing.campaign import Campaign, Case
@@ -37,7 +37,7 @@ def _tilt(pose: np.ndarray) -> float:
 
 def _three_inputs(make: Callable[[np.random.Generator], Inputs]) -> Choose:
     """The adversary where there are its three inputs; where there are six velocities, full deflection."""
-    return lambda rng, size: make(rng) if size == 3 else corners(rng, size)
+    return lambda rng, size: make(rng) if size == 3 else bang_bang(rng, size)
 
 
 def campaign() -> Campaign:

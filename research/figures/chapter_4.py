@@ -232,7 +232,7 @@ def figure_4_7(out: Path, seeds: int = 3, episodes: int = 30) -> dict[str, Any]:
         episodes=episodes,
         methods=["kgrl"],
         env={"action_repeat": HOLD, "observation": "image"},
-        folder="runs/NarrowPassage/{method}-hold-5-observation-image-quick-{episodes}-{seed}",
+        folder="runs/NarrowPassage/{method}-image-tqc_fast-{episodes}-{seed}",
     )
     rows = run_study(study, out)
     columns = {"return": "return", "reward_obstacle_cost": "obstacle cost", "success": "success"}

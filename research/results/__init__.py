@@ -1,1 +1,1 @@
-"""Stored results: the tables of finished studies and the numbers of reproduced figures, and the pages written of them."""
+"""Stored results: tables of finished studies, numbers of reproduced figures, and the pages written from them."""

@@ -34,7 +34,7 @@ FIGURES_OF_STUDIES = {
     "pouring_tqc": ("3.6", "3.8"),
 }
 PAGES = {
-    "BncConnector": "bnc_connector",
+    "BncConnector": "connector",
     "GridClamp": "grid_clamp",
     "Pouring": "pouring",
     "NarrowPassage": "narrow_passage",
@@ -81,7 +81,7 @@ def store(folders: Sequence[Path], tables: Path) -> None:
 
 
 def write_pages(tables: Path, pages: Path) -> list[Path]:
-    """Write a page for each task, one of the figures and one of the other programs, and a picture of every sweep.
+    """Write a page for each task, one of figures and other programs, and a picture of every sweep.
 
     Args:
         tables: Folder of stored results.
@@ -104,7 +104,7 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
         raise InputError(f"there is no table of a study and no figure in {tables}: name folders that have them")
     studies = {name: load_study(study_path(name)) for name in stored if name not in PROGRAMS}
     places = {name: f"{PAGES[study.task]}.md#{name}" for name, study in studies.items()}
-    content = {"figures": [_figures_section(figures, places)]}
+    content: dict[str, list[str]] = {}
     for task, page in PAGES.items():
         own = {name: study for name, study in studies.items() if study.task == task}
         if not own:
@@ -118,7 +118,8 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
             sections.append(_study_section(study, stored[name]))
         content[page] = sections
     programs = [_program_section(name, rows) for name, rows in stored.items() if name in PROGRAMS]
-    content["certificates_and_smoothness"] = [_page_head("Results: certificates and smoothness"), *programs]
+    content["other"] = [_page_head("Results: figures, certificates, smoothness"), _figures_section(figures, places)]
+    content["other"] += programs
     written = []
     for page, sections in content.items():
         written.append(pages / f"{page}.md")
@@ -148,7 +149,7 @@ def _figure(file: Path) -> dict[str, Any]:
 def _figures_section(figures: Mapping[str, Mapping[str, Any]], places: Mapping[str, str]) -> str:
     """Return the table of the thesis's figures: its statement, the result here and the command."""
     columns = ("figure", "thesis", "here", "seeds", "wall clock", "setting", "command")
-    lines = [_page_head("Results: figures of the thesis")]
+    lines = ["## Figures of the thesis", ""]
     lines += [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     for number, statement in THESIS.items():
         studies = [f"[{name}]({place})" for name, place in places.items() if number in FIGURES_OF_STUDIES.get(name, ())]

@@ -10,7 +10,13 @@ from guiderail.tools.experiments.declaration import LEARNED, load_study
 from guiderail.tools.experiments.study import Job
 from research.studies import study_path
 
-HARD = ("pouring_hard", "pouring_hard_nulls", "pouring_balls_nulls", "narrow_passage_hard", "narrow_passage_hard_nulls")
+HARD = (
+    "pouring_hard",
+    "pouring_hard_baselines",
+    "pouring_balls_baselines",
+    "narrow_passage_hard",
+    "narrow_passage_hard_baselines",
+)
 SWEEPS = ("connector_sweep", "grid_clamp_sweep", "pouring_sweep", "narrow_passage_sweep")
 # Of what was learned at the hardest, by whose study a sweep finds it.
 LEARNED_BY = {

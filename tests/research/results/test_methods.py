@@ -60,7 +60,7 @@ def test_every_readme_row_names_methods_of_its_section():
 
 
 def test_missing_study_is_left_out(tmp_path):
-    name = "connector_hard_nulls.csv"
+    name = "connector_hard_baselines.csv"
     (tmp_path / name).write_bytes((TABLES / name).read_bytes())
     assert [row[0] for row in rows(task_table("BncConnector", tmp_path))] == list(BASELINES)
     assert task_table("BncConnector", tmp_path / "nowhere") == ""

@@ -114,7 +114,7 @@ def test_figures_page_has_every_figure_with_its_results(finished, tmp_path):
         assert words in lines[number]
     assert "the presets of that name have the thesis's values: yes, all" in lines["table 4.1"]
     assert "`python -m research.figures 'table 4.1'`" in lines["table 4.1"]
-    assert "study [connector](bnc_connector.md#connector)" in lines["5.9"]
+    assert "study [connector](connector.md#connector)" in lines["5.9"]
     assert str(tmp_path) not in page
 
 
