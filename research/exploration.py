@@ -1,7 +1,7 @@
-"""Ways to explore: what a policy that knows nothing yet does, one action a control step.
+"""Exploration noise of an untrained policy: one action per control step.
 
-Every one of them has the same root mean square (that of uniform numbers in [−1, 1]), the same limits and a random
-generator of its own, so that what they stir up differs in its shape alone.
+All kinds have the same root mean square, that of uniform numbers in [−1, 1], the same limits and separate random
+generators. The motions that they excite differ only by the shape of the noise.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,75 +15,100 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import PolicyFn
 
 RMS = 1.0 / np.sqrt(3.0)
-FEATURES = 64  # of gSDE: as wide as a small policy's last layer
+FEATURES = 64  # features of gSDE, as many as the last layer of a small policy has
+WARM_UP = 300  # filtered samples that are discarded, so that the filter's initial state has decayed
 
 
-def white(rng: np.random.Generator, steps: int, size: int, action_repeat: int = 1) -> np.ndarray:
-    """Uniform in [−1, 1], each held for `action_repeat` control steps (action repeat)."""
+def uniform(rng: np.random.Generator, steps: int, size: int, action_repeat: int = 1) -> np.ndarray:
+    """Sample uniform actions in [−1, 1], each repeated for `action_repeat` control steps; (steps, size)."""
     return np.repeat(rng.uniform(-1.0, 1.0, (-(-steps // action_repeat), size)), action_repeat, axis=0)[:steps]
 
 
 def pink(rng: np.random.Generator, steps: int, size: int) -> np.ndarray:
-    """Coloured noise with a power of 1/f (Eberhard et al., 2023), for a whole episode at once."""
+    """Sample noise with a power spectrum of 1/f (Eberhard et al., 2023); (steps, size)."""
     return colorednoise.powerlaw_psd_gaussian(1.0, (size, steps), random_state=rng).T
 
 
 def ornstein_uhlenbeck(rng: np.random.Generator, steps: int, size: int, correlation: float = 15.0) -> np.ndarray:
-    """Noise that forgets itself after `correlation` control steps (θ dt = 1/15; DDPG's own is 0.15)."""
-    keep = np.exp(-1.0 / correlation)
-    return _filtered(rng, steps, size, [np.sqrt(1.0 - keep**2)], [1.0, -keep])
+    """Sample an Ornstein–Uhlenbeck process; (steps, size).
+
+    Args:
+        rng: Random generator.
+        steps: Number of control steps.
+        size: Number of actions.
+        correlation: Correlation time in control steps, 1/(θ dt).
+    """
+    decay = np.exp(-1.0 / correlation)
+    return _filtered(rng, steps, size, [np.sqrt(1.0 - decay**2)], [1.0, -decay])
 
 
 def low_pass(rng: np.random.Generator, steps: int, size: int, cutoff: float = 1.0, period: float = 0.02) -> np.ndarray:
-    """White noise behind a second-order Butterworth filter of `cutoff` Hz."""
+    """Sample white noise through a second-order Butterworth filter; (steps, size).
+
+    Args:
+        rng: Random generator.
+        steps: Number of control steps.
+        size: Number of actions.
+        cutoff: Cutoff frequency [Hz].
+        period: Control period [s].
+    """
     return _filtered(rng, steps, size, *signal.butter(2, cutoff, fs=1.0 / period))
 
 
 def _filtered(rng: np.random.Generator, steps: int, size: int, numerator: Any, denominator: Any) -> np.ndarray:
-    """White noise behind a filter, after it has forgotten where it began."""
-    lead = 300
-    return signal.lfilter(numerator, denominator, rng.normal(size=(lead + steps, size)), axis=0)[lead:]
+    return signal.lfilter(numerator, denominator, rng.normal(size=(WARM_UP + steps, size)), axis=0)[WARM_UP:]
 
 
 def open_loop(
-    make: Callable[..., np.ndarray], rng: np.random.Generator, steps: int, size: int, **arguments: Any
+    sample: Callable[..., np.ndarray], rng: np.random.Generator, steps: int, size: int, **arguments: Any
 ) -> PolicyFn:
-    """Actions made for an episode in advance; they do not look at what is observed.
+    """Return a policy that plays a sequence sampled for the whole episode, independent of observations.
+
+    Args:
+        sample: Sampler of this module, of (steps, size) numbers.
+        rng: Random generator.
+        steps: Number of control steps, at least 1.
+        size: Number of actions, at least 1.
+        arguments: Further arguments of the sampler.
 
     Raises:
-        InputError: if there is nothing to make.
+        InputError: If `steps` or `size` is out of range.
     """
     if steps < 1 or size < 1:
         raise InputError(f"an exploration needs at least one step and one action, not {steps} and {size}")
-    sequence: Iterator[np.ndarray] = iter(_with_rms(make(rng, steps, size, **arguments)))
+    sequence: Iterator[np.ndarray] = iter(_with_rms(sample(rng, steps, size, **arguments)))
     return lambda observation: next(sequence)
 
 
 def state_dependent(rng: np.random.Generator, steps: int, size: int, interval: int) -> PolicyFn:
-    """gSDE (Raffin et al., 2022): noise that is linear in features of the state, sampled anew every `interval` steps.
+    """Return a policy with gSDE noise (Raffin et al., 2022), linear in random features of the observation.
 
-    The features are those of an make_baseline network: rectified, not learned.
+    Args:
+        rng: Random generator.
+        steps: Ignored; the noise has no fixed length.
+        size: Number of actions.
+        interval: Control steps after which the linear map is sampled again.
     """
-    mix: np.ndarray | None = None
+    projection: np.ndarray | None = None
     weights = np.zeros((0, 0))
     count = 0
 
     def act(observation: np.ndarray) -> np.ndarray:
-        nonlocal mix, weights, count
-        if mix is None:
-            mix = rng.normal(size=(FEATURES, len(observation))) / np.sqrt(len(observation))
-        features = np.tanh(mix @ observation)
+        nonlocal projection, weights, count
+        if projection is None:
+            projection = rng.normal(size=(FEATURES, len(observation))) / np.sqrt(len(observation))
+        features = np.tanh(projection @ observation)
         if count % interval == 0:
             weights = rng.normal(size=(size, FEATURES))
         count += 1
-        # Divided by what the noise's deviation is in this very state: gSDE's own scale would depend on the network.
+        # Divided by the noise's deviation in this state: gSDE's own scale would depend on the network.
         return np.clip(RMS * weights @ features / np.linalg.norm(features), -1.0, 1.0)
 
     return act
 
 
 def _with_rms(sequence: np.ndarray) -> np.ndarray:
-    """Scaled so that, after clipping to [−1, 1], every action has the common root mean square."""
+    """Scale a sequence so that every action has the common RMS after clipping to [−1, 1]."""
     scale = np.full(sequence.shape[1], RMS) / np.maximum(np.sqrt(np.mean(sequence**2, axis=0)), 1e-12)
     for _ in range(20):
         clipped = np.clip(sequence * scale, -1.0, 1.0)

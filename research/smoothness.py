@@ -1,8 +1,10 @@
-"""The study `smoothness`: what exploring does to the motion, all ways at the same exploration RMS.
+"""Smoothness of exploration: every exploration method at the same RMS.
 
-Each method explores the connector's skill with random actions, in free space (the jack is somewhere else) and on the
-connector: KGRL and sKGRL through their null space, everything else as a residual on the demonstrations. One table, one
-picture. A command's jerk has two parts: the demonstrations' own, and what exploring adds.
+Each method explores the connector with random actions, in free space (the jack is out of reach) and in contact: KGRL
+and sKGRL through their null space, the others as a residual on the demonstrations. The jerk of a command has two parts:
+that of the demonstrations, and that which exploration adds.
+
+Run it with `python -m research.smoothness --out studies`.
 """
 
 from collections.abc import Callable
@@ -21,20 +23,27 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects.insertion import HISTORY_VARIANCE
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import zero
+from guiderail.tools.evaluation.baselines import always
 from guiderail.tools.evaluation.evaluate import cached
 from guiderail.tools.evaluation.metrics import jerk, summary
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import colour, new_figure, save_figure
-from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, white
+from research.command import Parser, print_result, run_program
+from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, uniform
 
 
 def log_dimensionless_jerk(positions: np.ndarray, period: float) -> float:
-    """Log dimensionless jerk of `positions` (N, O), higher (less negative) is smoother.
+    """Return the log dimensionless jerk of a motion; higher (less negative) is smoother.
 
-    −ln(T³/v² ∫|jerk|² dt), T the duration and v the largest speed: the same for the same motion at another tempo or in
-    another unit. −inf where nothing moves, or fewer than four positions are given.
+    −ln(T³/v² ∫|jerk|² dt) with duration T and largest speed v. It does not depend on tempo or unit.
+
+    Args:
+        positions: Positions, (N, O).
+        period: Time between them [s].
+
+    Returns:
+        −inf for fewer than four positions or no motion.
     """
     positions = np.asarray(positions, dtype=float)
     if len(positions) < 4:
@@ -50,10 +59,17 @@ def log_dimensionless_jerk(positions: np.ndarray, period: float) -> float:
 def spectral_arc_length(
     positions: np.ndarray, period: float, cutoff: float = 10.0, threshold: float = 0.05, padding: int = 4
 ) -> float:
-    """SPARC of `positions` (N, O) (Balasubramanian et al., 2015): higher (less negative) is smoother.
+    """Return the spectral arc length of a motion (Balasubramanian et al., 2015); higher (less negative) is smoother.
 
-    The length of the curve that the normalized spectrum of the speed draws, up to the last frequency below `cutoff`
-    [Hz] at which it is above `threshold`.
+    It is the arc length of the normalized spectrum of the speed, up to the last frequency below the cutoff at which
+    the spectrum is above the threshold.
+
+    Args:
+        positions: Positions, (N, O).
+        period: Time between them [s].
+        cutoff: Largest frequency [Hz].
+        threshold: Smallest amplitude, as a part of the largest.
+        padding: Powers of two by which the signal is zero-padded.
     """
     speed = np.linalg.norm(np.diff(np.asarray(positions, dtype=float), axis=0), axis=1) / period
     if not len(speed) or not np.max(speed) > 0:
@@ -71,10 +87,10 @@ def spectral_arc_length(
 
 
 TASK = "BncConnector"
-HOLD = 10  # control steps that an action lasts where the connector is learned
-SLOW = 25  # half a second: actions that are as slow as what a low-pass at 1 Hz lets through
+ACTION_REPEAT = 10  # control steps of an action when the connector is learned
+SLOW = 25  # control steps of an action that is as slow as a low-pass filter of 1 Hz
 PLACES = ("free", "connector")
-ELSEWHERE = (FARTHEST, FARTHEST)  # m: where the jack is while the robot moves in free space
+OUT_OF_REACH = (FARTHEST, FARTHEST)  # jack offset for motions in free space [m]
 ALONE = "demonstration alone"
 OUTPUTS = {"all": (0, 1, 2, 3, 4, 5), "xy": (0, 1)}
 
@@ -83,28 +99,36 @@ Explore = Callable[[np.random.Generator, int, int], PolicyFn]
 
 @dataclass(frozen=True)
 class Method:
-    """One way to explore."""
+    """Exploration method.
+
+    Attributes:
+        name: Name in the table.
+        guidance: Kind of guidance.
+        explore: Makes the policy of an episode from a random generator, the number of steps and of actions.
+        action_repeat: Control steps of an action. The environment takes an action at every control step.
+        environment: Further options of the environment.
+    """
 
     name: str
     guidance: str
     explore: Explore
-    action_repeat: int = 1  # decisions that an action lasts; the environment itself takes one at every control step
+    action_repeat: int = 1
     environment: dict[str, Any] = field(default_factory=dict)
 
 
 def methods() -> list[Method]:
-    """Everything that is compared."""
-    white_of = {n: partial(open_loop, white, action_repeat=n) for n in (1, HOLD, SLOW)}
+    """Return all exploration methods."""
+    repeated = {n: partial(open_loop, uniform, action_repeat=n) for n in (1, ACTION_REPEAT, SLOW)}
     listed = [Method(ALONE, "kmp", lambda rng, steps, size: lambda observation: np.zeros(size))]
-    listed.append(Method("KGRL", "kgrl", white_of[1]))
+    listed.append(Method("KGRL", "kgrl", repeated[1]))
     for history, variance in ((10, 1e-8), (10, 1e-10), (10, 1e-11), (10, 1e-12), (2, 1e-11), (20, 1e-11)):
         settings = {"history": history, "history_variance": variance}
-        listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", white_of[1], 1, settings))
+        listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", repeated[1], 1, settings))
     usual = {"history": 10, "history_variance": HISTORY_VARIANCE}
-    listed.append(Method("sKGRL adaptive", "skgrl", white_of[1], 1, usual | {"adaptive_history": True}))
-    listed.append(Method(f"KGRL repeat {HOLD}", "kgrl", white_of[HOLD], HOLD))
-    listed += [Method(f"sKGRL repeat {n}", "skgrl", white_of[n], n, usual) for n in (HOLD, SLOW)]
-    residual: dict[str, Explore] = {"white": white_of[1], f"repeat {HOLD}": white_of[HOLD]}
+    listed.append(Method("sKGRL adaptive", "skgrl", repeated[1], 1, usual | {"adaptive_history": True}))
+    listed.append(Method(f"KGRL repeat {ACTION_REPEAT}", "kgrl", repeated[ACTION_REPEAT], ACTION_REPEAT))
+    listed += [Method(f"sKGRL repeat {n}", "skgrl", repeated[n], n, usual) for n in (ACTION_REPEAT, SLOW)]
+    residual: dict[str, Explore] = {"white": repeated[1], f"repeat {ACTION_REPEAT}": repeated[ACTION_REPEAT]}
     residual |= {f"gSDE {n}": partial(state_dependent, interval=n) for n in (1, 8, 64)}
     residual |= {"pink": partial(open_loop, pink), "OU": partial(open_loop, ornstein_uhlenbeck)}
     residual |= {f"low-pass {f:g} Hz": partial(open_loop, low_pass, cutoff=f) for f in (2.0, 1.0, 0.5)}
@@ -114,17 +138,17 @@ def methods() -> list[Method]:
 def smoothness(
     out: Path, *, episodes: int = 4, action_scale: float = 1.0, outputs: str = "all", seed: int = 0
 ) -> dict[str, Any]:
-    """Runs the benchmark; writes `smoothness.csv`, `smoothness.md` and `smoothness.png`.
+    """Run the benchmark; write `smoothness.csv`, `smoothness.md` and `smoothness.png`.
 
     Args:
-        out: the folder.
-        episodes: of each method, in free space and on the connector alike.
-        action_scale: the common exploration RMS, in demonstration standard deviations.
-        outputs: "all" six, as in the thesis, or "xy", which the connector is learned with.
-        seed: of the random actions and of the connector's offsets (a new one in every episode).
+        out: Folder; methods that are already measured in it are not measured again.
+        episodes: Episodes of each method, in free space and in contact each.
+        action_scale: Common exploration RMS, in demonstration standard deviations.
+        outputs: "all" six outputs, as in the thesis, or "xy", as the connector is learned.
+        seed: Seed of the random actions and of the jack offsets, which are new in every episode.
 
     Raises:
-        InputError: if a number is out of range.
+        InputError: If a number is out of range.
     """
     if episodes < 1 or not action_scale > 0 or outputs not in OUTPUTS:
         raise InputError(
@@ -134,13 +158,12 @@ def smoothness(
     quiet = quiet_commands()
     rows = []
     for method in methods():
-        # A method that is measured already is not measured again: the benchmark goes on where it was interrupted.
-        words = [method.name, outputs, f"{action_scale:g}", str(episodes), str(seed)]
-        file = out / "methods" / ("-".join(words).replace(" ", "_") + ".csv")
-        how: dict[str, Any] = {"episodes": episodes, "action_scale": action_scale, "seed": seed}
-        found = cached(file, lambda: pd.DataFrame(measure(method, OUTPUTS[outputs], quiet, **how)))  # noqa: B023
-        rows += found.to_dict("records")
-    for row in rows:  # against white actions through KGRL, at the same place
+        parts = [method.name, outputs, f"{action_scale:g}", str(episodes), str(seed)]
+        file = out / "methods" / ("-".join(parts).replace(" ", "_") + ".csv")
+        settings: dict[str, Any] = {"episodes": episodes, "action_scale": action_scale, "seed": seed}
+        table = cached(file, lambda: pd.DataFrame(measure(method, OUTPUTS[outputs], quiet, **settings)))  # noqa: B023
+        rows += table.to_dict("records")
+    for row in rows:  # compared with uniform random actions through KGRL at the same place
         kgrl = next(one for one in rows if one["method"] == "KGRL" and one["place"] == row["place"])
         for part in ("linear", "angular"):
             row[f"times_below_kgrl_{part}"] = kgrl[f"jerk_commanded_{part}"] / row[f"jerk_commanded_{part}"]
@@ -148,14 +171,14 @@ def smoothness(
         "table": str(write_table(out / "smoothness", rows)),
         "picture": str(_draw(rows, out / "smoothness.png")),
         "exploration_rms": f"{action_scale:g} demonstration standard deviations, {outputs} outputs",
-        **_claims(rows),
+        **_ratios(rows),
     }
 
 
 def quiet_commands() -> np.ndarray:
-    """The commands of the demonstrations alone, (N, 6)."""
+    """Return the commands of the demonstrations without actions, (N, 6)."""
     env: Any = make_environment(TASK, {"guidance": "kmp", "action_repeat": 1, "fixture_offset": "none"})
-    rollout(env, still(env), seed=0, options={"offset": ELSEWHERE})
+    rollout(env, always(env, np.zeros(env.action_space.shape)), seed=0, options={"offset": OUT_OF_REACH})
     commands = env.unwrapped.trace.commanded.copy()
     env.close()
     return commands
@@ -164,15 +187,15 @@ def quiet_commands() -> np.ndarray:
 def measure(
     method: Method, action_dims: tuple[int, ...], quiet: np.ndarray, *, episodes: int, action_scale: float, seed: int
 ) -> list[dict[str, Any]]:
-    """A row for free space and one for the connector.
+    """Measure a method; return a row for free space and one for the connector.
 
     Args:
-        method: the way to explore.
-        explored: which outputs it moves.
-        quiet: the commands of the demonstrations alone, (N, 6): see `quiet_commands`.
-        episodes: in each place.
-        action_scale: the exploration RMS, in demonstration standard deviations.
-        seed: of the random actions and of the connector's offsets.
+        method: Exploration method.
+        action_dims: Indices of the outputs that it moves.
+        quiet: Commands of the demonstrations without actions, (N, 6): see `quiet_commands`.
+        episodes: Episodes in each place.
+        action_scale: Exploration RMS, in demonstration standard deviations.
+        seed: Seed of the random actions and of the jack offsets.
     """
     arguments = {
         "guidance": method.guidance,
@@ -180,43 +203,43 @@ def measure(
         "action_repeat": 1,
         "action_dims": action_dims,
     }
-    arguments |= method.environment | _strength(method, action_dims, action_scale)
+    arguments |= method.environment | _gains(method, action_dims, action_scale)
     env: Any = make_environment(TASK, arguments)
     unit = deviation(reference_trajectory("insert"))[list(action_dims)]
     rows = []
     for place in PLACES:
-        seen, moved, smooth, added = [], [], [], []
+        episode_rows, deviations, shapes, jerks_added = [], [], [], []
         for index in range(episodes):
             rng = np.random.default_rng([seed, index])
             act = method.explore(rng, len(quiet), len(action_dims))
-            options = {"offset": ELSEWHERE} if place == "free" else {"held_out": True}
-            seen.append(rollout(env, act, seed=seed + index, options=options))
+            options = {"offset": OUT_OF_REACH} if place == "free" else {"held_out": True}
+            episode_rows.append(rollout(env, act, seed=seed + index, options=options))
             trace = env.unwrapped.trace
             deviated = trace.commanded - quiet[: len(trace)]
-            added.append(jerk(deviated, trace.period))
-            moved.append(deviated[:, list(action_dims)] / unit)
-            smooth.append(_shape(trace))
-        rows.append(_row(method, place, pd.DataFrame(seen), np.concatenate(moved), smooth, added))
+            jerks_added.append(jerk(deviated, trace.period))
+            deviations.append(deviated[:, list(action_dims)] / unit)
+            shapes.append(_shape(trace))
+        rows.append(_row(method, place, pd.DataFrame(episode_rows), np.concatenate(deviations), shapes, jerks_added))
     env.close()
     return rows
 
 
-def _strength(method: Method, action_dims: tuple[int, ...], action_scale: float) -> dict[str, Any]:
-    """Arguments with which random actions have an RMS of κ standard deviations where no constraint is in the way."""
+def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) -> dict[str, Any]:
+    """Return options that give random actions the RMS `action_scale` where no constraint is active."""
     if method.guidance == "kmp":
         return {}
-    # Built once more, only for its primitive: what the environment would explore with at κ = 1.
+    # The primitive of the environment at an action scale of 1.
     histories = {key: value for key, value in method.environment.items() if key in ("history", "history_variance")}
     skill = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
     assert skill is not None
     indices = np.array(action_dims)
-    if method.guidance == "residual":  # the same for all outputs of a unit, whose deviations differ
+    if method.guidance == "residual":  # one gain for all outputs of a unit; their deviations differ
         reached = RMS * (skill.residual_gains() / deviation(skill.reference))[indices]
         return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
     primitive = skill.primitive(history=method.guidance == "skgrl")
     if not method.environment.get("adaptive_history"):
         return {"gains": tuple(rms_gains(primitive, action_scale, method.action_repeat, indices).tolist())}
-    # Each length of an adaptive history has gains of its own, which one κ sets: it is the longest that is free.
+    # One action scale sets the gains of every length of an adaptive history. In free space it has its full length.
     reached = exploration_rms(primitive, skill.null_space_gains(primitive), method.action_repeat)[indices]
     return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
 
@@ -233,55 +256,56 @@ def _shape(trace: Any) -> dict[str, float]:
 def _row(
     method: Method,
     place: str,
-    seen: pd.DataFrame,
-    moved: np.ndarray,
-    smooth: list[dict[str, float]],
-    added: list[dict[str, float]],
+    episodes: pd.DataFrame,
+    deviations: np.ndarray,
+    shapes: list[dict[str, float]],
+    jerks_added: list[dict[str, float]],
 ) -> dict[str, Any]:
     kinds = [f"jerk_{which}_{part}" for which in ("commanded", "measured") for part in ("linear", "angular")]
     return {
         "method": method.name,
         "place": place,
-        "episodes": len(seen),
-        "rms_in_deviations": float(np.sqrt(np.mean(moved**2))),
-        **{kind: float(np.mean(seen[kind])) for kind in kinds},
-        **{f"jerk_added_{part}": float(np.mean([one[part] for one in added])) for part in added[0]},
-        **{key: float(np.mean([one[key] for one in smooth])) for key in smooth[0]},
-        # In free space nothing succeeds.
-        **summary(seen, ("peak_force", "mean_force", "success_rate", "ended_in_collision", "max_commanded_violation")),
+        "episodes": len(episodes),
+        "rms_in_deviations": float(np.sqrt(np.mean(deviations**2))),
+        **{kind: float(np.mean(episodes[kind])) for kind in kinds},
+        **{f"jerk_added_{part}": float(np.mean([one[part] for one in jerks_added])) for part in jerks_added[0]},
+        **{key: float(np.mean([one[key] for one in shapes])) for key in shapes[0]},
+        **summary(
+            episodes, ("peak_force", "mean_force", "success_rate", "ended_in_collision", "max_commanded_violation")
+        ),
     }
 
 
-def _claims(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """sKGRL against KGRL with actions kept as long, and against every other way to explore, with how often it locks."""
+def _ratios(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Compare sKGRL with KGRL at the same action repeat, and with every other method, with their success rates."""
     free = {row["method"]: row for row in rows if row["place"] == "free"}
     success = {row["method"]: row["success_rate"] for row in rows if row["place"] == "connector"}
     others = {name: row for name, row in free.items() if name.startswith("residual")}
-    kgrl = free[f"KGRL repeat {HOLD}"]
-    claims: dict[str, Any] = {}
-    for action_repeat in (HOLD, SLOW):
-        mine = f"sKGRL repeat {action_repeat}"
-        ours = free[mine]
-        claims[f"{mine} explores and locks"] = f"{success[mine]:.0%}"
+    kgrl = free[f"KGRL repeat {ACTION_REPEAT}"]
+    ratios: dict[str, Any] = {}
+    for action_repeat in (ACTION_REPEAT, SLOW):
+        ours_name = f"sKGRL repeat {action_repeat}"
+        ours = free[ours_name]
+        ratios[f"{ours_name} explores and locks"] = f"{success[ours_name]:.0%}"
         for part in ("linear", "angular"):
             key, measured, added = f"jerk_commanded_{part}", f"jerk_measured_{part}", f"jerk_added_{part}"
-            claims[f"{mine}, {part} jerk below that of KGRL repeat {HOLD}"] = (
+            ratios[f"{ours_name}, {part} jerk below that of KGRL repeat {ACTION_REPEAT}"] = (
                 f"{kgrl[key] / ours[key]:.0f} times commanded ({kgrl[added] / ours[added]:.0f} times what exploring "
                 f"adds), {kgrl[measured] / ours[measured]:.1f} times measured"
             )
-            claims[f"{mine}, commanded {part} jerk as a part of the demonstrations' own"] = (
+            ratios[f"{ours_name}, commanded {part} jerk as a part of the demonstrations' own"] = (
                 f"{ours[key] / free[ALONE][key]:.3g}"
             )
             for what, column in (("commanded", key), ("added", added)):
-                claims[f"{mine}, {what} {part} jerk below"] = ", ".join(
+                ratios[f"{ours_name}, {what} {part} jerk below"] = ", ".join(
                     f"{name.removeprefix('residual ')} ({success[name]:.0%}) {row[column] / ours[column]:.3g} times"
                     for name, row in others.items()
                 )
-    return claims
+    return ratios
 
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> Path:
-    """Jerk of every method, commanded and measured, and what it leads to on the connector."""
+    """Draw the jerk of every method, commanded and measured, and its success and peak force on the connector."""
     figure, axes = new_figure(1, 4, (17, 0.32 * len(rows) / 2 + 2))
     free = [row for row in rows if row["place"] == "free"][::-1]
     contact = [row for row in rows if row["place"] == "connector"][::-1]
@@ -299,3 +323,23 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> Path:
     for index, axis in enumerate(axes[0]):
         axis.set_yticks(height, [row["method"] for row in free] if index == 0 else [""] * len(free))
     return save_figure(figure, path)
+
+
+def main(arguments: list[str]) -> None:
+    """Run the program."""
+    parser = Parser("smoothness", "Compare the smoothness of exploration methods at the same RMS.", "--out studies")
+    parser.add_argument("--episodes", type=int, default=16, help="episodes of each method and place (default: 16)")
+    parser.add_argument(
+        "--action-scale", type=float, default=1.0, help="exploration RMS in demonstration deviations (default: 1)"
+    )
+    parser.add_argument("--outputs", choices=[*OUTPUTS], default="all", help="outputs that actions move (default: all)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the actions (default: 0)")
+    parser.add_out(None)
+    parser.add_json()
+    given = parser.parse_args(arguments)
+    settings = {name: getattr(given, name) for name in ("episodes", "action_scale", "outputs", "seed")}
+    print_result(smoothness(given.out, **settings), as_json=given.json)
+
+
+if __name__ == "__main__":
+    run_program(main)

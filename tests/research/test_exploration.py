@@ -1,13 +1,15 @@
+"""Exploration noise."""
+
 import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, white
+from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, uniform
 
 STEPS, SIZE = 400, 2
-MADE = {
-    "white": (white, {}),
-    "repeat": (white, {"action_repeat": 7}),
+SAMPLERS = {
+    "uniform": (uniform, {}),
+    "repeat": (uniform, {"action_repeat": 7}),
     "pink": (pink, {}),
     "ou": (ornstein_uhlenbeck, {}),
     "low_pass": (low_pass, {"cutoff": 1.0}),
@@ -15,8 +17,8 @@ MADE = {
 
 
 def sequence(name, seed=0):
-    make, arguments = MADE[name]
-    act = open_loop(make, np.random.default_rng(seed), STEPS, SIZE, **arguments)
+    sample, arguments = SAMPLERS[name]
+    act = open_loop(sample, np.random.default_rng(seed), STEPS, SIZE, **arguments)
     return np.array([act(np.zeros(3)) for _ in range(STEPS)])
 
 
@@ -24,8 +26,8 @@ def roughness(actions):
     return np.sqrt(np.mean(np.diff(actions, 3, axis=0) ** 2))
 
 
-@pytest.mark.parametrize("name", MADE)
-def test_all_have_the_same_rms_and_the_same_limits(name):
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_samplers_have_the_same_rms_and_limits(name):
     actions = sequence(name)
     np.testing.assert_allclose(np.sqrt(np.mean(actions**2, axis=0)), RMS, rtol=1e-3)
     assert np.abs(actions).max() <= 1.0
@@ -33,16 +35,16 @@ def test_all_have_the_same_rms_and_the_same_limits(name):
     assert not np.array_equal(actions, sequence(name, seed=1))
 
 
-def test_an_action_is_repeated_as_often_as_said():
+def test_uniform_repeats_each_action():
     actions = sequence("repeat")
     changes = np.flatnonzero(np.abs(np.diff(actions, axis=0)).sum(axis=1)) + 1
     np.testing.assert_array_equal(changes, np.arange(7, STEPS, 7))
 
 
-def test_they_differ_in_how_rough_they_are():
-    assert roughness(sequence("low_pass")) < 0.05 * roughness(sequence("white"))
-    assert roughness(sequence("pink")) < roughness(sequence("white"))
-    assert roughness(sequence("ou")) < roughness(sequence("white"))
+def test_filtered_noise_is_smoother_than_uniform():
+    assert roughness(sequence("low_pass")) < 0.05 * roughness(sequence("uniform"))
+    assert roughness(sequence("pink")) < roughness(sequence("uniform"))
+    assert roughness(sequence("ou")) < roughness(sequence("uniform"))
 
 
 def test_pink_noise_has_the_same_power_in_every_octave():
@@ -52,15 +54,15 @@ def test_pink_noise_has_the_same_power_in_every_octave():
     assert max(octaves) < 1.2 * min(octaves)
 
 
-def test_state_dependent_noise_depends_on_the_state_and_is_chosen_anew():
+def test_state_dependent_noise_is_resampled_after_the_interval():
     act = state_dependent(np.random.default_rng(0), STEPS, SIZE, interval=3)
     states = [np.ones(5), np.ones(5), 2.0 * np.ones(5) - np.arange(5), np.ones(5)]
-    first, again, elsewhere, anew = (act(state) for state in states)
-    np.testing.assert_array_equal(first, again)
+    first, repeated, elsewhere, resampled = (act(state) for state in states)
+    np.testing.assert_array_equal(first, repeated)
     assert not np.allclose(first, elsewhere)
-    assert not np.allclose(first, anew)
+    assert not np.allclose(first, resampled)
 
 
-def test_nothing_to_make_is_refused():
+def test_open_loop_refuses_zero_steps():
     with pytest.raises(InputError):
-        open_loop(white, np.random.default_rng(0), 0, 2)
+        open_loop(uniform, np.random.default_rng(0), 0, 2)
