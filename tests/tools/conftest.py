@@ -1,44 +1,12 @@
-import shutil
-import sys
-from pathlib import Path
-
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import bead
-
-bead.register()
+from bead_runs import _bead_run, bead_config, bead_run  # noqa: F401
 
 
 @pytest.fixture(autouse=True, scope="session")
 def plain_pictures():
-    """Labels get no room of their own: nobody looks, and it is half of what a picture takes."""
+    """Skip the layout of labels, which takes half of the time of a picture."""
     from guiderail.tools.visualization import style
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "LAYOUT", None)
         yield
-
-
-@pytest.fixture(scope="session")
-def bead_config():
-    """A run of a second: tiny networks that learn from the second episode on."""
-    from guiderail.tools.learning.train import configure
-
-    settings = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
-    return configure("Bead", {}, settings=settings, episodes=8, seed=5)
-
-
-@pytest.fixture(scope="session")
-def _bead_run(bead_config, tmp_path_factory):
-    from guiderail.tools.learning.run_folder import RunFolder
-    from guiderail.tools.learning.trainer import train
-
-    train(RunFolder(folder := tmp_path_factory.mktemp("bead") / "run"), bead_config)
-    return folder
-
-
-@pytest.fixture
-def bead_run(_bead_run, tmp_path):
-    """The folder of such a run, for whoever changes it too."""
-    return shutil.copytree(_bead_run, tmp_path / "run")

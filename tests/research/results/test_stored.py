@@ -260,10 +260,7 @@ def test_grid_clamp_sweep_breaking_points():
 
 def test_pouring_sweep_breaking_points():
     found = {
-        method: [
-            sweep_success("pouring_sweep", method, "mug offset [mm]", at)
-            for at in (0, 15, 25, 35, 45, 60)
-        ]
+        method: [sweep_success("pouring_sweep", method, "mug offset [mm]", at) for at in (0, 15, 25, 35, 45, 60)]
         for method in ("rl_sct", "scripted", "scripted_blind", "uniform_random", "zero", "best_constant")
     }
     assert found["rl_sct"] == [100, 100, 93, 97, 97, 87]

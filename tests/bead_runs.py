@@ -1,0 +1,36 @@
+"""Fixtures of runs on the bead task, for the tests of tools and research."""
+
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent / "tools"))
+import bead
+
+bead.register()
+
+
+@pytest.fixture(scope="session")
+def bead_config():
+    """Return the configuration of a run that takes a second: tiny networks, trained from the second episode on."""
+    from guiderail.tools.learning.train import configure
+
+    settings = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
+    return configure("Bead", {}, settings=settings, episodes=8, seed=5)
+
+
+@pytest.fixture(scope="session")
+def _bead_run(bead_config, tmp_path_factory):
+    from guiderail.tools.learning.run_folder import RunFolder
+    from guiderail.tools.learning.trainer import train
+
+    train(RunFolder(folder := tmp_path_factory.mktemp("bead") / "run"), bead_config)
+    return folder
+
+
+@pytest.fixture
+def bead_run(_bead_run, tmp_path):
+    """Return a copy of the folder of a finished run."""
+    return shutil.copytree(_bead_run, tmp_path / "run")
