@@ -68,10 +68,10 @@ def refuses(function):
     return any(isinstance(one.func, ast.Name) and one.func.id == "InputError" for one in raised)
 
 
-def entries(describe_options):
+def entries(described):
     """Of each argument that a section lists, what it says."""
     found, names = {}, []
-    for line in describe_options.splitlines():
+    for line in described.splitlines():
         entry = re.match(r"^    (\S[\w, /*]*):\s+(.*)$", line)
         if entry:
             names = [name.strip(" *") for name in re.split("[,/]", entry[1])]
@@ -93,17 +93,17 @@ def test_what_is_exported_says_what_shape_its_arrays_have(thing):
     said = []
     for name, function in functions(thing).items():
         doc, signature = documented(function, thing), inspect.signature(function)
-        describe_options = entries(section(doc, "Args") + section(doc, "Attributes"))
+        described = entries(section(doc, "Args") + section(doc, "Attributes"))
         for argument, parameter in signature.parameters.items():
             if is_array(parameter.annotation):
-                said.append((f"{name}({argument})", describe_options.get(argument, doc)))
+                said.append((f"{name}({argument})", described.get(argument, doc)))
         if is_array(signature.return_annotation):
             said.append((f"what {name} returns", doc))
     if dataclasses.is_dataclass(thing):
         doc = inspect.getdoc(thing)
-        describe_options = entries(section(doc, "Attributes") + section(doc, "Args"))
+        described = entries(section(doc, "Attributes") + section(doc, "Args"))
         said += [
-            (one.name, describe_options.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)
+            (one.name, described.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)
         ]
     missing = [name for name, words in said if not SHAPE.search(words)]
     assert not missing, f"{', '.join(missing)}: no shape is given"
@@ -123,12 +123,12 @@ def test_what_is_exported_says_what_it_is_and_refuses(thing):
 def test_what_is_exported_says_what_it_takes(thing):
     if dataclasses.is_dataclass(thing):
         doc = inspect.getdoc(thing)
-        describe_options = section(doc, "Attributes") + section(doc, "Args")
-        missing = [one.name for one in dataclasses.fields(thing) if not re.search(rf"\b{one.name}\b", describe_options)]
+        described = section(doc, "Attributes") + section(doc, "Args")
+        missing = [one.name for one in dataclasses.fields(thing) if not re.search(rf"\b{one.name}\b", described)]
         assert not missing, f"fields {', '.join(missing)} are not described"
         return
     constructor = functions(thing).get("__init__" if inspect.isclass(thing) else thing.__name__)
     if constructor is not None:
-        describe_options = section(documented(constructor, thing), "Args")
-        missing = [name for name in arguments(constructor) if not re.search(rf"\b{name}\b", describe_options)]
+        described = section(documented(constructor, thing), "Args")
+        missing = [name for name in arguments(constructor) if not re.search(rf"\b{name}\b", described)]
         assert not missing, f"arguments {', '.join(missing)} are not described"
