@@ -584,7 +584,7 @@ def files() -> str:
         "| file | what is in it |\n|---|---|\n"
         "| `config.yaml` | everything resolved: the fields below |\n"
         "| `episodes.csv` | one row an episode: see below |\n"
-        "| `ledger/*.parquet` | one row a control step: see below |\n"
+        "| `steps/*.parquet` | one row a control step: see below |\n"
         "| `checkpoint/` | what `--resume` goes on from |\n"
         "| `policy.safetensors`, `policy.json` | the policy's weights, and its shape; loading them runs no code |\n"
         "| `learning_curve.png`, `replay.html` | to look at |\n\n"
@@ -598,8 +598,8 @@ def files() -> str:
         "are of the signal that `Task.collision` names. An episode that a `TerminationTerm` ends as `collision` counts only "
         "where that signal is above its limit too.\n\n"
     )
-    page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.words)) for m in COLUMNS])
-    page += "### ledger\n\n`…_i` stands for a column for every number of a pose or a wrench.\n\n"
+    page += table(["column", "unit", "meaning"], [(code(m.name), cell(m.unit), cell(m.description)) for m in COLUMNS])
+    page += "### Step log\n\n`…_i` stands for a column for every number of a pose or a wrench.\n\n"
     page += table(["column", "unit", "meaning"], [(code(n), cell(u), cell(w)) for n, (u, w) in MEANINGS.items()])
     page += (
         f"## Demonstrations\n\n{paragraphs(inspect.getdoc(Demonstrations.load) or '').split('Raises:')[0]}\n"
@@ -623,16 +623,16 @@ def _fields(kind: type) -> str:
 
 def metrics() -> str:
     """What each number means."""
-    from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS
+    from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
     heads = ["name", "unit", "meaning"]
     page = (
-        "# Numbers\n\nEach is defined once, in `guiderail.tools.evaluation.metrics`, and comes from the trace and the "
-        "safety ledger. `guiderail list metrics` prints them.\n\n## Of an episode\n\n"
+        "# Numbers\n\nEach is defined once, in `guiderail.tools.evaluation.metrics`, and computed from the "
+        "`EpisodeTrace`. `guiderail list metrics` prints them.\n\n## Of an episode\n\n"
     )
-    page += table(heads, [(code(m.name), cell(m.unit), cell(m.words)) for m in COLUMNS])
+    page += table(heads, [(code(m.name), cell(m.unit), cell(m.description)) for m in COLUMNS])
     page += "## Of many episodes\n\nOf training, a study's table has them with `training_` before the name.\n\n"
-    return page + table(heads, [(code(m.name), cell(m.unit), cell(m.words)) for m in STATISTICS.values()])
+    return page + table(heads, [(code(m.name), cell(m.unit), cell(m.description)) for m in statistics_of().values()])
 
 
 def errors() -> str:

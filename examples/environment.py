@@ -17,7 +17,7 @@ for _ in range(20):
 
 print(f"a return of {total:.2f} after {info['control_steps']} control steps, ended by {info['termination'] or 'us'}")
 print(f"worst violation, commanded: {info['constraint_violation']:.2g}, measured: {info['measured_violation']:.2g}")
-print(f"contact force now: {info['contact_force']:.1f} N")  # an episode's worst are in info["ledger"], at its end
+print(f"contact force now: {info['contact_force']:.1f} N")
 
 observation, info = env.reset(seed=1, options={"held_out": True})  # from where training never starts
 env.close()

@@ -36,7 +36,6 @@ from .residual import Residual as Residual
 from .reward_system import RewardSystem as RewardSystem
 from .reward_system import RewardTerm as RewardTerm
 from .safety_filter import SafetyFilter as SafetyFilter
-from .safety_ledger import SafetyLedger as SafetyLedger
 from .sct_input_mapping import SctInputMapping as SctInputMapping
 from .sct_state_machine import SctStateMachine as SctStateMachine
 from .sensor_disturbance import SensorDisturbance as SensorDisturbance

@@ -102,9 +102,7 @@ def test_what_is_exported_says_what_shape_its_arrays_have(thing):
     if dataclasses.is_dataclass(thing):
         doc = inspect.getdoc(thing)
         described = entries(section(doc, "Attributes") + section(doc, "Args"))
-        said += [
-            (one.name, described.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)
-        ]
+        said += [(one.name, described.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)]
     missing = [name for name, words in said if not SHAPE.search(words)]
     assert not missing, f"{', '.join(missing)}: no shape is given"
 

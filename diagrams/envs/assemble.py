@@ -31,34 +31,6 @@ from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
 from guiderail.systems.policy_system import PolicySystem
 from guiderail.systems.reward_system import RewardSystem
-from guiderail.systems.safety_ledger import SafetyLedger
-
-
-def add_ledger(
-    builder: DiagramBuilder,
-    period: float,
-    *,
-    commanded_violation: OutputPort,
-    measured_violation: OutputPort,
-    contact_force: OutputPort,
-    collision: OutputPort,
-    saturation: OutputPort,
-    fallback: OutputPort,
-) -> OutputPort:
-    """Adds the ledger of a task with a control step of `period` [s], and returns where its fields come out."""
-    ledger = builder.AddNamedSystem("ledger", SafetyLedger(period, num_actuators=saturation.size()))
-    recorded = {
-        "commanded_violation": commanded_violation,
-        "measured_violation": measured_violation,
-        "contact_force": contact_force,
-        "collision": collision,
-        "saturation": saturation,
-        "fallback": fallback,
-    }
-    for name, port in recorded.items():
-        builder.Connect(port, ledger.get_record_input_port(name))
-    return ledger.get_ledger_output_port()
-
 
 HALF_TURN_MARGIN = 0.1  # [rad] what actions and contact turn a motion further by
 
@@ -219,7 +191,7 @@ class Loop:
 def build_task_diagram(
     task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None
 ) -> TaskDiagram:
-    """Wires a task: its loop, and reward, monitor and ledger beside it. The policy's `action` is an input.
+    """Wires a task: its loop, and reward and monitor beside it. The policy's `action` is an input.
 
     Args:
         task: the declaration.
@@ -248,24 +220,16 @@ def build_task_diagram(
     signals.connect(reward, rewarded, f"reward {task.config.reward!r} of {task.name}")
 
     too_much = builder.AddNamedSystem("collision", affine(np.eye(1), [-task.collision.above]))
-    builder.Connect(signals.get(task.collision.signal, f"the ledger of {task.name}"), too_much.get_input_port())
-    force = station.get_contact_force_output_port()
-    ledger = add_ledger(
-        builder,
-        period,
-        **violations,
-        contact_force=force,
-        collision=too_much.get_output_port(),
-        saturation=station.get_saturation_output_port(),
-        fallback=guidance.GetOutputPort("fallback"),
+    builder.Connect(
+        signals.get(task.collision.signal, f"the collision threshold of {task.name}"), too_much.get_input_port()
     )
+    force = station.get_contact_force_output_port()
     exported = {
         **violations,
         "observation": loop.observation,
         "reward": reward.get_reward_output_port(),
         "termination": monitor.get_termination_output_port(),
         "contact_force": force,
-        "ledger": ledger,
         "desired_pose": guidance.GetOutputPort("desired_pose"),
         "pose": station.get_pose_output_port(),
         "wrench": station.get_wrench_output_port(),
@@ -297,7 +261,6 @@ def build_task_diagram(
         num_steps=task.num_steps,
         observation_space=loop.space,
         reward_terms=reward.term_names,
-        ledger_fields=SafetyLedger.FIELDS,
         randomize=make_randomize(task, station, guidance),
         push=_push(station) if task.pushable else None,
         query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,

@@ -39,7 +39,6 @@ SAID = (
     "contact_force",
     "fallback",
     "control_steps",
-    "ledger",
     "simulation_failure",
 )
 """What `info` says of every task: no reward term and nothing that a reset draws can have one of these names."""
@@ -64,8 +63,7 @@ class GuidedEnv(DrakeGymEnv):
     `info` has at every step, and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
     `constraint_violation` and `measured_violation` (the worst of the step; negative is slack), `contact_force` (the
     largest of the step, N), `fallback` (whether guidance fell back to something safe in it), every reward term by name
-    (summed over the step), and `control_steps` since the reset. At the end of an episode it also has `ledger`, the
-    safety ledger's row as a dict. A reset's `info` also has what the task drew.
+    (summed over the step), and `control_steps` since the reset. A reset's `info` also has what the task drew.
 
     An episode that lasts as long as the task allows is truncated with `termination` "time_limit". Where the simulation
     itself fails (a solver that doesn't converge, NaN), the episode is truncated with the last sound observation, and
@@ -100,7 +98,7 @@ class GuidedEnv(DrakeGymEnv):
         """
         if isinstance(action_repeat, bool) or not isinstance(action_repeat, int | np.integer) or action_repeat < 1:
             raise InputError(
-                f"hold is the number of control steps an action lasts: give an integer from 1, not {action_repeat}"
+                f"action_repeat is the number of control steps of an action: give an integer from 1, not {action_repeat}"
             )
         diagram = task.diagram
         _check_view(task, render_mode)
@@ -138,7 +136,6 @@ class GuidedEnv(DrakeGymEnv):
         self._termination_port = diagram.GetOutputPort("termination")
         self._recorded = [(name, diagram.GetOutputPort(name)) for name in RECORDED if diagram.HasOutputPort(name)]
         self._force_port = diagram.GetOutputPort("contact_force")
-        self._ledger_port = diagram.GetOutputPort("ledger")
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
         self._pose_port = diagram.GetOutputPort("pose")
         sizes = {name: port.size() for name, port in self._recorded}
@@ -266,10 +263,6 @@ class GuidedEnv(DrakeGymEnv):
             info["simulation_failure"] = failure
         else:
             self._observation = self._observe(context)
-            if terminated or truncated:
-                info["ledger"] = dict(
-                    zip(self.task.ledger_fields, self._ledger_port.Eval(context).tolist(), strict=True)
-                )
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
 

@@ -24,7 +24,6 @@ PORTS = (
     "commanded_violation",
     "measured_violation",
     "contact_force",
-    "ledger",
     "desired_pose",
     "pose",
     "fallback",
@@ -97,7 +96,6 @@ class TaskDiagram:
     ``commanded_violation`` (1,) max over the constraints of c - G y of the commanded output; negative is slack
     ``measured_violation``  (1,) the same of the measured one
     ``contact_force``       (1,) N
-    ``ledger``              the `SafetyLedger`'s row, named as in `ledger_fields`
     ``desired_pose``        (O,) what is commanded
     ``pose``                (O,) what is measured
     ``fallback``            (1,) 1 where guidance commanded something safe instead of what was asked for
@@ -119,7 +117,6 @@ class TaskDiagram:
         num_steps: control steps after which an episode is truncated.
         observation_space: the space of observations; its dtype is what the environment returns.
         reward_terms: names of the reward's terms, which are ports of the diagram and keys of `info`.
-        ledger_fields: names of the ledger's entries.
         randomize: called at every reset with the root context (just restored to how the diagram was built), the
             environment's own random generator and the reset's options; draws the episode's conditions, writes them
             into the context and returns what `info` should say about them. Refuses an unknown option by `InputError`.
@@ -137,7 +134,6 @@ class TaskDiagram:
     num_steps: int
     observation_space: gymnasium.spaces.Box
     reward_terms: tuple[str, ...]
-    ledger_fields: tuple[str, ...]
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]] = _nothing_to_randomize
     push: Callable[[Context, np.ndarray], None] | None = None
     query: OutputPort | None = None
@@ -165,5 +161,3 @@ class TaskDiagram:
                 or symmetry.actions.shape[1:] != 2 * (self.diagram.GetInputPort("action").size(),)
             ):
                 raise ValueError("a symmetry is of every observed number and of every action")
-        if len(self.ledger_fields) != self.diagram.GetOutputPort("ledger").size():
-            raise ValueError(f"the ledger has {self.diagram.GetOutputPort('ledger').size()} fields, not the named ones")

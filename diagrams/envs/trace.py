@@ -1,23 +1,43 @@
-"""What happened in an episode, control step by control step."""
+"""Trace of an episode: what was commanded, measured and rewarded in every control step, and its statistics."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 
-class EpisodeTrace:
-    """Commanded and measured pose, contact force and reward of every control step of an episode, and further signals.
+@dataclass(frozen=True)
+class Metric:
+    """Number that is computed from an episode, or from a table of episodes.
 
-    The arrays are views of storage that the next episode writes into: copy what should outlive a reset.
+    Attributes:
+        name: Name of its column.
+        unit: Unit, or the quantity that is counted; "" if there is none.
+        description: Definition in words.
+        compute: Function from the episode, or from the table of episodes, to the number.
+    """
+
+    name: str
+    unit: str
+    description: str
+    compute: Callable[[Any], Any]
+
+
+class EpisodeTrace:
+    """Record of an episode: one row for every control step, taken at its end.
+
+    The arrays are views of storage that the next episode overwrites: copy what has to outlive a reset.
     """
 
     def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int] | None = None):
-        """
+        """Construct an empty trace.
+
         Args:
-            num_steps: control steps that an episode can have.
-            num_outputs: O, the size of a pose.
-            period: seconds between control steps.
-            signals: the sizes of further signals by name.
+            num_steps: Largest number of control steps in an episode.
+            num_outputs: O, size of a pose.
+            period: Control period [s].
+            signals: Sizes of further signals by name.
         """
         self.period = period
         self._length = 0
@@ -28,36 +48,36 @@ class EpisodeTrace:
         self._signals = {name: np.empty((num_steps, size)) for name, size in (signals or {}).items()}
 
     def __len__(self) -> int:
-        """Control steps recorded so far."""
+        """Return the number of control steps recorded so far."""
         return self._length
 
     @property
     def commanded(self) -> np.ndarray:
-        """The commanded poses, (n, O)."""
+        """Commanded poses, (n, O)."""
         return self._commanded[: self._length]
 
     @property
     def measured(self) -> np.ndarray:
-        """The measured poses at the end of each control step, (n, O)."""
+        """Measured poses, (n, O)."""
         return self._measured[: self._length]
 
     @property
     def force(self) -> np.ndarray:
-        """The contact force of each control step, (n,), N."""
+        """Contact force, (n,) [N]."""
         return self._force[: self._length]
 
     @property
     def reward(self) -> np.ndarray:
-        """The reward of each control step, (n,)."""
+        """Reward, (n,)."""
         return self._reward[: self._length]
 
     @property
     def signals(self) -> dict[str, np.ndarray]:
-        """The further signals by name, (n, size) each."""
+        """Further signals by name, (n, size) each."""
         return {name: values[: self._length] for name, values in self._signals.items()}
 
     def clear(self) -> None:
-        """Forgets the episode."""
+        """Delete all control steps."""
         self._length = 0
 
     def append(
@@ -68,7 +88,15 @@ class EpisodeTrace:
         reward: float,
         signals: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Records one more control step; `signals` has a value for each further one."""
+        """Record one control step.
+
+        Args:
+            commanded: Commanded pose, (O,).
+            measured: Measured pose, (O,).
+            force: Contact force [N].
+            reward: Reward of the control step.
+            signals: Values of all further signals by name; NaN is recorded if they are left out.
+        """
         n = self._length
         self._commanded[n] = commanded
         self._measured[n] = measured
@@ -78,9 +106,44 @@ class EpisodeTrace:
             values[n] = signals[name] if signals is not None else np.nan
         self._length = n + 1
 
+    def statistics(self) -> dict[str, float]:
+        """Return the statistics of the episode's safety so far.
+
+        A maximum over no control steps is −∞, and 0 for the force; NaN is the maximum of values that contain it. A
+        collision lasts from its first control step in contact to its last; `collisions` counts them, `collision_steps`
+        their control steps. Without the signal that it is computed from, a violation is −∞ and a count is 0.
+        """
+        collision = self._is_positive("collision")
+        return {
+            "max_commanded_violation": self._largest("commanded_violation"),
+            "max_measured_violation": self._largest("measured_violation"),
+            "peak_force": float(self.force.max(initial=0.0)),
+            # Summed step by step: NumPy's mean adds in another order, which rounds differently.
+            "mean_force": float(np.cumsum(self.force)[-1] / len(self)) if len(self) else 0.0,
+            "collisions": float((collision & ~np.append(False, collision[:-1])).sum()),
+            "collision_steps": float(collision.sum()),
+            "saturated_steps": float(self.signals["saturation"].any(axis=1).sum())
+            if "saturation" in self._signals
+            else 0.0,
+            "fallback_steps": float(self._is_positive("fallback").sum()),
+            "steps": float(len(self)),
+        }
+
+    def _largest(self, name: str) -> float:
+        return float(self.signals[name].max(initial=-np.inf)) if name in self._signals else -np.inf
+
+    def _is_positive(self, name: str) -> np.ndarray:
+        """Return for each control step whether a signal of one number is positive, (n,); False without the signal."""
+        return self.signals[name][:, 0] > 0.0 if name in self._signals else np.zeros(len(self), bool)
+
 
 def mean_jerk(positions: np.ndarray, period: float) -> float:
-    """The mean norm of the third derivative of `positions` (n, O), by differences; 0 for fewer than four of them."""
+    """Return the mean norm of the third derivative of `positions`, by finite differences; 0 for fewer than four.
+
+    Args:
+        positions: Positions at equal intervals, (n, O).
+        period: Interval [s].
+    """
     if len(positions) < 4:
         return 0.0
     return float(np.linalg.norm(np.diff(positions, 3, axis=0), axis=1).mean() / period**3)

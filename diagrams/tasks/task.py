@@ -16,6 +16,7 @@ from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Station
 from guiderail.models.control.keep_out import KeepOut
@@ -49,7 +50,7 @@ class EpisodeConstant:
 class Threshold:
     """A signal that means a collision while it is above a limit.
 
-    The safety ledger counts these collisions, in `collisions` and `collision_steps`. They do not end an episode: a
+    The episode statistics count these collisions, in `collisions` and `collision_steps`. They do not end an episode: a
     `TerminationTerm` does.
 
     Attributes:
@@ -81,9 +82,10 @@ class Task(ABC):
         learner: the algorithm and the preset that `guiderail train` uses unless told otherwise.
         num_steps: control steps after which an episode is over; must be given, in the class or in `__init__`.
         clip: the largest absolute value in an observation; larger ones are clipped.
-        collision: the signal that the ledger's `collisions` counts, and its limit; any contact force unless given, and
+        collision: the signal that the statistic `collisions` counts, and its limit; any contact force unless given, and
             then an evaluation leaves the count out. A `TerminationTerm` that ends an episode as a collision is not counted by
             itself.
+        statistics: Statistics of a table of episodes that only this task has; studies name them.
         isotropic_groups: indices of outputs of one unit, group by group; residual learning moves all outputs of a group
             alike. None is one group of all.
         pushable: whether `GuidedEnv.push` may displace the robot.
@@ -106,6 +108,7 @@ class Task(ABC):
     learner: ClassVar[Mapping[str, Any]] = {"algorithm": "tqc", "preset": "tqc_contact"}
     num_steps: int
     clip: ClassVar[float] = 3.0
+    statistics: ClassVar[tuple[Metric, ...]] = ()
     collision: Threshold = Threshold()
     has_held_out_distribution: ClassVar[bool] = False
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -35,3 +37,13 @@ def numbers(values: ArrayLike, what: str) -> np.ndarray:
     if given.dtype.kind in "iu" and given.dtype.itemsize == 8 and (np.abs(array) >= _EXACT).any():
         raise InputError(f"{what} holds whole numbers of 2^53 and more, which a double rounds: subtract an offset")
     return array
+
+
+def find_streak(successes: Iterable[bool], length: int) -> int | None:
+    """Return the index at which the first streak of `length` successes begins, or None if there is none."""
+    streak = 0
+    for index, success in enumerate(successes):
+        streak = streak + 1 if success else 0
+        if streak == length:
+            return index + 1 - length
+    return None

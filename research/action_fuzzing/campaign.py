@@ -92,7 +92,7 @@ def run_campaign(
     *,
     seed: int = 0,
     out: Path | None = None,
-    ledger: Path | None = None,
+    step_log: Path | None = None,
     environment: Mapping[str, Any] | None = None,
     say: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
@@ -103,7 +103,7 @@ def run_campaign(
         enough: is asked before each episode, and told the rows so far.
         seed: of the first episode; episode i has seed + i.
         out: a table that grows with every round of the cases; episodes in it are not run again.
-        ledger: a folder for every control step, a file an episode; none unless given.
+        step_log: a folder for every control step, a file an episode; none unless given.
         environment: arguments that every case has besides its own.
         say: is told what each round came to.
 
@@ -133,7 +133,7 @@ def run_campaign(
             env = make_environment(campaign.task, wheres[case.name])
             watching: list[Callback] = [Finite(env), RecomputedViolation(env, campaign.frames)]
             watching += [campaign.witness(env)] if campaign.witness else []
-            watching += [StepLog(env, ledger)] if ledger is not None else []
+            watching += [StepLog(env, step_log)] if step_log is not None else []
             environments[case.name] = env, watching
         env, watching = environments[case.name]
         own = seed + len(rows)
@@ -230,7 +230,7 @@ def stress(
         episodes: how many; 1000 unless given, and not for all tasks.
         steps: control steps, instead.
         seed: of the first episode of each task.
-        out: of one task a table; of all a folder with a table for each, and a ledger of every control step. What is in
+        out: of one task a table; of all a folder with a table for each, and a step log with every control step. What is in
             it is not run again.
         environment: arguments that every case has besides its own.
         say: is told what each round came to.
@@ -261,9 +261,9 @@ def stress(
 def _stress_all(steps: int, *, seed: int, out: Path | None, say: Callable[[str], None] | None) -> dict[str, Any]:
     found = {}
     for task in STRESSED:
-        table, ledger = (None, None) if out is None else (out / f"{task}.csv", out / "ledger" / task)
+        table, step_log = (None, None) if out is None else (out / f"{task}.csv", out / "steps" / task)
         told = None if say is None else _told(say, task)
-        found[task] = _stress(task, 0, steps, seed, table, ledger, None, told)
+        found[task] = _stress(task, 0, steps, seed, table, step_log, None, told)
     return {
         "tasks": found,
         "control_steps": sum(one["all"]["control_steps"] for one in found.values()),
@@ -283,7 +283,7 @@ def _stress(
     steps: int | None,
     seed: int,
     out: Path | None,
-    ledger: Path | None,
+    step_log: Path | None,
     environment: Mapping[str, Any] | None,
     say: Callable[[str], None] | None,
 ) -> dict[str, Any]:
@@ -299,7 +299,7 @@ def _stress(
             return sum(row["steps"] for row in rows) >= steps
         return len(rows) >= episodes
 
-    rows = run_campaign(campaign, enough, seed=seed, out=out, ledger=ledger, environment=environment, say=say)
+    rows = run_campaign(campaign, enough, seed=seed, out=out, step_log=step_log, environment=environment, say=say)
     cases, wrong = {}, []
     for case in campaign.cases:
         if some := [row for row in rows if row["case"] == case.name]:

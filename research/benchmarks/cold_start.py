@@ -20,7 +20,7 @@ from typing import Any
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import evaluate_run
-from guiderail.tools.evaluation.rollout import as_learned
+from guiderail.tools.evaluation.rollout import check_compatible
 from guiderail.tools.learning.run_folder import RunFolder
 from research.benchmarks import told
 
@@ -62,7 +62,9 @@ def measure(
         for seed, kind in told([(seed, kind) for seed in seeds for kind in KINDS], "run"):
             out = Path(folder) / f"{seed}-{KINDS[kind]}"
             seconds = _train(task, options, episodes, seed, KINDS[kind], out, imports)
-            judged = evaluate_run(RunFolder(out).config(), partial(as_learned, Policy.load(out)), episodes=held_out)
+            judged = evaluate_run(
+                RunFolder(out).config(), partial(check_compatible, Policy.load(out)), episodes=held_out
+            )
             success = float((judged["termination"] == "success").mean())
             runs.append({"kind": kind, "seed": seed, "seconds": seconds, "success_rate": success})
     return {"task": task, "environment": dict(options), "episodes": episodes, "held_out": held_out, "runs": runs}

@@ -1,6 +1,6 @@
 """What it costs that nothing of a run is lost: `guiderail bench saving`.
 
-A short run is trained, and the time for its ledger and its checkpoints is given as a part of the whole: in wall clock,
+A short run is trained, and the time for its step log and its checkpoints is given as a part of the whole: in wall clock,
 as most of it is waiting for the disk.
 """
 
@@ -45,22 +45,26 @@ def timed(owner: Any, name: str) -> Iterator[list[float]]:
 def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     """Trains a run of so many episodes in a temporary folder: what saving it took, as parts of the whole."""
     config = configure(task, {}, **with_defaults(task, {"episodes": episodes, "seed": seed}))
-    with tempfile.TemporaryDirectory() as folder, timed(StepLog, "end") as ledger, timed(train, "_save") as checkpoints:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        timed(StepLog, "on_episode_end") as step_log,
+        timed(train, "_save") as checkpoints,
+    ):
         rows = train.train(RunFolder(Path(folder) / "run"), config)
     seconds = sum(row["wall_time"] for row in rows) + sum(checkpoints)
     return {
         "seconds": seconds,
-        "ledger_share": sum(ledger) / seconds,
+        "step_log_share": sum(step_log) / seconds,
         "checkpoint_share": sum(checkpoints) / seconds,
         "checkpoints": len(checkpoints),
-        "ledger_ms_per_episode": 1e3 * sum(ledger) / len(ledger),
+        "step_log_ms_per_episode": 1e3 * sum(step_log) / len(step_log),
     }
 
 
 def measure() -> dict[str, Any]:
     """All of it, as a program may read it."""
     results: dict[str, Any] = {task: saving_share(task, TASKS[task]) for task in told(TASKS, "saving")}
-    shares = [results[task]["ledger_share"] + results[task]["checkpoint_share"] for task in TASKS]
+    shares = [results[task]["step_log_share"] + results[task]["checkpoint_share"] for task in TASKS]
     results["cheap_enough"] = max(shares) <= REQUIRED_SHARE
     return results
 
@@ -70,7 +74,7 @@ def show(results: dict[str, Any]) -> None:
     for task, episodes in TASKS.items():
         row = results[task]
         print(
-            f"{task:14s} {episodes} episodes in {row['seconds']:.0f} s: ledger {row['ledger_share']:.2%} "
-            f"({row['ledger_ms_per_episode']:.1f} ms an episode), {row['checkpoints']} checkpoints "
+            f"{task:14s} {episodes} episodes in {row['seconds']:.0f} s: step log {row['step_log_share']:.2%} "
+            f"({row['step_log_ms_per_episode']:.1f} ms an episode), {row['checkpoints']} checkpoints "
             f"{row['checkpoint_share']:.2%} (at most {REQUIRED_SHARE:.0%} together)"
         )

@@ -90,7 +90,6 @@ def built():
         systems.Residual(np.ones(2)),
         systems.RewardSystem([term]),
         systems.SafetyFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0), PERIOD),
-        systems.SafetyLedger(PERIOD),
         systems.SctInputMapping(template, frames, PERIOD),
         systems.SctStateMachine(template, frames, PERIOD),
         systems.SensorDisturbance(PERIOD, np.ones(2), delay=1),

@@ -9,6 +9,8 @@ from gymnasium import spaces
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
 
+VIOLATIONS = {"commanded_violation": 1, "measured_violation": 1}
+
 
 class Bead(gymnasium.Env):
     metadata = {"render_modes": ["human"]}  # noqa: RUF012
@@ -22,7 +24,7 @@ class Bead(gymnasium.Env):
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
         self.action_repeat, self.wall, self.render_mode = action_repeat, wall, render_mode
         self.task = SimpleNamespace(num_steps=12, reward_terms=("goal_distance",), control_period=0.1, symmetry=None)
-        self.trace, self.length = EpisodeTrace(250, 2, 0.1), 12
+        self.trace, self.length = EpisodeTrace(250, 2, 0.1, VIOLATIONS), 12
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -47,14 +49,13 @@ class Bead(gymnasium.Env):
         for _ in range(self.action_repeat):
             self.x = np.minimum(self.x + 0.1 * np.asarray(action, float), self.wall)
             reward = -float(np.linalg.norm(self.x - [0.5, 0.5]))
-            self.trace.append(self.x, self.x, 1.0, reward)
+            violation = self.x[:1] - 1.0
+            self.trace.append(self.x, self.x, 1.0, reward, dict.fromkeys(VIOLATIONS, violation))
             total += reward
             if done := reward > -0.2 or len(self.trace) == self.length:
                 break
         termination = ("success" if reward > -0.2 else "time_limit") if done else ""
         info = self._info(termination, total)
-        if done:
-            info["ledger"] = {"collisions": 0.0, "fallback_steps": 0.0}
         return self._observation(), total, termination == "success", termination == "time_limit", info
 
 

@@ -9,7 +9,7 @@ from guiderail.tools.certify import _what
 from guiderail.tools.environments import changed_environment, check_environment, make_environment
 from guiderail.tools.evaluation import evaluate
 from guiderail.tools.evaluation.robustness import robustness
-from guiderail.tools.evaluation.rollout import as_learned
+from guiderail.tools.evaluation.rollout import check_compatible
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.study import Job, run_job
 from guiderail.tools.learning.run_folder import RunFolder
@@ -76,12 +76,23 @@ def test_a_policy_is_shown_and_certified_at_another_difficulty(tmp_path):
     assert _what(str(tmp_path), HARD)[1] == hard
 
 
-def test_a_policy_that_sees_or_moves_other_things_is_refused_in_a_sentence():
+def test_policy_is_refused_with_both_shapes_when_they_differ():
     env = make_environment("Bead", {})
-    as_learned(policy(3, 2), env)
-    for other in (policy(4, 2), policy(3, 1)):
-        with pytest.raises(InputError, match="saw or moved where it learned"):
-            as_learned(other, env)
+    check_compatible(policy(3, 2), env)
+    for other, shapes in ((policy(4, 2), r"\(4,\) and returns actions \(2,\)"), (policy(3, 1), r"\(3,\) .* \(1,\)")):
+        with pytest.raises(
+            InputError, match=rf"takes observations {shapes}, .* observations \(3,\) and actions \(2,\)"
+        ):
+            check_compatible(other, env)
+
+
+def test_policy_is_refused_with_the_options_that_differ():
+    env = make_environment("NarrowPassage", {"guidance": "kgrl"})
+    learned_in = check_environment("NarrowPassage", {"guidance": "kgrl", **HARD})
+    with pytest.raises(
+        InputError, match="it learned with difficulty='hard' instead of 'standard', gap_width=0.03 inst"
+    ):
+        check_compatible(policy(4, 2), env, learned_in)
 
 
 @pytest.mark.parametrize("chosen", [{"difficulty": "hard"}, {"station": "arm", "action_repeat": 7}])

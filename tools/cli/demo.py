@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 from rich.console import Console
 
+from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import still
-from guiderail.tools.evaluation.metrics import TOLERANCE, avoids_obstacle_from
+from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder

@@ -34,10 +34,10 @@ def list_(
             names |= describe_all()
         print_result(names, as_json)
     elif name == "metrics":
-        from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS
+        from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
-        metrics = [*(("episode: ", one) for one in COLUMNS), *(("episodes: ", one) for one in STATISTICS.values())]
-        text = {prefix + one.name: one.words + (f" [{one.unit}]" if one.unit else "") for prefix, one in metrics}
+        metrics = [*(("episode: ", one) for one in COLUMNS), *(("episodes: ", one) for one in statistics_of().values())]
+        text = {prefix + one.name: one.description + (f" [{one.unit}]" if one.unit else "") for prefix, one in metrics}
         print_result(text, as_json, "_")
     elif name in cli.LISTED:
         print_result({name: cli.LISTED[name]()}, as_json)

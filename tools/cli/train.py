@@ -96,7 +96,7 @@ def train(
         from guiderail.tools.hardware.train import train_on_robot
 
         given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
-        given |= {"ledger": step_log, "imports": modules}
+        given |= {"step_log": step_log, "imports": modules}
         connection = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
         result = train_on_robot(
             task,
@@ -124,7 +124,7 @@ def train(
         seed=seed,
         resume=resume,
         imports=modules,
-        ledger=step_log,
+        step_log=step_log,
         person=_wait_for_supervisor if human_in_the_loop else None,
         demonstrator=_scripted_policy,
     )

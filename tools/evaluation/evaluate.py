@@ -20,7 +20,7 @@ from guiderail.tools.environments import changed_environment, make_environment, 
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.metrics import episodes_to_convergence, summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
-from guiderail.tools.evaluation.rollout import PolicyFn, as_learned, check_seed, rollout, suits
+from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, check_seed, is_compatible, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.tables import read_table, table_text
@@ -156,7 +156,9 @@ def evaluate(
         name: f"series {number} of {1 + len(them)}: {SERIES.get(name, name)}"
         for number, name in enumerate(("policy", *them), start=1)
     }
-    rows = evaluate_run(config, partial(as_learned, policy), where, words=series["policy"], **how)
+    rows = evaluate_run(
+        config, partial(check_compatible, policy, learned_in=config.environment), where, words=series["policy"], **how
+    )
     if where == config.environment and not resample_offsets:
         write_atomically(learned_file(folder.path, len(trained), seed, episodes), table_text(rows).encode())
     kept, judged = folder.path / "baselines", {}
@@ -220,7 +222,7 @@ def _can_hide(task: str) -> bool:
 
 
 def _counts_collisions(task: str) -> bool:
-    """Whether a task declares what a collision is; a `TerminationTerm` that ends an episode as one is none of the ledger."""
+    """Whether a task declares what a collision is; a `TerminationTerm` that ends an episode as one is not counted."""
     return task not in TASKS.names() or TASKS.get(task).declares_collision()
 
 
@@ -279,6 +281,6 @@ class _NotSuitedError(Exception):
 
 def _suited(policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> PolicyFn:
     """What acts, if its observations and actions are the environment's."""
-    if not suits(policy, env):
+    if not is_compatible(policy, env):
         raise _NotSuitedError
     return policy(env)

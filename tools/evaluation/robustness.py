@@ -23,7 +23,7 @@ from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, hides, judged_once
 from guiderail.tools.evaluation.metrics import wilson
-from guiderail.tools.evaluation.rollout import PolicyFn, as_learned
+from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import is_demonstrated, label, legend, new_figure, save_figure
@@ -342,7 +342,13 @@ def _policies(runs: Sequence[Path], environment: Mapping[str, Any], tell: Callab
     if differing:
         tell(f"the runs differ in {', '.join(differing)}")
     return [
-        _Who(name, partial(as_learned, Policy.load(folder.path)), config, one, _digest(folder))
+        _Who(
+            name,
+            partial(check_compatible, Policy.load(folder.path), learned_in=config.environment),
+            config,
+            one,
+            _digest(folder),
+        )
         for name, folder, config, one in zip(names, folders, configs, where, strict=True)
     ]
 

@@ -1,4 +1,4 @@
-"""The loop of an episode: the same one for training, evaluation, replays, films, studies, stress and driving."""
+"""Loop of an episode, the same for training, evaluation, replays, films, studies, fuzzing and teleoperation."""
 
 from __future__ import annotations
 
@@ -9,17 +9,26 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.metrics import Episode, episode_row
 
 PolicyFn = Callable[[np.ndarray], np.ndarray]
-COUNTED = {"collision", "saturation", "fallback"}
 
 
 @dataclass(frozen=True)
 class Transition:
-    """A decision of an episode and what followed; `info` is the environment's."""
+    """Action of an episode and its outcome.
+
+    Attributes:
+        observation: Observation before the action.
+        action: Action.
+        reward: Reward.
+        following: Observation after the action.
+        terminated: True if the task ended the episode.
+        truncated: True if the episode ended for another reason.
+        info: `info` of the environment's step.
+    """
 
     observation: np.ndarray
     action: np.ndarray
@@ -31,46 +40,47 @@ class Transition:
 
     @property
     def is_last(self) -> bool:
-        """Whether the episode is over."""
+        """True if the episode is over."""
         return self.terminated or self.truncated
 
 
 class Callback:
-    """Watches an episode: a learner, a camera, a witness."""
+    """Callback of an episode, such as a learner or a camera."""
 
     def on_episode_start(self) -> None:
-        """Called after the environment was reset."""
+        """Call after the environment was reset."""
 
-    def on_step(self, decision: Transition) -> None:
-        """Called after every decision."""
+    def on_step(self, transition: Transition) -> None:
+        """Call after every action."""
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Called with the episode's row; what it returns are further columns."""
+        """Call with the episode's row; return further columns."""
         return {}
 
 
 class EnvCallback(Callback):
-    """One that also looks at what an environment's step doesn't return.
+    """Callback that reads more of an environment than its step returns.
 
     Attributes:
-        env: the environment.
-        base: the same without its wrappers.
+        env: Environment.
+        base: Environment without its wrappers.
     """
 
     def __init__(self, env: gymnasium.Env):
-        """
+        """Construct the callback.
+
         Args:
-            env: the environment.
+            env: Environment.
         """
         self.env: Any = env
         self.base: Any = env.unwrapped
 
 
 def check_seed(seed: int) -> None:
-    """Refuses a seed that no environment takes.
+    """Refuse a seed that no environment takes.
 
     Raises:
-        InputError: if it is negative, or does not fit into 31 bits.
+        InputError: If it is negative, or does not fit into 31 bits.
     """
     if not 0 <= seed < 2**31:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}")
@@ -85,114 +95,101 @@ def rollout(
     held_out: bool = False,
     options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Runs one episode and returns its row; the environment's trace is still that episode's afterwards.
+    """Run one episode and return its row; the environment's trace holds that episode afterwards.
 
     Args:
-        env: the environment.
-        act: the policy; one that is an observer too is told of the episode.
-        observers: who watches.
-        index: the row's number.
-        seed: of the reset; unless given, the next conditions that training would meet.
-        held_out: whether the conditions are ones that training never meets; then the seed decides them.
-        options: of the reset.
+        env: Environment.
+        act: Policy; it is called as a callback too if it is one.
+        observers: Callbacks.
+        index: Number of the row.
+        seed: Seed of the reset; default: the next conditions of the training distribution.
+        held_out: Sample the conditions from the held-out distribution, by the seed.
+        options: Options of the reset.
     """
     observation = (
         reset_held_out(env, seed or 0, **(options or {}))
         if held_out
         else env.reset(seed=seed, options=None if options is None else dict(options))[0]
     )
-    tally = _Tally(env)
-    watching = (tally, *([act] if isinstance(act, Callback) and act not in observers else []), *observers)
-    for observer in watching:
-        observer.on_episode_start()
-    over = False
-    while not over:
+    base: Any = env.unwrapped
+    callbacks = (*([act] if isinstance(act, Callback) and act not in observers else []), *observers)
+    for callback in callbacks:
+        callback.on_episode_start()
+    total, terms = 0.0, dict.fromkeys(base.task.reward_terms, 0.0)
+    is_over = False
+    while not is_over:
         action = act(observation)
         following, reward, terminated, truncated, info = env.step(action)
-        decision = Transition(observation, action, float(reward), following, terminated, truncated, info)
-        for observer in watching:
-            observer.on_step(decision)
-        observation, over = following, decision.is_last
-    row = tally.row(index)
-    for observer in watching:
-        row |= observer.on_episode_end(row)
+        transition = Transition(observation, action, float(reward), following, terminated, truncated, info)
+        total += transition.reward
+        terms = {name: value + float(info[name]) for name, value in terms.items()}
+        for callback in callbacks:
+            callback.on_step(transition)
+        observation, is_over = following, transition.is_last
+    row = episode_row(Episode(index, base.trace, total, terms, info))
+    for callback in callbacks:
+        row |= callback.on_episode_end(row)
     return row
 
 
 class Paths(EnvCallback):
-    """Adds the poses that were commanded and measured, (n, O) each, to an episode's row."""
+    """Callback that adds the commanded and measured poses, (n, O) each, to an episode's row."""
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """`commanded` and `measured`."""
+        """Return the columns `commanded` and `measured`."""
         trace = self.base.trace
         return {"commanded": trace.commanded.copy(), "measured": trace.measured.copy()}
 
 
-class _Tally(EnvCallback):
-    """Adds up what the trace and the ledger don't hold. (Where the simulation failed or a person ended the episode
-    there is no ledger: then what was seen until there takes its place.)
-    """
-
-    def on_episode_start(self) -> None:
-        self._terms: dict[str, float] = dict.fromkeys(self.base.task.reward_terms, 0.0)
-        self._total, self._worst = 0.0, {"max_commanded_violation": -np.inf, "max_measured_violation": -np.inf}
-        self._last: Mapping[str, Any] = {}
-
-    def on_step(self, decision: Transition) -> None:
-        self._total += decision.reward
-        self._last = decision.info
-        for name, key in zip(self._worst, ("constraint_violation", "measured_violation"), strict=True):
-            self._worst[name] = max(self._worst[name], decision.info[key])
-        for name in self._terms:
-            self._terms[name] += float(decision.info[name])
-
-    def row(self, index: int) -> dict[str, Any]:
-        """The episode's row."""
-        trace = self.base.trace
-        force = np.asarray(trace.force)
-        seen = {"peak_force": force.max(initial=0.0), "mean_force": force.mean() if len(force) else 0.0, **self._worst}
-        if "ledger" not in self._last and trace.signals.keys() >= COUNTED:
-            from guiderail.systems.safety_ledger import SafetyLedger  # Drake takes a second
-
-            seen |= SafetyLedger.counts(trace.signals)
-        failed = "simulation_failure" in self._last
-        return episode_row(
-            Episode(
-                index=index,
-                trace=trace,
-                ledger={**seen, **self._last.get("ledger", {})},
-                total=self._total,
-                terms=self._terms,
-                success=bool(self._last["is_success"]),
-                termination="simulation_failure" if failed else self._last["termination"],
-            )
-        )
-
-
 def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
-    """Starts an episode with conditions that training never meets; `options` are further ones of the reset."""
+    """Start an episode with held-out conditions; `options` are further options of the reset."""
     return env.reset(seed=seed, options={"held_out": True} | options)[0]
 
 
-def suits(acts: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Whether what it says to a few observations are actions of the environment's shape.
+def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
+    """Return True if a policy's actions for several observations have the shape of the environment's actions.
 
-    A few, because a rule may look at a number that isn't there only in the middle of an episode.
+    Several observations are tried because a scripted policy may index an entry only in the middle of an episode.
     """
-    acting, shape = acts(env), env.observation_space.shape or ()
+    act, shape = make_policy(env), env.observation_space.shape or ()
     try:
-        found = {np.shape(acting(np.full(shape, value, np.float32))) for value in np.linspace(-1.0, 1.0, 21)}
+        shapes = {np.shape(act(np.full(shape, value, np.float32))) for value in np.linspace(-1.0, 1.0, 21)}
     except (IndexError, ValueError):
         return False
-    return found == {env.action_space.shape}
+    return shapes == {env.action_space.shape}
 
 
-def as_learned(policy: Policy, env: gymnasium.Env) -> PolicyFn:
-    """A learned policy, in an environment that may be another one than where it learned.
+def check_compatible(policy: Policy, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
+    """Return a learned policy for an environment that may differ from the one it learned in.
+
+    Args:
+        policy: Learned policy.
+        env: Environment.
+        learned_in: Options of the environment that it learned in, for the message.
 
     Raises:
-        InputError: if what it sees or moves is not this environment's.
+        InputError: If the shape of its observations or its actions is another one than the environment's.
     """
-    if not suits(lambda env: policy, env):
-        raise InputError("what the policy saw or moved where it learned is not what this environment has: change --env")
-    return policy
+    if is_compatible(lambda env: policy, env):
+        return policy
+    raise InputError(_describe_mismatch(policy, env, learned_in))
+
+
+_MAX_DIFFERENCES = 5  # options that a message names
+
+
+def _describe_mismatch(policy: Policy, env: gymnasium.Env, learned_in: Mapping[str, Any] | None) -> str:
+    """Return a sentence with the shapes of policy and environment, and the options in which their environments differ."""
+    sees, moves = tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
+    config = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
+    options = {} if config is None else config.config.options
+    changed = [
+        f"{name}={brief(value)} instead of {brief(options[name])}"
+        for name, value in (learned_in or {}).items()
+        if name in options and options[name] != value
+    ][:_MAX_DIFFERENCES]
+    differences = f"; it learned with {', '.join(changed)}" if changed else ""
+    return (
+        f"the policy takes observations {sees} and returns actions {moves}, and this environment has observations "
+        f"{env.observation_space.shape} and actions {env.action_space.shape}{differences}: change --env"
+    )

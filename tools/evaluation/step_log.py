@@ -1,4 +1,4 @@
-"""The ledger of a run: what happened at every control step, a Parquet file for each episode, in the run's `ledger/`."""
+"""Step log of a run: one row for every control step, one Parquet file for each episode, in the run's `steps/`."""
 
 from __future__ import annotations
 
@@ -19,62 +19,65 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import EnvCallback
 from guiderail.tools.files import write_atomically
 
-SLACK = "how far outside of the constraint: negative is slack"
-# Each column, its unit and meaning; "_i" stands for a column for every number of a pose or a wrench.
+SLACK = "distance outside of the constraint; negative is slack"
+# Unit and meaning of each column; "_i" stands for a column for every number of a pose or a wrench.
 MEANINGS = {
     "episode": ("", "number of the episode, from 0"),
-    "step": ("control steps", "number of the control step, from 0; everything is of its end"),
-    "desired_pose_i": ("m, rad", "what was commanded"),
-    "pose_i": ("m, rad", "what was measured"),
-    "commanded_violation": (SLACK, "of what was commanded"),
-    "measured_violation": (SLACK, "of what was measured"),
-    "contact_force": ("N", "the contact force"),
-    "wrench_i": ("N, Nm", "of the surroundings on the tool"),
-    "saturation": ("", "the greatest demand on an actuator beyond its limit, 0 within"),
-    "collision": ("", "whether the robot touched what it must not"),
-    "command_timed_out": ("", "whether the watchdog held the last safe pose"),
-    "fallback": ("", "whether guidance commanded something safe instead of what was asked for"),
-    "state": ("", "number of the template's state, where there is one"),
-    "reward": ("reward", "of the control step"),
+    "step": ("control steps", "number of the control step, from 0; all values are those at its end"),
+    "desired_pose_i": ("m, rad", "commanded pose"),
+    "pose_i": ("m, rad", "measured pose"),
+    "commanded_violation": (SLACK, "violation of the commanded pose"),
+    "measured_violation": (SLACK, "violation of the measured pose"),
+    "contact_force": ("N", "contact force"),
+    "wrench_i": ("N, Nm", "wrench of the surroundings on the tool"),
+    "saturation": ("", "largest demand on an actuator beyond its limit, 0 within it"),
+    "collision": ("", "True in a collision"),
+    "command_timed_out": ("", "True while the last safe pose is held because commands stopped"),
+    "fallback": ("", "True where guidance commanded something safe instead of the requested pose"),
+    "state": ("", "number of the template's state, if there is a template"),
+    "reward": ("reward", "reward of the control step"),
 }
 _FLAGS = {"collision", "command_timed_out", "fallback"}
 
 
 class StepLog(EnvCallback):
-    """Writes what an episode's control steps were as the episode ends: before a checkpoint can know of it.
+    """Callback that writes an episode's control steps when it ends, before a checkpoint counts the episode.
 
     Attributes:
-        seconds: how long that has taken so far.
+        seconds: Time spent so far [s].
     """
 
     def __init__(self, env: gymnasium.Env, folder: Path):
-        """
+        """Construct the callback.
+
         Args:
-            env: the environment.
-            folder: where the files go, one an episode.
+            env: Environment.
+            folder: Folder of the files, one for each episode.
         """
         super().__init__(env)
         self._folder = folder
         self.seconds = 0.0
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Writes; adds no column."""
+        """Write the episode; add no column to its row."""
         started = time.perf_counter()
-        write_ledger(ledger_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
+        write_step_log(step_log_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
         self.seconds += time.perf_counter() - started
         return {}
 
 
-def ledger_file(folder: Path, episode: int) -> Path:
-    """Where an episode is written."""
+def step_log_file(folder: Path, episode: int) -> Path:
+    """Return the path of an episode's file."""
     return folder / f"episode-{episode:06d}.parquet"
 
 
 def table(trace: EpisodeTrace, episode: int) -> pa.Table:
-    """An episode's control steps, a row each, with the columns of `MEANINGS` that its environment knows."""
+    """Return an episode's control steps, one row each, with the columns of `MEANINGS` that its trace holds."""
     number = len(trace)
-    columns: dict[str, np.ndarray] = {"episode": np.full(number, episode, np.int32), "step": np.arange(number)}
-    columns["step"] = columns["step"].astype(np.int32)
+    columns: dict[str, np.ndarray] = {
+        "episode": np.full(number, episode, np.int32),
+        "step": np.arange(number, dtype=np.int32),
+    }
     columns |= _numbered("desired_pose", trace.commanded) | _numbered("pose", trace.measured)
     columns["contact_force"] = trace.force
     for name, values in trace.signals.items():
@@ -96,38 +99,38 @@ def _numbered(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{name}_{index}": values[:, index] for index in range(values.shape[1])}
 
 
-def write_ledger(path: Path, rows: pa.Table) -> None:
-    """Writes an episode's control steps: whole, or not at all.
+def write_step_log(path: Path, rows: pa.Table) -> None:
+    """Write an episode's control steps atomically.
 
     Raises:
-        InputError: if they cannot be written.
+        InputError: If the file cannot be written.
     """
     file = io.BytesIO()
-    # Random digits hardly compress, and whoever packs them pays with time.
+    # Uncompressed: sensor noise does not compress and compression costs time.
     pq.write_table(rows, file, compression="NONE", use_dictionary=False)
     write_atomically(path, file.getvalue())
 
 
-def read_ledger(folder: Path, columns: list[str] | None = None) -> pd.DataFrame:
-    """The control steps of all episodes in a folder, in order.
+def read_step_log(folder: Path, columns: list[str] | None = None) -> pd.DataFrame:
+    """Return the control steps of all episodes in a folder, in order.
 
     Args:
-        folder: a run's `ledger/`.
-        columns: those that are wanted, all of them unless given; one that a file lacks is refused.
+        folder: A run's `steps/`.
+        columns: Names of the columns to read; default: all. A column that a file lacks is refused.
 
     Raises:
-        InputError: if there is no ledger, or a file is damaged.
+        InputError: If there is no step log, or a file is damaged.
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:
-        raise InputError(f"{folder} holds no ledger: the run was trained without one, or with an earlier version")
+        raise InputError(f"{folder} holds no step log: the run was trained without one")
     tables = []
     for file in files:
         try:
             tables.append(pq.read_table(file, columns=columns, partitioning=None))
         except (pa.ArrowException, OSError, KeyError) as error:
-            raise InputError(f"{file} is damaged: restore it, or train anew") from error
+            raise InputError(f"{file} is damaged: restore it, or train again") from error
     try:
         return pa.concat_tables(tables).to_pandas()
     except pa.ArrowInvalid as error:
-        raise InputError(f"{folder} holds ledgers of different environments: restore them, or train anew") from error
+        raise InputError(f"{folder} holds step logs of different environments: restore them, or train again") from error

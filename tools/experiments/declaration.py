@@ -7,13 +7,22 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
-from guiderail.tools.evaluation.metrics import STATISTICS
+from guiderail.tools.evaluation.metrics import statistics_of
 
 Whole = Annotated[int, Field(strict=True)]  # YAML's `true` would be 1 otherwise
 FolderName = Annotated[str, Field(pattern=r"^[\w.-]+$")]
@@ -120,10 +129,11 @@ class Study(_Strict):
 
     @field_validator("statistics")
     @classmethod
-    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _known(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        known = statistics_of(info.data.get("task", ""))
         for name in names:
-            if name not in STATISTICS:
-                raise ValueError(f"there is no statistic {name!r}: {did_you_mean(name, STATISTICS)}")
+            if name not in known:
+                raise ValueError(f"there is no statistic {name!r}: {did_you_mean(name, known)}")
         return names
 
     @property

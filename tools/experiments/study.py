@@ -33,7 +33,7 @@ from guiderail.tools.environments import (
 from guiderail.tools.evaluation.baselines import always
 from guiderail.tools.evaluation.evaluate import cached, evaluate_run
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import PolicyFn, as_learned, rollout
+from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, rollout
 from guiderail.tools.evaluation.scripted import make_baseline
 from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Ratio, Study
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
@@ -313,7 +313,7 @@ def run_job(job: Job) -> list[dict[str, Any]]:
         algorithm = job.config(mark).learner.algorithm if job.learns else ""
         policy = job.study.methods[job.method].policy
         row = {"method": job.method, "policy": policy, "algorithm": algorithm, "seed": job.seed, "after_episodes": mark}
-        training = summary(trained, (*TRAINING, *job.study.statistics), "training_")
+        training = summary(trained, (*TRAINING, *job.study.statistics), "training_", job.study.task)
         training["folder"] = str(job.folder.path)
         for judged in job.study.judgements:
             rows.append(row | {"eval_set": judged.name} | summary(_evaluated(job, mark, judged), JUDGED) | training)
@@ -433,7 +433,7 @@ def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], PolicyFn]:
     if name == LEARNED:
         _refuse_gone(job, mark)
         learned = Policy.load(_policy_folder(job, mark))
-        return partial(as_learned, learned)
+        return partial(check_compatible, learned)
     if name == BEST_CONSTANT:
         best = _best_constant(job)
         return lambda env: always(env, best)

@@ -28,7 +28,7 @@ from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault
 from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.evaluation.step_log import ledger_file, table, write_ledger
+from guiderail.tools.evaluation.step_log import step_log_file, table, write_step_log
 from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.preflight import LISTENING, Check, check_robot, confirm_checks
@@ -250,16 +250,16 @@ class SkillExecutor:
         say(f"{outcome.words}, after {outcome.steps} control steps: {self.write(folder, found)}")
 
     def write(self, folder: Path, found: Mapping[str, Any]) -> Path:
-        """Writes a ledger of the control steps, the joints' too, and beside it what was found; returns its path."""
+        """Writes a step log of the control steps, the joints' too, and beside it what was found; returns its path."""
         folder.mkdir(parents=True, exist_ok=True)
         number = _next_number(folder)
-        ledger = table(self.trace, number)
+        step_log = table(self.trace, number)
         joints = self._station.controller_plant.plant.num_positions()
         for name, values in self._joints.items():
             for joint, column in enumerate(np.reshape(values[: len(self.trace)], (len(self.trace), joints)).T):
-                ledger = ledger.append_column(f"{name}_{joint}", pa.array(column))
-        path = ledger_file(folder, number)
-        write_ledger(path, ledger)
+                step_log = step_log.append_column(f"{name}_{joint}", pa.array(column))
+        path = step_log_file(folder, number)
+        write_step_log(path, step_log)
         write_atomically(path.with_suffix(".json"), json.dumps(dict(found), indent=2).encode() + b"\n")
         return path
 
@@ -295,7 +295,7 @@ def run_policy(
     """
     folder, recorded = RunFolder(run), out or run / "hardware"
     config, policy = folder.config(), Policy.load(folder.path)
-    check_writable(ledger_file(recorded, 0))
+    check_writable(step_log_file(recorded, 0))
     environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
     task = EnvConfig.resolve(config.task, environment).make_task()
     if not isinstance(task, InsertionTask):

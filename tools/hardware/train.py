@@ -16,7 +16,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.evaluation.step_log import ledger_file, table
+from guiderail.tools.evaluation.step_log import step_log_file, table
 from guiderail.tools.files import write_atomically
 from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.robot_env import RobotEnv
@@ -100,9 +100,9 @@ def _learn(
     rows: list[dict[str, Any]] = []
     due: list[Callable[[], None]] = []  # what the last episode still leaves
 
-    def write_ledger() -> None:
-        if config.ledger:
-            student.write(ledger_file(folder.ledger, rows[-1]["episode"]), table(env.trace, rows[-1]["episode"]))
+    def write_step_log() -> None:
+        if config.step_log:
+            student.write(step_log_file(folder.steps, rows[-1]["episode"]), table(env.trace, rows[-1]["episode"]))
 
     def save_policy() -> None:
         shape = list(env.observation_space.shape or ())
@@ -122,7 +122,7 @@ def _learn(
             row |= {"episodes_known": student.known, "late": student.late}
             row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
             rows.append(row)
-            due = [student.submit_episode, write_ledger, partial(folder.write_episodes, rows)]
+            due = [student.submit_episode, write_step_log, partial(folder.write_episodes, rows)]
             while due:
                 due[0]()
                 due.pop(0)

@@ -22,7 +22,7 @@ import torch
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.evaluation.step_log import write_ledger
+from guiderail.tools.evaluation.step_log import write_step_log
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 
@@ -137,7 +137,7 @@ class PipelinedLearner(Learner):
             self.given += 1
 
     def write(self, path: Path, table: pa.Table) -> None:
-        """Has a ledger written there by the other process; what comes in its way is raised by what asks it next."""
+        """Has a step log written there by the other process; what comes in its way is raised by what asks it next."""
         self._send(("write", path, table))
 
     def finish(self) -> None:
@@ -304,7 +304,7 @@ def _restored(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], value
 
 def _written(learner: OffPolicyLearner, path: Path, table: pa.Table) -> object:
     try:
-        write_ledger(path, table)
+        write_step_log(path, table)
     except InputError as error:
         return error
     return _NOTHING

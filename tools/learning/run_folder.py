@@ -18,7 +18,7 @@ from pydantic.dataclasses import dataclass
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import check_environment, import_modules, task_content
-from guiderail.tools.evaluation.metrics import checked_rows
+from guiderail.tools.evaluation.metrics import check_rows
 from guiderail.tools.files import LOCK, remove_parts, write_atomically
 from guiderail.tools.learning.config import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
@@ -38,7 +38,7 @@ class RunConfig:
     seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # of everything random
     versions: dict[str, str] = field(default_factory=dict)  # that the result depends on
     imports: tuple[str, ...] = ()  # modules or files that register what is used here
-    ledger: bool = True  # whether every control step is written down
+    step_log: bool = True  # whether every control step is written down
     task_content: str = ""  # the digest of the files that the task is made of; empty where there are none
     with_person: bool = False  # whether a person watches; what was corrected is in the environment's via_points
 
@@ -71,7 +71,7 @@ def _version(name: str) -> str:
 class RunFolder:
     """The files of one run.
 
-    `config.yaml` is there from the start, `ledger/` gets a file as each episode ends, `episodes.csv` and `checkpoint/`
+    `config.yaml` is there from the start, `steps/` gets a file as each episode ends, `episodes.csv` and `checkpoint/`
     grow together after it, the rest is written when the run ends. Every file is replaced whole.
     """
 
@@ -88,9 +88,9 @@ class RunFolder:
         return self.path / "checkpoint" / "state.safetensors"
 
     @property
-    def ledger(self) -> Path:
+    def steps(self) -> Path:
         """The folder with every control step; see `guiderail.tools.evaluation.step_log`."""
-        return self.path / "ledger"
+        return self.path / "steps"
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -213,7 +213,7 @@ class RunFolder:
         Raises:
             InputError: if the file is missing or no such table.
         """
-        return checked_rows(read_table(self.path / "episodes.csv"), self.path / "episodes.csv")
+        return check_rows(read_table(self.path / "episodes.csv"), self.path / "episodes.csv")
 
 
 def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:

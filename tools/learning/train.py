@@ -44,7 +44,7 @@ def configure(
     episodes: int = DEFAULTS["episodes"],
     seed: int = DEFAULTS["seed"],
     imports: Sequence[str] = (),
-    ledger: bool = True,
+    step_log: bool = True,
     with_person: bool = False,
 ) -> RunConfig:
     """A checked configuration with everything resolved.
@@ -58,7 +58,7 @@ def configure(
     learner = resolve_preset(preset, algorithm, settings)
     resolved = check_environment(task, environment)
     return RunConfig(
-        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), ledger,
+        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), step_log,
         task_content(task, resolved, imports), with_person,
     )  # fmt: skip
 
@@ -75,7 +75,7 @@ def run(
     seed: int | None = None,
     resume: bool = False,
     imports: Sequence[str] = (),
-    ledger: bool | None = None,
+    step_log: bool | None = None,
     person: Callable[[], Supervisor] | None = None,
     demonstrator: Callable[[str], Callable[[gymnasium.Env], PolicyFn]] | None = None,
 ) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def run(
         raise InputError("where should the run go? name a folder with --out RUN")
     folder = RunFolder(out)
     imports = import_modules(imports)
-    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "ledger": ledger}
+    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log}
     choices["with_person"] = None if person is None else True
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
     if resume:
@@ -151,7 +151,7 @@ def _continued(
     config = folder.config()
     config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
-    stored |= {"ledger": config.ledger, "with_person": config.with_person} | config.environment
+    stored |= {"step_log": config.step_log, "with_person": config.with_person} | config.environment
     environment = {key: check_environment(config.task, environment).get(key, environment[key]) for key in environment}
     wanted = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in wanted.items():

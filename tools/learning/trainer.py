@@ -9,7 +9,7 @@ import torch
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, rollout, suits
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible, rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
@@ -19,7 +19,7 @@ from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
 
-# Ledger and checkpoints cost at most this part of the time: a small checkpoint is written after every episode, a large
+# Step log and checkpoints cost at most this part of the time: a small checkpoint is written after every episode, a large
 # one now and then. (The first and the last are written in any case.)
 SAVING_SHARE = 0.03
 
@@ -36,7 +36,7 @@ def train(
     """Trains a run to its last episode and writes its folder.
 
     A run that was killed and resumed gives bit for bit what it would have given undisturbed: a checkpoint is taken at
-    an episode's end and holds every number and every random generator that the rest depends on. The ledger is written
+    an episode's end and holds every number and every random generator that the rest depends on. The step log is written
     before it, and what is beyond it is written again.
 
     Args:
@@ -62,7 +62,7 @@ def train(
         )
     torch.set_num_threads(1)  # two runs side by side are faster so, and sums do not depend on the machine's cores
     env = make_environment(config.task, config.environment)
-    if config.learner.demonstration_episodes and demonstrator is not None and not suits(demonstrator, env):
+    if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
         env.close()
         raise InputError(
             f"who demonstrates {config.task} sees or moves other things than this environment: leave the setting "
@@ -126,8 +126,8 @@ def _train(
         env, config = watched.env, watched.config
     folder.write_config(config)
 
-    ledger = StepLog(env, folder.ledger)
-    watching: list[Callback] = [ledger] if config.ledger else []
+    step_log = StepLog(env, folder.steps)
+    watching: list[Callback] = [step_log] if config.step_log else []
     shown = 0 if demonstrator is None else config.learner.demonstration_episodes
     spent_training, spent_saving, last_saving = 0.0, 0.0, 0.0
     for episode in range(len(rows), config.episodes):
@@ -152,7 +152,7 @@ def _train(
         spent_training += time.perf_counter() - started
         if report is not None:
             report(rows[-1])
-        with_another = ledger.seconds + spent_saving + last_saving
+        with_another = step_log.seconds + spent_saving + last_saving
         if with_another <= SAVING_SHARE * spent_training or episode + 1 in (1, config.episodes):
             started = time.perf_counter()
             _save(folder, rows, learner, env, watched)

@@ -13,7 +13,7 @@ import gymnasium
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
-from guiderail.tools.evaluation.rollout import PolicyFn, as_learned, check_seed
+from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, check_seed
 from guiderail.tools.learning.run_folder import RunFolder
 
 
@@ -42,7 +42,7 @@ class EpisodeSpec:
         return cls(
             task=config.task,
             environment=changed_environment(config.task, config.environment, environment or {}),
-            policy=partial(as_learned, policy),
+            policy=partial(check_compatible, policy, learned_in=config.environment),
             acting="after learning",
             title=config.learner.algorithm.upper(),
             run_seed=config.seed,

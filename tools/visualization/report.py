@@ -202,13 +202,11 @@ def _worst(value: float, key: str) -> Cell:
 
 def _source(safety: dict[str, list[dict[str, Any]]]) -> str:
     sources = {one["source"] for found in safety.values() for one in found}
-    if sources == {"ledger"}:
-        return "Counted in control steps, from the ledgers of the runs."
+    if sources == {"step_log"}:
+        return "Counted in control steps, from the step logs of the runs."
     if sources == {"table"}:
-        return "From the tables of the episodes, as there is no ledger: what was outside is counted in episodes."
-    return (
-        "From the ledgers, and for runs without one from the tables of their episodes, whose violations count episodes."
-    )
+        return "From the tables of the episodes, because there is no step log: violations are counted in episodes."
+    return "From the step logs, and for runs without one from the tables of their episodes, whose violations count episodes."
 
 
 def _differences(methods: dict[str, list[Run]]) -> list[dict[str, Any]]:

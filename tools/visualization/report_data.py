@@ -18,7 +18,7 @@ from guiderail.tools.environments import beyond_defaults, known_tasks
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, cached, evaluate_run, kept_file, learned_file
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.step_log import read_ledger
+from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import read_table
@@ -36,7 +36,7 @@ NEEDED = (
     "fallback_steps",
 )  # fmt: skip
 PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
-LEDGER_COLUMNS = (
+STEP_LOG_COLUMNS = (
     "commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "command_timed_out", "fallback",
 )  # fmt: skip
 
@@ -52,7 +52,7 @@ class Run:
 
     @property
     def safety(self) -> dict[str, Any]:
-        """Counts and worst values of its control steps: from the ledger, and without one from the episodes' table."""
+        """Counts and worst values of its control steps: from the step log, and without one from the episodes' table."""
         rows = self.episodes
         found: dict[str, Any] = {
             "source": "table",
@@ -69,15 +69,15 @@ class Run:
             "held": None,
             "fallback_steps": int(rows["fallback_steps"].sum()),
         }
-        folder = RunFolder(self.path).ledger
+        folder = RunFolder(self.path).steps
         if not folder.is_dir():
             return found
-        steps = read_ledger(folder)
+        steps = read_step_log(folder)
         steps = steps[steps["episode"] < len(rows)]  # what a killed run wrote beyond its table is not in it
-        if steps["episode"].nunique() != len(rows) or not set(LEDGER_COLUMNS) <= set(steps.columns):
+        if steps["episode"].nunique() != len(rows) or not set(STEP_LOG_COLUMNS) <= set(steps.columns):
             return found
         return found | {
-            "source": "ledger",
+            "source": "step_log",
             "steps": len(steps),
             "commands_outside": int((~(steps["commanded_violation"] <= TOLERANCE)).sum()),
             "worst_command": float(steps["commanded_violation"].max(skipna=False)),
@@ -295,8 +295,8 @@ def command(config: RunConfig, out: str) -> str:
         words += ["--env", f"{key}={'null' if value is None else text}"]
     for module in config.imports:
         words += ["--import", module]
-    if not config.ledger:
-        words.append("--no-ledger")
+    if not config.step_log:
+        words.append("--no-step-log")
     return shlex.join([*words, "--out", out])
 
 

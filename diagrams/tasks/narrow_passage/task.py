@@ -16,11 +16,13 @@ from guiderail.diagrams.envs.cameras import Camera
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Number, Numbers, Options, ResetOptions
 from guiderail.diagrams.envs.scene import Scene, in_plane
+from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task
+from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.objects.narrow_passage import demonstrations
@@ -82,6 +84,20 @@ class NarrowPassageOptions(Options):
             second_obstacle=SECOND_OBSTACLE if self.second_obstacle else None,
             obstacles_move=self.drawn,
         )
+
+
+def avoids_obstacle_from(rows: Any, cost: float = 1.0, streak: int = 5) -> int | None:
+    """Return the first episode, from 1, that begins a streak of episodes whose obstacle cost is below `cost`, or None.
+
+    A path through the obstacle's middle costs about a hundred; a policy that explores touches its margin now and then.
+
+    Args:
+        rows: Table of episodes.
+        cost: Largest cost of an episode.
+        streak: Length of the streak.
+    """
+    index = find_streak(rows["reward_obstacle_cost"] > -cost, streak)
+    return None if index is None else index + 1
 
 
 class NarrowPassageReset(ResetOptions):
@@ -201,6 +217,14 @@ class NarrowPassage(Task):
     difficulties = {STANDARD: {}, "hard": HARD}
     num_steps = demonstrations.NUM_STEPS
     clip = 1.0
+    statistics = (
+        Metric(
+            "avoids_obstacle_from",
+            "episode",
+            "first of five consecutive episodes whose obstacle cost is below 1, from 1",
+            avoids_obstacle_from,
+        ),
+    )
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)

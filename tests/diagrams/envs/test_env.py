@@ -47,7 +47,6 @@ class Toy(LeafSystem):
         port("commanded_violation", 1, lambda x: x[0] - 1)
         port("measured_violation", 1, lambda x: x[0] - 2)
         port("contact_force", 1, lambda x: 10 * x[0])
-        port("ledger", 2, lambda x: [x[0], x[2]])
         port("desired_pose", 1, lambda x: x[0] + x[3])
         port("pose", 1, lambda x: x[0])
         port("fallback", 1, lambda x: float(abs(x[0] - 0.3) < 1e-9))
@@ -92,7 +91,6 @@ def make(num_steps=20, **arguments):
         num_steps=num_steps,
         observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float32),
         reward_terms=("double", "one"),
-        ledger_fields=("position", "ticks"),
         randomize=randomize,
     )
     env = GuidedEnv(task, **arguments)
@@ -102,7 +100,7 @@ def make(num_steps=20, **arguments):
 
 def test_info_says_everything_at_reset_and_at_every_step():
     env = make()
-    expected = {*SAID, "double", "one"} - {"ledger", "simulation_failure"}  # of an episode that is over
+    expected = {*SAID, "double", "one"} - {"simulation_failure"}  # of an episode that is over
     _, info = env.reset(options={"start": 0.0})
     assert set(info) == expected | {"start"}
     assert info["constraint_violation"] == -1.0
@@ -158,7 +156,7 @@ def test_a_time_limit_truncates():
     assert [(terminated, truncated) for terminated, truncated, _ in results] == [(False, False)] * 2 + [(False, True)]
     assert results[-1][2]["termination"] == "time_limit"
     assert not results[-1][2]["is_success"]
-    assert results[-1][2]["ledger"] == {"position": 0.0, "ticks": 15.0}
+    assert len(env.trace) == 3
 
 
 def test_a_success_in_the_last_step_is_no_time_limit():

@@ -93,7 +93,7 @@ def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
     env = {"kgrl": kgrl, "skgrl": skgrl, "safe_residual": safe_residual}[guidance]
     rng = np.random.default_rng(3)
     _, info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
-    assert info["ledger"]["max_commanded_violation"] <= 1e-9
+    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert np.abs(env.trace.commanded[:, :2]).max() <= ALIGNMENT + 1e-9
     assert np.isfinite(observations).all()
     assert "simulation_failure" not in info
@@ -147,7 +147,7 @@ def test_a_hard_push_is_a_collision():
     _, info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
     assert info["termination"] == "collision"
     assert info["contact_force"] > COLLISION_FORCE
-    assert info["ledger"]["collisions"] == 1
+    assert env.trace.statistics()["collisions"] == 1
     assert total < -45.0
 
 

@@ -65,7 +65,7 @@ def arm():
 def test_the_straight_descent_inserts_where_the_offset_is_known(known, seed):
     info, total, terms = play(known, lambda _: DOWN, seed=seed)
     assert info["termination"] == "success"
-    assert info["ledger"]["peak_force"] <= 10.0
+    assert known.trace.statistics()["peak_force"] <= 10.0
     assert total == pytest.approx(sum(terms.values()))
     assert terms["terminal_reward"] == 50.0
     # What it came down is what it is paid for, 300 a metre, from 15 to 18 mm.
@@ -118,10 +118,10 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
     assert commanded[:, 2].min() >= -parameters["push_m"] - 1e-9
     assert commanded[:, 2].max() <= parameters["height_m"] - parameters["push_m"] + 1e-9
     assert np.abs(commanded[:, 3:]).max() <= 1e-9
-    assert info["ledger"]["max_commanded_violation"] <= 1e-9
+    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert info["termination"] != "collision"
     if guidance != "residual":  # whose command comes down whatever is in the way
-        assert info["ledger"]["peak_force"] < 1.2 * LEASH * STIFFNESS
+        assert env.trace.statistics()["peak_force"] < 1.2 * LEASH * STIFFNESS
 
 
 def test_without_the_cuboid_a_push_is_a_collision():
@@ -172,8 +172,8 @@ def test_the_arm_inserts_too(arm, seed):
     """At 12 mm/s: an arm that descends faster is pulled sideways by more than a chamfer leads back."""
     info, _, _ = play(arm, lambda _: 0.3 * DOWN, seed=seed)
     assert info["is_success"]
-    assert info["ledger"]["peak_force"] <= 10.0
-    assert info["ledger"]["collisions"] == 0
+    assert arm.trace.statistics()["peak_force"] <= 10.0
+    assert arm.trace.statistics()["collisions"] == 0
 
 
 class TestUncertainty:

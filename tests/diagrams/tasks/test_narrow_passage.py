@@ -85,7 +85,7 @@ def test_same_seed_same_episode_bit_for_bit_fresh_and_after_resets(guidance):
 
     def episode(env):
         rewards, observations, infos = play(env, lambda k: actions[k], seed=5)
-        return rewards, observations, env.trace.measured.copy(), env.trace.force.copy(), infos[-1]["ledger"]
+        return rewards, observations, env.trace.measured.copy(), env.trace.force.copy(), env.trace.statistics()
 
     used = make(guidance)
     play(used, lambda k: -actions[k], seed=9)
@@ -100,7 +100,7 @@ def test_the_demonstrations_alone_pass_and_run_into_the_obstacle(guidance):
     env = make(guidance)
     rewards, _, infos = play(env, still)
     assert infos[-1]["is_success"]
-    assert infos[-1]["ledger"]["collisions"] == 0
+    assert env.trace.statistics()["collisions"] == 0
     assert sum(info["obstacle_cost"] for info in infos) < -50
     total = sum(info[name] for info in infos for name in env.task.reward_terms)
     assert rewards.sum() == pytest.approx(total)
@@ -112,15 +112,15 @@ def test_no_adversary_makes_null_space_guidance_violate_collide_or_fail(guidance
     env = make(guidance, action_repeat=action_repeat)
     for policy in islice(adversaries(), first, None, 2):
         _, _, infos = play(env, policy)
-        ledger = infos[-1]["ledger"]
-        assert ledger["max_commanded_violation"] <= 1e-9
-        assert ledger["max_measured_violation"] <= 1e-9
-        assert ledger["collisions"] == 0
+        statistics = env.trace.statistics()
+        assert statistics["max_commanded_violation"] <= 1e-9
+        assert statistics["max_measured_violation"] <= 1e-9
+        assert statistics["collisions"] == 0
         assert infos[-1]["is_success"]
-        # The ledger and what every step said are two accounts of the same episode.
-        assert ledger["max_commanded_violation"] == max(info["constraint_violation"] for info in infos[1:])
-        assert ledger["max_measured_violation"] == max(info["measured_violation"] for info in infos[1:])
-        assert ledger["steps"] == len(env.trace)
+        # The trace and the info of every step are two accounts of the same episode.
+        assert statistics["max_commanded_violation"] == max(info["constraint_violation"] for info in infos[1:])
+        assert statistics["max_measured_violation"] == max(info["measured_violation"] for info in infos[1:])
+        assert statistics["steps"] == len(env.trace)
 
 
 @pytest.mark.parametrize("guidance", NULL_SPACE)
@@ -156,8 +156,8 @@ def test_a_residual_collides_gets_stuck_and_violates_but_never_tunnels():
     for policy in islice(adversaries(), 0, None, 2):
         _, _, infos = play(env, policy)
         endings.add(infos[-1]["termination"])
-        collisions += infos[-1]["ledger"]["collisions"]
-        violation = max(violation, infos[-1]["ledger"]["max_measured_violation"])
+        collisions += env.trace.statistics()["collisions"]
+        violation = max(violation, env.trace.statistics()["max_measured_violation"])
         # In a wall at most as deep as it gets in one plant step.
         path = env.trace.measured[:, None]
         assert not ((path > lower + 0.021) & (path < upper - 0.021)).all(axis=2).any()
@@ -173,8 +173,8 @@ def test_the_safe_residual_neither_collides_nor_violates_but_gets_stuck():
         for policy in islice(adversaries(), first, None, 2):
             _, _, infos = play(env, policy)
             endings.add(infos[-1]["termination"])
-            assert infos[-1]["ledger"]["collisions"] == 0
-            assert infos[-1]["ledger"]["max_measured_violation"] <= -0.02 + 1e-6
+            assert env.trace.statistics()["collisions"] == 0
+            assert env.trace.statistics()["max_measured_violation"] <= -0.02 + 1e-6
     assert "blocked" in endings
 
 
@@ -230,7 +230,7 @@ def test_a_pushed_robot_keeps_its_course_without_a_jump(step, push):
     assert np.linalg.norm(jump) < 0.03 + max(0.0, before[0] + push[0] - WORLD.zone_x)
     assert worst_after <= 1e-9
     assert info["is_success"]
-    assert info["ledger"]["collisions"] == 0
+    assert env.trace.statistics()["collisions"] == 0
 
 
 def test_a_robot_pushed_out_of_the_allowed_region_is_led_back():

@@ -55,8 +55,8 @@ def test_a_persons_three_axes_pour_and_the_constraints_are_why(env, unconstraine
     info, total, actions = run(env, scripted_pour, seed=1, options={"start": start})
     assert info["termination"] == "success"
     assert total > 200.0
-    assert info["ledger"]["max_commanded_violation"] <= 1e-9
-    assert info["ledger"]["collisions"] == 0.0
+    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
+    assert env.trace.statistics()["collisions"] == 0.0
     # The very same inputs, or the very same person, who may react: it doesn't depend on which is meant.
     replay = iter([*actions, *[actions[-1]] * 150])
     again = scripted_pour if STARTS.index(start) % 2 else lambda observation: next(replay)
@@ -108,7 +108,7 @@ def test_the_template_is_the_objects_not_the_episodes(mug, position):
     env = make_env("Pouring", **mug)
     info, _, _ = run(env, scripted_pour, seed=1, options={"mug_position": position})
     assert info["termination"] == "success"
-    assert info["ledger"]["max_commanded_violation"] <= 1e-9
+    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
 
 
 def test_faster_inputs_are_as_safe():
@@ -116,7 +116,7 @@ def test_faster_inputs_are_as_safe():
     info, _, _ = run(env, scripted_pour, seed=3)
     assert info["termination"] == "success"
     assert info["control_steps"] < 250
-    assert info["ledger"]["max_commanded_violation"] <= 1e-9
+    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     rng = np.random.default_rng(0)
     info, _, _ = run(env, ADVERSARIES["noisy_person"](rng), seed=3, limit=15)
     assert info["termination"] not in ("collision", "spill")

@@ -64,4 +64,4 @@ def test_who_aims_pours_enough_of_them():
         observation, _, terminated, truncated, info = env.step(scripted_pour_aimed(observation))
         ended = terminated or truncated
     assert info["termination"] == "success"
-    assert info["ledger"]["max_commanded_violation"] <= 1e-9
+    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9

@@ -36,8 +36,8 @@ def test_who_looks_pours_and_who_does_not_spills(env):
         drawn, info = run(env, inputs, mug_error=BESIDE)
         np.testing.assert_array_equal(drawn["mug_error"], BESIDE)
         assert info["termination"] == ending
-        assert info["ledger"]["max_commanded_violation"] <= 1e-9
-        assert info["ledger"]["collisions"] == 0.0
+        assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
+        assert env.trace.statistics()["collisions"] == 0.0
 
 
 def guided(template, frames, actions, X_TP):

@@ -42,7 +42,7 @@ def written(config, folder):
 CONFIGS = [
     configure("NarrowPassage", {"guidance": "skgrl", "action_dims": [1], "action_repeat": 3}, episodes=7, seed=3),
     configure("BncConnector", {"guidance": "kgrl"}, preset="sac_gridclamp", algorithm="sac", seed=2**31 - 1),
-    configure("Pouring", {}, preset="pouring", settings={"net_arch": "32", "ent_coef": "0.2"}, ledger=False),
+    configure("Pouring", {}, preset="pouring", settings={"net_arch": "32", "ent_coef": "0.2"}, step_log=False),
 ]
 
 

@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import transform_to_pose
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, rollout
-from guiderail.tools.evaluation.step_log import read_ledger
+from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.tables import read_table
 from research.action_fuzzing import STRESSED, bnc_connector, narrow_passage
 from research.action_fuzzing import campaign as campaign_module
@@ -186,7 +186,7 @@ def test_all_tasks_are_stressed_in_one_folder_and_go_on_there(tmp_path, monkeypa
     assert found["wrong"] == []
     assert found["max_commanded_violation"] <= 1e-9
     assert found["control_steps"] == sum(
-        len(read_ledger(tmp_path / "ledger" / task)) for task in ("NarrowPassage", "GridClamp")
+        len(read_step_log(tmp_path / "steps" / task)) for task in ("NarrowPassage", "GridClamp")
     )
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.csv")}
     assert stress("all", steps=20, seed=5, out=tmp_path) == found

@@ -7,8 +7,8 @@ def test_only_what_saving_took_is_counted(monkeypatch, bead_config):
     monkeypatch.setattr(saving, "with_defaults", lambda task, given: given)
     found = saving_share("Bead", bead_config.episodes)
     assert 1 <= found["checkpoints"] <= bead_config.episodes
-    assert 0 < found["ledger_share"] < 1
-    assert 0 < found["ledger_ms_per_episode"] < 1e3 * found["seconds"]
+    assert 0 < found["step_log_share"] < 1
+    assert 0 < found["step_log_ms_per_episode"] < 1e3 * found["seconds"]
 
 
 def test_a_timed_function_is_put_back():

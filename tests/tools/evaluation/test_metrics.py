@@ -3,9 +3,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS, episodes_to_convergence, first_in_a_row, summary
+from guiderail.tools.evaluation.metrics import COLUMNS, STATISTICS, episodes_to_convergence, find_streak, summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
+
+FAILS_AFTER = 215  # control steps
 
 
 def episodes(successes="", **columns):
@@ -22,8 +25,8 @@ def test_converged_after_is_how_many_came_before_ten_in_a_row(successes, episode
 
 
 def test_first_in_a_row_is_before_the_first_of_them():
-    assert first_in_a_row([0, 1, 1, 0, 1, 1, 1], 3) == 4
-    assert first_in_a_row([0, 1, 1], 3) is None
+    assert find_streak([0, 1, 1, 0, 1, 1, 1], 3) == 4
+    assert find_streak([0, 1, 1], 3) is None
 
 
 def test_a_collision_and_an_episode_that_ends_in_one_are_two_numbers():
@@ -49,6 +52,13 @@ def test_the_interval_is_wilsons(successes, number):
     np.testing.assert_allclose(list(found.values()), [middle - half, middle + half], atol=1e-12)
 
 
+def test_summary_knows_the_statistics_of_the_task():
+    rows = episodes("1" * 7, reward_obstacle_cost=[-9.0, *6 * [-0.5]])
+    assert summary(rows, ["avoids_obstacle_from"], task="NarrowPassage") == {"avoids_obstacle_from": 2}
+    with pytest.raises(InputError, match="no statistic 'avoids_obstacle_from'"):
+        summary(rows, ["avoids_obstacle_from"], task="GridClamp")
+
+
 def test_nothing_is_said_of_no_episodes():
     assert set(summary(episodes(), STATISTICS).values()) == {None}
 
@@ -56,11 +66,11 @@ def test_nothing_is_said_of_no_episodes():
 def test_every_number_has_a_name_of_its_own_and_words():
     names = [column.name for column in COLUMNS]
     assert len(set(names)) == len(names)
-    assert all(metric.words for metric in (*COLUMNS, *STATISTICS.values()))
+    assert all(metric.description for metric in (*COLUMNS, *STATISTICS.values()))
 
 
-def test_the_ledger_says_what_the_trace_says():
-    """Residual learning without walls in mind: it collides, and the numbers of both sources agree."""
+def test_row_agrees_with_the_trace():
+    """Residual learning, which does not avoid walls, collides."""
     env = make_environment("NarrowPassage", {"guidance": "residual"})
     random = np.random.default_rng(0)
     row = rollout(env, lambda observation: random.uniform(-1, 1, 2), Paths(env), seed=0)
@@ -76,31 +86,32 @@ def test_the_ledger_says_what_the_trace_says():
     assert row["jerk_commanded_linear"] == pytest.approx(jerk, rel=1e-12)
 
 
-@pytest.mark.parametrize("gone", ["ledger", "nothing"])
-def test_without_a_ledger_what_the_trace_saw_is_counted(gone):
-    """Where a simulation failed or a person ended the episode, what had happened is no zero."""
-
-    class WithoutIt(gymnasium.Wrapper):
+def test_row_counts_what_happened_when_a_simulation_fails():
+    class Failing(gymnasium.Wrapper):
         def step(self, action):
-            *what, info = super().step(action)
-            return *what, {key: value for key, value in info.items() if key != gone}
+            observation, reward, terminated, truncated, info = super().step(action)
+            is_failing = len(self.unwrapped.trace) == FAILS_AFTER
+            more = {"simulation_failure": "it diverged"} if is_failing else {}
+            return observation, reward, terminated, truncated or is_failing, info | more
 
-    env = WithoutIt(make_environment("NarrowPassage", {"guidance": "residual"}))
+    env = Failing(make_environment("NarrowPassage", {"guidance": "residual"}))
     random = np.random.default_rng(0)
     row = rollout(env, lambda observation: random.uniform(-1, 1, 2), seed=0)
     touches = env.unwrapped.trace.force > 0
+    assert row["termination"] == "simulation_failure"
+    assert row["steps"] == FAILS_AFTER
     assert row["collision_steps"] == touches.sum() > 0
     assert row["collisions"] == (np.diff(touches, prepend=False) & touches).sum()
     assert row["saturated_steps"] == env.unwrapped.trace.signals["saturation"].any(axis=1).sum()
 
 
 def test_what_was_demonstrated_is_no_success_of_the_learner():
-    rows = episodes("1" * 12 + "00" + "1" * 10, demonstrated=[1] * 12 + [0] * 12)
+    rows = episodes("1" * 12 + "00" + "1" * 10, is_demonstration=[1] * 12 + [0] * 12)
     assert episodes_to_convergence(rows) == 14
-    assert episodes_to_convergence(episodes("1" * 12, demonstrated=[1] * 12)) is None
+    assert episodes_to_convergence(episodes("1" * 12, is_demonstration=[1] * 12)) is None
     found = summary(rows, ("success_rate", "success_low", "success_rate_last_10"))
     assert found["success_rate"] == pytest.approx(10 / 12)
     assert found["success_low"] == pytest.approx(0.5520, abs=1e-3)
-    assert summary(episodes("1", demonstrated=[1]), ("success_rate", "success_low")) == dict.fromkeys(
+    assert summary(episodes("1", is_demonstration=[1]), ("success_rate", "success_low")) == dict.fromkeys(
         ("success_rate", "success_low")
     )

@@ -68,13 +68,25 @@ def test_an_episode_whose_simulation_failed_has_a_row_too():
     class Failing(gymnasium.Wrapper):
         def step(self, action):
             observation, reward, *_, info = super().step(action)
-            info = {k: v for k, v in info.items() if k != "ledger"} | {"simulation_failure": "it diverged"}
-            return observation, reward, False, True, info | {"constraint_violation": 0.25}
+            return observation, reward, False, True, info | {"simulation_failure": "it diverged"}
 
-    row = rollout(Failing(make_environment("Bead", {})), lambda observation: np.zeros(2), seed=0)
+    env = Failing(make_environment("Bead", {}))
+    row = rollout(env, lambda observation: np.zeros(2), seed=0)
     assert row["termination"] == "simulation_failure"
     assert (row["steps"], row["success"], row["collisions"]) == (1, 0, 0)
-    assert (row["max_commanded_violation"], row["peak_force"]) == (0.25, 1.0)
+    assert (row["max_commanded_violation"], row["peak_force"]) == (env.unwrapped.x[0] - 1.0, 1.0)
+
+
+def test_rollout_has_the_violations_of_the_start_when_it_fails_at_once():
+    class Failing(gymnasium.Wrapper):
+        def step(self, action):
+            observation, _, _, _, info = super().step(action)
+            self.unwrapped.trace.clear()
+            info |= {"simulation_failure": "it diverged", "constraint_violation": 0.25, "measured_violation": 0.5}
+            return observation, 0.0, False, True, info
+
+    row = rollout(Failing(make_environment("Bead", {})), lambda observation: np.zeros(2), seed=0)
+    assert (row["steps"], row["max_commanded_violation"], row["max_measured_violation"]) == (0, 0.25, 0.5)
 
 
 def acted(policy: BaselinePolicy, episodes: int) -> np.ndarray:

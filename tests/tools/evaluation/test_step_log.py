@@ -5,7 +5,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.evaluation.step_log import MEANINGS, StepLog, ledger_file, read_ledger
+from guiderail.tools.evaluation.step_log import MEANINGS, StepLog, read_step_log, step_log_file
 
 
 def act(env, seed=0):
@@ -15,7 +15,7 @@ def act(env, seed=0):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("ledger")
+    folder = tmp_path_factory.mktemp("steps")
     env = make_environment("NarrowPassage", {"guidance": "kgrl", "action_repeat": 5})
     rows = [rollout(env, act(env, index), StepLog(env, folder), index=index, seed=index) for index in range(2)]
     trace = env.unwrapped.trace
@@ -24,9 +24,9 @@ def written(tmp_path_factory):
 
 def test_it_has_every_control_step_and_agrees_with_the_episodes_table(written):
     folder, rows, trace = written
-    ledger = read_ledger(folder)
-    assert [len(group) for _, group in ledger.groupby("episode")] == [row["steps"] for row in rows]
-    for row, (_, steps) in zip(rows, ledger.groupby("episode"), strict=True):
+    step_log = read_step_log(folder)
+    assert [len(group) for _, group in step_log.groupby("episode")] == [row["steps"] for row in rows]
+    for row, (_, steps) in zip(rows, step_log.groupby("episode"), strict=True):
         assert steps["step"].tolist() == list(range(row["steps"]))
         assert steps["commanded_violation"].max() == row["max_commanded_violation"] <= TOLERANCE
         assert steps["measured_violation"].max() == row["max_measured_violation"]
@@ -36,15 +36,15 @@ def test_it_has_every_control_step_and_agrees_with_the_episodes_table(written):
         assert not steps["command_timed_out"].any()
         assert (steps["saturation"] > 0).sum() == row["saturated_steps"]
         assert steps["reward"].sum() == pytest.approx(row["return"])
-    last = ledger[ledger["episode"] == 1]
+    last = step_log[step_log["episode"] == 1]
     np.testing.assert_array_equal(last[["desired_pose_0", "desired_pose_1"]], trace.commanded)
     np.testing.assert_array_equal(last[["pose_0", "pose_1"]], trace.measured)
     # The zone is x ≥ 0.6: by what was commanded itself, and not by what anybody says of it.
-    np.testing.assert_allclose(ledger["commanded_violation"], ledger["desired_pose_0"] - 0.6, atol=1e-12)
+    np.testing.assert_allclose(step_log["commanded_violation"], step_log["desired_pose_0"] - 0.6, atol=1e-12)
 
 
 def test_every_column_has_a_meaning(written):
-    for name in read_ledger(written[0]).columns:
+    for name in read_step_log(written[0]).columns:
         stem, _, end = name.rpartition("_")
         assert (f"{stem}_i" if end.isdigit() else name) in MEANINGS
 
@@ -53,14 +53,14 @@ def test_a_collision_and_a_wrench_are_seen(tmp_path):
     env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 5})
     aside = np.array([1.0, 0.0])
     row = rollout(env, lambda observation: aside, StepLog(env, tmp_path), seed=0)
-    ledger = read_ledger(tmp_path)
-    assert row["collision_steps"] == ledger["collision"].sum() > 0
-    assert np.linalg.norm(ledger.loc[ledger["collision"], ["wrench_0", "wrench_1"]], axis=1).max() > 0
+    step_log = read_step_log(tmp_path)
+    assert row["collision_steps"] == step_log["collision"].sum() > 0
+    assert np.linalg.norm(step_log.loc[step_log["collision"], ["wrench_0", "wrench_1"]], axis=1).max() > 0
 
 
-def test_what_is_no_ledger_is_refused_in_a_sentence(written, tmp_path):
-    with pytest.raises(InputError, match="holds no ledger"):
-        read_ledger(tmp_path)
-    ledger_file(tmp_path, 0).write_bytes(b"PAR1 and not much more")
+def test_step_log_is_refused_when_absent_or_damaged(written, tmp_path):
+    with pytest.raises(InputError, match="holds no step log"):
+        read_step_log(tmp_path)
+    step_log_file(tmp_path, 0).write_bytes(b"PAR1 and not much more")
     with pytest.raises(InputError, match="damaged"):
-        read_ledger(tmp_path)
+        read_step_log(tmp_path)

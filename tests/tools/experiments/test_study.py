@@ -10,7 +10,7 @@ from guiderail.tools.cli.main import main
 from guiderail.tools.environments import import_modules, make_environment
 from guiderail.tools.evaluation.baselines import always
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.metrics import STATISTICS
+from guiderail.tools.evaluation.metrics import statistics_of
 from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study
 from guiderail.tools.experiments.engines.engine import make_engine
 from guiderail.tools.experiments.study import (
@@ -353,7 +353,7 @@ def test_every_study_that_comes_along_makes_sense(name, tmp_path):
     for method in declared.methods:
         _check(Job(declared, method, declared.seeds[0], tmp_path))
     for wanted in declared.ratios:
-        assert wanted.of.removeprefix("training_") in STATISTICS
+        assert wanted.of.removeprefix("training_") in statistics_of(declared.task)
         assert {wanted.method, wanted.against} <= declared.methods.keys()
 
 

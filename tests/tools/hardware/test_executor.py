@@ -63,9 +63,9 @@ def test_approaches_executes_records_and_comes_to_rest(operated, tmp_path):
     velocities = pace.robot.plant.GetVelocities(pace.robot.plant.GetMyContextFromRoot(context))
     assert np.abs(velocities).max() < 0.01
     path = operation.write(tmp_path, {"outcome": outcome.words})
-    ledger = pd.read_parquet(path)
-    assert len(ledger) == 20
-    assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(ledger)
+    step_log = pd.read_parquet(path)
+    assert len(step_log) == 20
+    assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(step_log)
     assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "done"
 
 
@@ -100,9 +100,9 @@ def test_a_run_that_fails_leaves_what_was_recorded_beside_what_was_there(monkeyp
     assert imported == ["json"]
     assert there.read_text() == "{}"
     found = json.loads((tmp_path / "hardware" / "episode-000005.json").read_text())
-    ledger = pd.read_parquet(tmp_path / "hardware" / "episode-000005.parquet")
+    step_log = pd.read_parquet(tmp_path / "hardware" / "episode-000005.parquet")
     assert found["outcome"].startswith("failed: PolicyError")
-    assert found["steps"] == len(ledger) > 0
+    assert found["steps"] == len(step_log) > 0
 
 
 @pytest.mark.parametrize("sound", [0, 2])  # of its actions: it is asked once before anything moves

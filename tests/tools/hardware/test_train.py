@@ -19,7 +19,7 @@ from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.evaluation.step_log import read_ledger
+from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.evaluate import evaluate_on_robot
 from guiderail.tools.hardware.robot_env import RobotEnv
@@ -133,7 +133,7 @@ def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, t
         _learn(folder, config, env, waits=True, report=lambda row: None)
     assert "policy.json" not in before[-1]
     assert folder.episodes()["termination"].tolist() == ["time_limit"] * 2
-    assert len(read_ledger(folder.ledger)) == 20
+    assert len(read_step_log(folder.steps)) == 20
     assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
     assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.USER_STOP  # at rest
 

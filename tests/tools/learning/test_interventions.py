@@ -80,7 +80,7 @@ class Scripted(Supervisor):
 def passage(episodes, **environment):
     return configure(
         "NarrowPassage", {"guidance": "kgrl", "action_repeat": 2, **environment}, algorithm="still", episodes=episodes,
-        with_person=True, ledger=False,
+        with_person=True, step_log=False,
     )  # fmt: skip
 
 
@@ -175,7 +175,7 @@ def test_five_millimetres_astray_a_person_rescues_it_with_a_push_or_two(tmp_path
     astray[:, 1] += 5e-3
     environment["via_points"] = tuple(astray.ravel())
     push = [-5e-3 / shown.reach[0], 0.0]
-    config = configure("BncConnector", environment, algorithm="still", episodes=3, with_person=True, ledger=False)
+    config = configure("BncConnector", environment, algorithm="still", episodes=3, with_person=True, step_log=False)
     rows = train(RunFolder(tmp_path / "run"), config, person=Scripted({1: (0, 10**6, push)}))
     assert [row["success"] for row in rows] == [0, 0, 1]
     assert sum(row["interventions"] for row in rows) <= 5

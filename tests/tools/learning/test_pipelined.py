@@ -7,7 +7,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.evaluation.step_log import read_ledger
+from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.pipelined import PipelinedLearner, _written
@@ -25,8 +25,8 @@ def made(**more):
     return PipelinedLearner(acting, ((preset, space), named), waits=True, **more), acting
 
 
-def test_a_ledger_is_whole_or_not_there(tmp_path, monkeypatch):
-    rows, file = pa.table({"episode": np.zeros(9, np.int32)}), tmp_path / "ledger" / "episode-000000.parquet"
+def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):
+    rows, file = pa.table({"episode": np.zeros(9, np.int32)}), tmp_path / "steps" / "episode-000000.parquet"
 
     def fail(*names):
         raise OSError("the process was killed")
@@ -36,10 +36,10 @@ def test_a_ledger_is_whole_or_not_there(tmp_path, monkeypatch):
         assert isinstance(_written(None, file, rows), InputError)
     assert list(tmp_path.rglob("*.parquet")) == []
     _written(None, file, rows)
-    assert len(read_ledger(file.parent)) == 9
+    assert len(read_step_log(file.parent)) == 9
 
 
-def test_a_ledger_that_cannot_be_written_is_said_by_who_acts(forkserver, tmp_path):
+def test_a_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
     (tmp_path / "file").write_text("")
     student, _ = made()
     student.write(tmp_path / "file" / "episode-000000.parquet", pa.table({"episode": [0]}))

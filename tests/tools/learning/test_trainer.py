@@ -49,11 +49,11 @@ def assert_same_run(first, second):
     assert a.keys() == b.keys()
     for key in a:
         np.testing.assert_array_equal(a[key], b[key])
-    assert ledger_bytes(first) == ledger_bytes(second) != {}
+    assert step_log_bytes(first) == step_log_bytes(second) != {}
 
 
-def ledger_bytes(folder):
-    return {path.name: path.read_bytes() for path in folder.ledger.iterdir()}
+def step_log_bytes(folder):
+    return {path.name: path.read_bytes() for path in folder.steps.iterdir()}
 
 
 def shown(config, number):
@@ -203,12 +203,12 @@ def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
     assert {path.name for path in folder.path.iterdir() if path.name.startswith(".")} == set()
 
 
-def test_the_ledger_can_be_turned_off_and_a_run_goes_on_as_it_began(bead_config, tmp_path):
+def test_a_step_log_that_was_turned_off_stays_off_when_a_run_resumes(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    train(folder, replace(bead_config, episodes=2, ledger=False))
-    assert not folder.ledger.exists()
-    with pytest.raises(InputError, match="ledger False, not True"):
-        run(None, folder.path, environment={}, ledger=True, resume=True)
+    train(folder, replace(bead_config, episodes=2, step_log=False))
+    assert not folder.steps.exists()
+    with pytest.raises(InputError, match="step_log False, not True"):
+        run(None, folder.path, environment={}, step_log=True, resume=True)
 
 
 def test_a_run_never_replaces_another(bead_config, tmp_path):

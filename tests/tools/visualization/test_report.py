@@ -14,7 +14,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.evaluation.step_log import StepLog, read_ledger
+from guiderail.tools.evaluation.step_log import StepLog, read_step_log
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import train
@@ -147,35 +147,35 @@ def test_a_run_without_a_column_has_no_figure_of_it(studied, tmp_path):
     assert plot_run(run).is_file()
 
 
-def test_safety_is_counted_in_control_steps_where_there_is_a_ledger(tmp_path):
+def test_safety_is_counted_in_control_steps_with_a_step_log(tmp_path):
     config = configure("NarrowPassage", {"guidance": "residual"}, episodes=1)
     folder, env = RunFolder(tmp_path / "run"), make_environment("NarrowPassage", config.environment)
     folder.create(config)
-    folder.write_episodes([rollout(env, lambda _: np.array([1.0, 0.0]), StepLog(env, folder.ledger), seed=0)])
+    folder.write_episodes([rollout(env, lambda _: np.array([1.0, 0.0]), StepLog(env, folder.steps), seed=0)])
     env.close()
     (run,) = gather([tmp_path / "run"]).runs
-    ledger, row = read_ledger(tmp_path / "run" / "ledger"), run.episodes.iloc[0]
-    assert run.safety["source"] == "ledger"
-    assert run.safety["steps"] == len(ledger) == row["steps"]
+    step_log, row = read_step_log(tmp_path / "run" / "steps"), run.episodes.iloc[0]
+    assert run.safety["source"] == "step_log"
+    assert run.safety["steps"] == len(step_log) == row["steps"]
     assert run.safety["collision_steps"] > 0
-    assert run.safety["poses_outside"] == (ledger["measured_violation"] > 1e-9).sum()
+    assert run.safety["poses_outside"] == (step_log["measured_violation"] > 1e-9).sum()
     assert run.safety["worst_command"] == row["max_commanded_violation"]
     assert run.safety["collision_steps"] == row["collision_steps"]
-    (tmp_path / "run" / "ledger" / "episode-000000.parquet").unlink()
-    with pytest.raises(InputError, match="holds no ledger"):
+    (tmp_path / "run" / "steps" / "episode-000000.parquet").unlink()
+    with pytest.raises(InputError, match="holds no step log"):
         _ = run.safety
 
 
 def test_the_command_of_a_run_makes_the_same_run(bead_config):
-    config = replace(bead_config, ledger=False)
+    config = replace(bead_config, step_log=False)
     words = shlex.split(command(config, "runs/bead"))
     assert words[:3] == ["guiderail", "train", "Bead"]
-    assert words[-3:] == ["--no-ledger", "--out", "runs/bead"]
+    assert words[-3:] == ["--no-step-log", "--out", "runs/bead"]
     given = dict(word.split("=") for before, word in itertools.pairwise(words) if before == "--set")
     option = dict(zip(words[3:-3:2], words[4:-3:2], strict=True))
     again = configure(
         "Bead", {"guidance": option["--guidance"]}, algorithm=option["--algorithm"], preset=option["--preset"],
-        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=given, ledger=False,
+        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=given, step_log=False,
     )  # fmt: skip
     assert again == config
 

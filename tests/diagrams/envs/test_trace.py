@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from guiderail.diagrams.envs.trace import EpisodeTrace, mean_jerk
+
+SIGNALS = {"commanded_violation": 1, "measured_violation": 1, "collision": 1, "saturation": 2, "fallback": 1}
+QUIET = {"commanded_violation": -1.0, "measured_violation": -1.0}
+
+
+def trace_of(steps):
+    """Return a trace whose control steps have the given signals, and a contact force if `force` is among them."""
+    trace = EpisodeTrace(60, 2, 0.1, SIGNALS)
+    for values in steps:
+        signals = {name: np.broadcast_to({**QUIET, **values}.get(name, 0.0), size) for name, size in SIGNALS.items()}
+        trace.append(np.zeros(2), np.zeros(2), values.get("force", 0.0), 0.0, signals)
+    return trace
+
+
+def test_statistics_are_those_of_all_control_steps():
+    rng = np.random.default_rng(0)
+    forces, violations = rng.uniform(0, 9, 50), rng.normal(size=50)
+    found = trace_of(
+        {"force": force, "commanded_violation": violation, "measured_violation": 2 * violation}
+        for force, violation in zip(forces, violations, strict=True)
+    ).statistics()
+    assert found["steps"] == 50
+    assert found["peak_force"] == forces.max()
+    assert found["mean_force"] == pytest.approx(forces.mean(), rel=1e-12)
+    assert found["max_commanded_violation"] == violations.max()
+    assert found["max_measured_violation"] == 2 * violations.max()
+
+
+def test_statistics_have_the_largest_violation_when_it_is_the_last():
+    assert trace_of([{}, {"commanded_violation": 0.3}]).statistics()["max_commanded_violation"] == 0.3
+
+
+def test_collision_lasts_as_long_as_the_contact():
+    found = trace_of({"collision": touching} for touching in (0, 1, 1, 1, 0, 0, 1, 0, 1)).statistics()
+    assert (found["collisions"], found["collision_steps"]) == (3, 5)
+    assert trace_of([{"collision": 1.0}]).statistics()["collisions"] == 1
+
+
+def test_statistics_count_saturation_of_any_actuator_and_fallbacks():
+    steps = (([0, 0], 1), ([0, -3], 0), ([1, 0], 1))
+    found = trace_of(
+        {"saturation": np.array(saturation, float), "fallback": fallback} for saturation, fallback in steps
+    ).statistics()
+    assert (found["saturated_steps"], found["fallback_steps"]) == (2, 2)
+
+
+@pytest.mark.parametrize("last", [np.nan, 9.0])
+def test_nan_does_not_hide_behind_a_maximum(last):
+    steps = [{"measured_violation": value} for value in (5.0, np.nan, last)]
+    assert np.isnan(trace_of(steps).statistics()["max_measured_violation"])
+
+
+def test_clear_deletes_every_control_step():
+    trace = trace_of([{"commanded_violation": 1.0, "force": 4.0, "collision": 1.0}] * 3)
+    trace.clear()
+    empty = trace.statistics()
+    assert empty.pop("max_commanded_violation") == empty.pop("max_measured_violation") == -np.inf
+    assert set(empty.values()) == {0.0}
+    assert len(trace) == len(trace.force) == 0
+
+
+def test_mean_jerk_is_that_of_a_cubic():
+    times = 0.1 * np.arange(9)
+    assert mean_jerk(np.column_stack([times**3, 0 * times]), 0.1) == pytest.approx(6.0, rel=1e-9)
+    assert mean_jerk(np.zeros((3, 2)), 0.1) == 0.0
