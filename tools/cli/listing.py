@@ -44,7 +44,9 @@ def list_(
     elif name in cli.LISTED["tasks"]():
         from guiderail.tools.cli.catalog import describe_task, describe_task_options, is_declared
 
-        print_result(describe_task(name) if as_json and is_declared(name) else describe_task_options(name), as_json, "_")
+        print_result(
+            describe_task(name) if as_json and is_declared(name) else describe_task_options(name), as_json, "_"
+        )
     else:
         known = did_you_mean(name, [*cli.CHOICES["listed"](), "metrics"], IMPORTED)
         raise InputError(f"there is no list of {name!r}: {known}")

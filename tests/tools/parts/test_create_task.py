@@ -139,7 +139,9 @@ def test_bounds_from_demonstrations_become_its_own(folder, capsys):
 
     before = (folder / "task.yaml").read_text()
     try:
-        call("dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder)
+        call(
+            "dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder
+        )
         constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
         assert constraints.G.shape[0] > 1
         np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
