@@ -1,7 +1,7 @@
-"""Drake LeafSystems, one a file, each a thin shell over a law that can be called without a diagram.
+"""Drake LeafSystems, one per file; each wraps a law that can also be called without a diagram.
 
-Every system, and what its constructor takes, can be imported from here: `from guiderail.systems import HistoryBuffer`.
-The names are in `__init__.pyi`; a module is imported when the first of its names is used.
+All systems and the types of their constructor arguments are exported: `from guiderail.systems import HistoryBuffer`.
+`__init__.pyi` lists the names. A module is imported at the first use of one of its names.
 """
 
 import lazy_loader

@@ -11,21 +11,21 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import orientation_error, pose_to_transform, transform_to_pose
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
-from guiderail.systems.support.command_watch import CommandWatch
+from guiderail.systems.support.last_valid_pose import LastValidPose
 
 
 @dataclass(frozen=True)
 class ImpedanceGains:
-    """Stiffness, damping and limits of a Cartesian impedance, and the posture that the null space is controlled to.
+    """Stiffness, damping and limits of a Cartesian impedance, and its null-space posture.
 
     Args:
-        stiffness: (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad.
-        wrench_limits: (6,) of the wrench along the stiffness frame's axes [N, Nm], positive.
-        damping_ratio: of every mode, positive and finite.
-        posture: joint positions (n,) that the null space returns to, finite.
-        posture_stiffness: [Nm/rad], not negative, finite.
-        posture_damping: decay rate of motion in the null space [1/s], not negative, finite; its torque is this rate
-            times M v, which takes energy out of the null space in every posture.
+        stiffness: Stiffness matrix (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad.
+        wrench_limits: Limits (6,) of the wrench along the axes of the stiffness frame [N, Nm], positive.
+        damping_ratio: Damping ratio of every mode, positive and finite.
+        posture: Joint positions (n,) that the null-space control returns to [rad], finite.
+        posture_stiffness: Stiffness of the return to the posture [Nm/rad], not negative, finite.
+        posture_damping: Decay rate of null-space motion [1/s], not negative, finite. Its torque is this rate times M v,
+            which dissipates energy in every posture.
     """
 
     stiffness: np.ndarray
@@ -37,8 +37,8 @@ class ImpedanceGains:
 
     def __post_init__(self) -> None:
         K = np.asarray(self.stiffness, dtype=float)
-        is_sound = K.shape == (6, 6) and np.isfinite(K).all() and np.allclose(K, K.T)
-        if not is_sound or not (np.linalg.eigvalsh(K) > 0.0).all():
+        is_symmetric = K.shape == (6, 6) and np.isfinite(K).all() and np.allclose(K, K.T)
+        if not is_symmetric or not (np.linalg.eigvalsh(K) > 0.0).all():
             raise InputError("a Cartesian stiffness must be a symmetric, positive definite 6 × 6 matrix")
         if np.shape(self.wrench_limits) != (6,) or not (np.asarray(self.wrench_limits) > 0.0).all():
             raise InputError(f"an impedance needs six positive wrench limits, not {self.wrench_limits}")
@@ -53,13 +53,13 @@ class ImpedanceGains:
 
 
 class CartesianImpedanceController(LeafSystem):
-    """Makes an arm's tool centre P behave as a spring and a damper around a desired pose.
+    """Joint torques that make the tool centre P of an arm act as a spring and damper around a desired pose.
 
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
 
-    (`impedance_torques`). K may be given in the axes of any frame. The orientation error is a quaternion's, so that no
-    orientation is singular. D follows from K and the arm's inertia at its present posture. Where commands stop, a
-    watchdog holds the last valid one: see `CommandWatch`.
+    See `impedance_torques`. K may be given in the axes of any frame. The orientation error is computed from quaternions,
+    so no orientation is singular. D follows from K and the arm's inertia in its present posture. If commands stop, the
+    last valid one remains in force (`LastValidPose`).
 
     .. pydrake_system::
 
@@ -75,10 +75,11 @@ class CartesianImpedanceController(LeafSystem):
         - saturation
         - command_timed_out
 
-    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``estimated_state`` is (2n,), joint
-    positions and velocities. ``command_time`` is (1,), when ``desired_pose`` was given [s]; unconnected, commands never
-    get stale. ``generalized_force`` is (n,) [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T. ``saturation`` is 1
-    while the wrench or a motor is at its limit, ``command_timed_out`` 1 while the watchdog holds; both (1,).
+    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``estimated_state`` is (2n,),
+    joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
+    is not connected, commands never time out. ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench``
+    is (6,), force first, in the axes of T. ``saturation`` (1,) is 1 while the wrench or a motor is at its limit.
+    ``command_timed_out`` (1,) is 1 while no valid command is available.
     """
 
     def __init__(
@@ -93,20 +94,21 @@ class CartesianImpedanceController(LeafSystem):
         compensate_gravity: bool = True,
         timeout: float = 0.1,
     ):
-        """
+        """Construct the system.
+
         Args:
-            plant: the arm with what it carries and nothing else, finalized; only its kinematics and inertia are used.
-            target: T, fixed in the world.
-            tool_centre: P.
-            gains: the impedance.
-            period: at which the watchdog checks commands [s], positive.
-            stiffness_frame: in whose axes the gains are given; T unless given. In the axes of a frame that rotates the
-                impedance is not strictly passive: a spring whose axes are turned can gain energy.
-            compensate_gravity: False where the robot's own controller compensates it.
-            timeout: age beyond which a desired pose is stale [s], positive.
+            plant: Model of the arm and its payload alone, finalized; its kinematics and inertia are used.
+            target: Frame T, fixed in the world.
+            tool_centre: Frame P.
+            gains: Impedance parameters.
+            period: Period of the command check [s], positive.
+            stiffness_frame: Frame in whose axes the gains are given, T by default. If this frame rotates, the impedance
+                is not strictly passive: turning the axes of a loaded spring can add energy.
+            compensate_gravity: False if the robot's own controller compensates gravity.
+            timeout: Age above which a desired pose is stale [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         num_joints = plant.num_positions()
@@ -120,7 +122,7 @@ class CartesianImpedanceController(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._estimated_state_port = self.DeclareVectorInputPort("estimated_state", 2 * num_joints)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
-        self._watch = CommandWatch(
+        self._followed_pose = LastValidPose(
             self,
             self._desired_pose_port,
             self._command_time_port,
@@ -131,7 +133,9 @@ class CartesianImpedanceController(LeafSystem):
 
         state = {self._estimated_state_port.ticket()}
         self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=state)
-        self._law = declare_cache(self, "law", self._calc_law, prerequisites_of_calc=self._watch.tickets | state)
+        self._law = declare_cache(
+            self, "law", self._calc_law, prerequisites_of_calc=self._followed_pose.tickets | state
+        )
         law = {self._law.ticket()}
         self._generalized_force_port = self.DeclareVectorOutputPort(
             "generalized_force", num_joints, self._calc_generalized_force, prerequisites_of_calc=law
@@ -144,39 +148,42 @@ class CartesianImpedanceController(LeafSystem):
             "saturation", 1, self._calc_saturation, prerequisites_of_calc=law
         )
         self._command_timed_out_port = self.DeclareVectorOutputPort(
-            "command_timed_out", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
+            "command_timed_out",
+            1,
+            self._followed_pose.calc_timed_out,
+            prerequisites_of_calc=self._followed_pose.timed_out_tickets,
         )
 
     def get_desired_pose_input_port(self) -> InputPort:
-        """The desired pose of the tool centre, (6,)."""
+        """Return the port of the desired pose of the tool centre, (6,)."""
         return self._desired_pose_port
 
     def get_estimated_state_input_port(self) -> InputPort:
-        """Joint positions and velocities, (2n,) [rad, rad/s]."""
+        """Return the port of joint positions and velocities, (2n,) [rad, rad/s]."""
         return self._estimated_state_port
 
     def get_command_time_input_port(self) -> InputPort:
-        """When the desired pose was given, (1,) [s]; optional."""
+        """Return the port of the time stamp of the desired pose, (1,) [s]; optional."""
         return self._command_time_port
 
     def get_generalized_force_output_port(self) -> OutputPort:
-        """Joint torques, (n,) [Nm]."""
+        """Return the port of the joint torques, (n,) [Nm]."""
         return self._generalized_force_port
 
     def get_pose_output_port(self) -> OutputPort:
-        """The measured pose of the tool centre, (6,)."""
+        """Return the port of the measured pose of the tool centre, (6,)."""
         return self._pose_port
 
     def get_impedance_wrench_output_port(self) -> OutputPort:
-        """What the spring and the damper apply at P in the axes of T, (6,), force first."""
+        """Return the port of the wrench of spring and damper at P in the axes of T, (6,), force first."""
         return self._impedance_wrench_port
 
     def get_saturation_output_port(self) -> OutputPort:
-        """1 while the wrench or a motor is at its limit, (1,)."""
+        """Return the port of the flag that the wrench or a motor is at its limit, (1,)."""
         return self._saturation_port
 
     def get_command_timed_out_output_port(self) -> OutputPort:
-        """1 while the watchdog holds, (1,)."""
+        """Return the port of the flag that no valid command is available, (1,)."""
         return self._command_timed_out_port
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
@@ -188,7 +195,7 @@ class CartesianImpedanceController(LeafSystem):
     def _calc_law(self, context: Context) -> JointTorques:
         plant, gains = self._plant, self._gains
         plant_context = self._plant_context.Eval(context)
-        X_TPd = pose_to_transform(self._watch.pose(context))
+        X_TPd = pose_to_transform(self._followed_pose.eval(context))
         X_TP = self._tool_centre.CalcPose(plant_context, self._target)
         R_TAxes = None
         if self._stiffness_frame is not None:

@@ -1,4 +1,4 @@
-"""Cartesian position control for an arm that takes joint positions."""
+"""Cartesian position control of an arm with joint position commands."""
 
 from dataclasses import dataclass
 
@@ -25,17 +25,17 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform, transform_to_pose
 from guiderail.models.control.damped_inverse import damped_joint_velocities, follows
 from guiderail.systems.support.caching import declare_plant_context
-from guiderail.systems.support.command_watch import CommandCheck
+from guiderail.systems.support.last_valid_pose import CommandValidity
 from guiderail.systems.support.sampling import check_period
 
 
 @dataclass(frozen=True)
 class SpeedLimits:
-    """Greatest commanded speeds of the tool centre.
+    """Speed limits of the tool centre.
 
     Attributes:
-        translational: [m/s], positive.
-        rotational: [rad/s], positive.
+        translational: Translational speed limit [m/s], positive.
+        rotational: Rotational speed limit [rad/s], positive.
     """
 
     translational: float = 0.25
@@ -47,17 +47,18 @@ class SpeedLimits:
 
 
 class CartesianPositionController(LeafSystem):
-    """Commands joint positions that move an arm's tool centre P to a desired pose, by differential inverse kinematics.
+    """Joint position commands that move the tool centre P to a desired pose by differential inverse kinematics.
 
-        q[k+1] = clip(q[k] + v·period), J v = the velocity that reaches the desired pose in one period, within limits
+        q[k+1] = clip(q[k] + v·period),  J v = V
 
-    (`pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics`; in closed form while no limit of a joint
-    binds, which is the same optimum). The optimization keeps the direction of the tool's motion and every joint's
-    limits of position and velocity; where both can't be had, the motion slows down or stops. A joint that begins beyond
-    a limit of its position may come back, no faster than ever, and goes no farther. Where commands stop, the
-    joint command is held: while the desired pose is not finite, older than a timeout or more than a period from the
-    future (`CommandCheck`). Near a singular posture a damped pseudoinverse takes over (`models.damped_inverse`): the
-    tool leaves its direction a little, the joints stay slow, and the return to the posture leads out.
+    V is the velocity that reaches the desired pose in one period, within the speed limits.
+    `pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics` computes v; while no joint limit is active, a
+    closed form gives the same optimum. Position and velocity limits of the joints are satisfied and the direction of
+    the tool's motion is preserved; if both are not possible, the motion slows down or stops. A joint that starts
+    outside its position limits may return within its velocity limit and moves no farther out. While the desired pose is
+    not finite, older than the timeout, or more than one period in the future (`CommandValidity`), the joint command is
+    constant. Near a singular posture a damped pseudoinverse is used (`models.control.damped_inverse`): the direction of
+    the tool deviates slightly, the joints stay slow, and the return to the posture leads out of the singularity.
 
     .. pydrake_system::
 
@@ -72,12 +73,12 @@ class CartesianPositionController(LeafSystem):
         - stuck
         - command_timed_out
 
-    ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``positions`` is (n,), measured; it is read
-    at initialization, and the joint command starts there. ``command_time`` is (1,), when ``desired_pose`` was given
-    [s]; unconnected, commands never get stale. ``joint_positions`` is the joint command, (n,) [rad]. ``pose`` is (6,),
-    where the joint command puts the tool centre. ``stuck`` is 1 while the desired direction can't be followed,
-    ``command_timed_out`` 1 while the joint command is held; both (1,). All outputs are state or follow from it: nothing feeds
-    through.
+    ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``positions`` is (n,), measured joint
+    positions [rad], read at initialization as the first joint command. ``command_time`` is (1,), the time stamp of
+    ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
+    (n,) [rad]. ``pose`` is (6,), the pose of the tool centre at the joint command. ``stuck`` (1,) is 1 while the
+    desired direction cannot be followed. ``command_timed_out`` (1,) is 1 while no valid command is available. All
+    outputs depend on state alone; there is no direct feedthrough.
     """
 
     def __init__(
@@ -92,19 +93,20 @@ class CartesianPositionController(LeafSystem):
         posture_gain: float = 0.5,
         timeout: float = 0.1,
     ):
-        """
+        """Construct the system.
+
         Args:
-            plant: the arm alone, finalized; its joints' limits are kept.
-            target: T, fixed in the world.
-            tool_centre: P.
-            posture: joint positions (n,) that the null space returns to, finite.
-            period: between two joint commands [s], positive; 100 Hz unless given.
-            speed_limits: of the tool centre.
-            posture_gain: of the return to the posture [1/s], not negative.
-            timeout: age beyond which a desired pose is stale [s], positive.
+            plant: Model of the arm alone, finalized; its joint limits are satisfied.
+            target: Frame T, fixed in the world.
+            tool_centre: Frame P.
+            posture: Joint positions (n,) that the null-space control returns to [rad], finite.
+            period: Period of the joint commands [s], positive.
+            speed_limits: Speed limits of the tool centre.
+            posture_gain: Gain of the return to the posture [1/s], not negative.
+            timeout: Age above which a desired pose is stale [s], positive.
 
         Raises:
-            InputError: if an argument is out of range. At initialization, if a measured position is not finite.
+            InputError: If an argument is out of range. At initialization, if a measured position is not finite.
         """
         super().__init__()
         check_period(period)
@@ -130,10 +132,12 @@ class CartesianPositionController(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
-        self._check = CommandCheck(self._desired_pose_port, self._command_time_port, period=period, timeout=timeout)
+        self._validity = CommandValidity(
+            self._desired_pose_port, self._command_time_port, period=period, timeout=timeout
+        )
         self._command = self.DeclareDiscreteState(num_joints)
         self._is_stuck = self.DeclareDiscreteState(1)
-        self._is_holding = self.DeclareDiscreteState(1)
+        self._has_timed_out = self.DeclareDiscreteState(1)
         command = {self.discrete_state_ticket(self._command)}
         self._plant_context = declare_plant_context(self, plant, self._set_plant_state, prerequisites_of_calc=command)
         self._joint_positions_port = self.DeclareStateOutputPort("joint_positions", self._command)
@@ -141,36 +145,36 @@ class CartesianPositionController(LeafSystem):
             "pose", 6, self._calc_pose, prerequisites_of_calc={self._plant_context.ticket()}
         )
         self._stuck_port = self.DeclareStateOutputPort("stuck", self._is_stuck)
-        self._command_timed_out_port = self.DeclareStateOutputPort("command_timed_out", self._is_holding)
+        self._command_timed_out_port = self.DeclareStateOutputPort("command_timed_out", self._has_timed_out)
         self.DeclareInitializationDiscreteUpdateEvent(self._start_at_measured_positions)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 
     def get_desired_pose_input_port(self) -> InputPort:
-        """The desired pose of the tool centre, (6,)."""
+        """Return the port of the desired pose of the tool centre, (6,)."""
         return self._desired_pose_port
 
     def get_positions_input_port(self) -> InputPort:
-        """Measured joint positions, (n,) [rad]."""
+        """Return the port of the measured joint positions, (n,) [rad]."""
         return self._positions_port
 
     def get_command_time_input_port(self) -> InputPort:
-        """When the desired pose was given, (1,) [s]; optional."""
+        """Return the port of the time stamp of the desired pose, (1,) [s]; optional."""
         return self._command_time_port
 
     def get_joint_positions_output_port(self) -> OutputPort:
-        """The joint command, (n,) [rad]."""
+        """Return the port of the joint command, (n,) [rad]."""
         return self._joint_positions_port
 
     def get_pose_output_port(self) -> OutputPort:
-        """Where the joint command puts the tool centre, (6,)."""
+        """Return the port of the pose of the tool centre at the joint command, (6,)."""
         return self._pose_port
 
     def get_stuck_output_port(self) -> OutputPort:
-        """1 while the desired direction can't be followed, (1,)."""
+        """Return the port of the flag that the desired direction cannot be followed, (1,)."""
         return self._stuck_port
 
     def get_command_timed_out_output_port(self) -> OutputPort:
-        """1 while the joint command is held, (1,)."""
+        """Return the port of the flag that no valid command is available, (1,)."""
         return self._command_timed_out_port
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
@@ -187,12 +191,12 @@ class CartesianPositionController(LeafSystem):
             )
         discrete_state.set_value(self._command, measured)
         discrete_state.set_value(self._is_stuck, [0.0])
-        discrete_state.set_value(self._is_holding, [0.0])
+        discrete_state.set_value(self._has_timed_out, [0.0])
         return EventStatus.Succeeded()
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        is_valid = self._check.is_valid(context, context.get_time())
-        discrete_state.set_value(self._is_holding, [float(not is_valid)])
+        is_valid = self._validity.is_valid(context, context.get_time())
+        discrete_state.set_value(self._has_timed_out, [float(not is_valid)])
         if not is_valid:
             return EventStatus.Succeeded()
         plant, plant_context = self._plant, self._plant_context.Eval(context)
@@ -202,17 +206,17 @@ class CartesianPositionController(LeafSystem):
             plant_context, JacobianWrtVariable.kV, self._tool_centre, np.zeros(3), self._target, self._target
         )
         q = self._joint_command(context)
-        # With q among them no limit asks for a leap of a joint that is beyond it, nor forbids every motion.
+        # With q included, a joint outside its limits neither jumps back nor makes the problem infeasible.
         limits = np.minimum(self._position_limits[0], q), np.maximum(self._position_limits[1], q)
         velocities, is_stuck = self._joint_velocities(q, V, J, limits)
         discrete_state.set_value(self._is_stuck, [float(is_stuck)])
         if velocities is not None:
-            # The solver keeps limits to its own tolerance only; what is sent keeps them exactly.
+            # The solver satisfies limits only to its tolerance; the command satisfies them exactly.
             discrete_state.set_value(self._command, np.clip(q + self._period * velocities, *limits))
         return EventStatus.Succeeded()
 
     def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
-        """Of the tool centre, [rotational, translational] (6,): reaches X_TPd in one period, within the limits."""
+        """Return the tool velocity [rotational, translational] (6,) that reaches X_TPd in one period, within limits."""
         turn = (X_TPd.rotation() @ X_TP.rotation().inverse()).ToAngleAxis()
         return np.concatenate(
             [
@@ -224,13 +228,13 @@ class CartesianPositionController(LeafSystem):
     def _joint_velocities(
         self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray | None, bool]:
-        """For the tool velocity V, or None where there are none; and whether V's direction can't be followed."""
+        """Return joint velocities for the tool velocity V (None if there are none), and True if V cannot be followed."""
         velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
         if not is_regular:
             velocities /= max(1.0, float((np.abs(velocities) / self._velocity_limits[1]).max()))
             return velocities, not follows(J, velocities, V)
         if _within(velocities, self._velocity_limits) and _within(q + self._period * velocities, position_limits):
-            return velocities, False  # no limit binds: the optimum, without the time that its solver takes
+            return velocities, False  # no limit is active: the optimum in closed form, which is faster
         self._parameters.set_joint_position_limits(position_limits)
         result = DoDifferentialInverseKinematics(q, np.zeros_like(q), V, J, self._parameters)
         return result.joint_velocities, result.status != DifferentialInverseKinematicsStatus.kSolutionFound
@@ -245,6 +249,6 @@ def _within(values: np.ndarray, limits: tuple[np.ndarray, np.ndarray]) -> bool:
 
 
 def _limited(velocity: np.ndarray, limit: float) -> np.ndarray:
-    """The same direction, no faster than the limit."""
+    """Return the velocity scaled down to the speed limit."""
     speed = float(np.linalg.norm(velocity))
     return velocity if speed <= limit else velocity * (limit / speed)

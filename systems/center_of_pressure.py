@@ -1,4 +1,4 @@
-"""Where a contact pushes, told from what it pushes with."""
+"""Center of pressure of a contact, computed from its wrench."""
 
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
@@ -8,12 +8,11 @@ from guiderail.models.control.wrench import center_of_pressure
 
 
 class CenterOfPressure(LeafSystem):
-    """Measures the lever of a force along z about a tool centre.
+    """Center of pressure of a contact force along z, relative to the tool centre.
 
-        lever = (−τ_y, τ_x) / f_z where f_z ≥ least_force, and 0 elsewhere
+        center_of_pressure = (−τ_y, τ_x) / f_z if f_z ≥ min_force, otherwise 0
 
-    A single point that pushes along z at p has τ = p × f, so that the lever is p: it leads from the tool centre to the
-    point, however hard that pushes.
+    A point force along z at p has the torque τ = p × f, so the center of pressure is p for any magnitude of the force.
 
     .. pydrake_system::
 
@@ -23,33 +22,34 @@ class CenterOfPressure(LeafSystem):
         output_ports:
         - center_of_pressure
 
-    ``wrench`` (6,) is force and torque about the tool centre [N, Nm]; ``center_of_pressure`` is (2,) [m].
+    ``wrench`` is (6,), force and torque about the tool centre [N, Nm]. ``center_of_pressure`` is (2,), x and y [m].
     """
 
-    def __init__(self, least_force: float):
-        """
+    def __init__(self, min_force: float):
+        """Construct the system.
+
         Args:
-            least_force: [N] below which the plug touches nothing, positive.
+            min_force: Force along z below which there is no contact [N], positive.
 
         Raises:
-            InputError: if it is not.
+            InputError: If the force is not positive.
         """
         super().__init__()
-        if not least_force > 0.0:
-            raise InputError(f"the lever of a force needs a least force, positive, not {least_force} N")
-        self._least_force = least_force
+        if not min_force > 0.0:
+            raise InputError(f"a center of pressure needs a positive minimum force, not {min_force} N")
+        self._min_force = min_force
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
         self._center_of_pressure_port = self.DeclareVectorOutputPort(
             "center_of_pressure", 2, self._calc_center_of_pressure, prerequisites_of_calc={self._wrench_port.ticket()}
         )
 
     def get_wrench_input_port(self) -> InputPort:
-        """Force and torque about the tool centre, (6,) [N, Nm]."""
+        """Return the port of force and torque about the tool centre, (6,) [N, Nm]."""
         return self._wrench_port
 
     def get_center_of_pressure_output_port(self) -> OutputPort:
-        """From the tool centre to where it pushes, (2,) [m]."""
+        """Return the port of the center of pressure relative to the tool centre, (2,) [m]."""
         return self._center_of_pressure_port
 
     def _calc_center_of_pressure(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(center_of_pressure(self._wrench_port.Eval(context), self._least_force))
+        output.SetFromVector(center_of_pressure(self._wrench_port.Eval(context), self._min_force))

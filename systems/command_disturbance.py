@@ -1,4 +1,4 @@
-"""A line that loses commands, or is slow."""
+"""Command line with delay and random loss."""
 
 import numpy as np
 from pydrake.systems.framework import (
@@ -16,11 +16,11 @@ from guiderail.systems.support.sampling import check_period
 
 
 class CommandDisturbance(LeafSystem):
-    """Delivers commands late, and some not at all: then the robot goes on with the last one that arrived.
+    """Delay commands and lose some of them at random; a lost command is replaced by the last delivered one.
 
         y_n = y_{n−1} with probability p, otherwise u_{n−k}
 
-    Before the first command the measured pose is what was delivered.
+    Before the first command the output is the measured pose.
 
     .. pydrake_system::
 
@@ -31,58 +31,61 @@ class CommandDisturbance(LeafSystem):
         output_ports:
         - delivered_command
 
-    All are (n,). ``pose`` is measured, and read at initialization only.
+    All are (n,). ``pose`` is the measured pose, read at initialization only.
     """
 
-    def __init__(self, size: int, period: float, lost: float = 0.0, late: int = 0):
-        """
+    def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
+        """Construct the system.
+
         Args:
-            size: n, at least 1.
-            period: at which commands change [s], positive.
-            lost: p, from 0 to less than 1.
-            late: k periods, from 0.
+            size: Size n of a command, at least 1.
+            period: Period of the commands [s], positive.
+            loss_probability: p, from 0 to less than 1.
+            delay: k periods, at least 0.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         check_period(period)
         if size < 1:
             raise InputError(f"a command has at least one number, not {size}")
-        if not 0.0 <= lost < 1.0:
-            raise InputError(f"the probability that a command is lost is from 0 to less than 1, not {lost}")
-        if late < 0:
-            raise InputError(f"commands are late by a number of periods from 0, not {late}")
-        self._lost, self._late = lost, late
+        if not 0.0 <= loss_probability < 1.0:
+            raise InputError(f"the probability that a command is lost is from 0 to less than 1, not {loss_probability}")
+        if delay < 0:
+            raise InputError(f"the delay of commands is a number of periods from 0, not {delay}")
+        self._loss_probability, self._delay = loss_probability, delay
         self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
         self._count = self.DeclareDiscreteState(1)
         self._is_lost = self.DeclareDiscreteState(1)
         self._last = self.DeclareDiscreteState(size)
-        self._line = self.DeclareDiscreteState(late * size) if late else None  # the oldest first
+        self._delay_line = self.DeclareDiscreteState(delay * size) if delay else None  # oldest command first
         self._command_port = self.DeclareVectorInputPort("command", size)
         self._pose_port = self.DeclareVectorInputPort("pose", size)
         state = {self.discrete_state_ticket(index) for index in (self._is_lost, self._last)}
-        source = self._command_port.ticket() if self._line is None else self.discrete_state_ticket(self._line)
+        source = (
+            self._command_port.ticket() if self._delay_line is None else self.discrete_state_ticket(self._delay_line)
+        )
         self._delivered_command_port = self.DeclareVectorOutputPort(
-            "delivered_command", size, self._calc_delivered, prerequisites_of_calc=state | {source}
+            "delivered_command", size, self._calc_delivered_command, prerequisites_of_calc=state | {source}
         )
         self.DeclareInitializationDiscreteUpdateEvent(self._start)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_command_input_port(self) -> InputPort:
-        """What is commanded, (n,)."""
+        """Return the port of the command, (n,)."""
         return self._command_port
 
     def get_pose_input_port(self) -> InputPort:
-        """Where the robot is, (n,)."""
+        """Return the port of the measured pose, (n,)."""
         return self._pose_port
 
     def get_delivered_command_output_port(self) -> OutputPort:
-        """What arrives, (n,)."""
+        """Return the port of the delivered command, (n,)."""
         return self._delivered_command_port
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Sets what losses are drawn from; `context` is this system's own."""
+        """Set the seed of the losses; `context` is this system's."""
         context.get_mutable_numeric_parameter(self._seed).SetFromVector([float(seed)])
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -90,31 +93,31 @@ class CommandDisturbance(LeafSystem):
         discrete_state.set_value(self._count, [0.0])
         discrete_state.set_value(self._is_lost, [0.0])
         discrete_state.set_value(self._last, pose)
-        if self._line is not None:
-            discrete_state.set_value(self._line, np.tile(pose, self._late))
+        if self._delay_line is not None:
+            discrete_state.set_value(self._delay_line, np.tile(pose, self._delay))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = context.get_discrete_state(self._count).value()[0] + 1.0
         discrete_state.set_value(self._count, [count])
-        discrete_state.set_value(self._last, self._delivered(context))
-        if self._line is not None:
-            sent = self._command_port.Eval(context)
-            line = context.get_discrete_state(self._line).value()
-            discrete_state.set_value(self._line, np.concatenate([line[len(sent) :], sent]))
-        if self._lost > 0.0:
+        discrete_state.set_value(self._last, self._eval_delivered(context))
+        if self._delay_line is not None:
+            command = self._command_port.Eval(context)
+            line = context.get_discrete_state(self._delay_line).value()
+            discrete_state.set_value(self._delay_line, np.concatenate([line[len(command) :], command]))
+        if self._loss_probability > 0.0:
             seed = context.get_numeric_parameter(self._seed).value()[0]
-            drawn = np.random.default_rng([int(seed), int(count)]).uniform()
-            discrete_state.set_value(self._is_lost, [float(drawn < self._lost)])
+            sample = np.random.default_rng([int(seed), int(count)]).uniform()
+            discrete_state.set_value(self._is_lost, [float(sample < self._loss_probability)])
         return EventStatus.Succeeded()
 
-    def _delivered(self, context: Context) -> np.ndarray:
+    def _eval_delivered(self, context: Context) -> np.ndarray:
         last = context.get_discrete_state(self._last).value()
         if context.get_discrete_state(self._is_lost).value()[0]:
             return last
-        if self._line is None:
+        if self._delay_line is None:
             return self._command_port.Eval(context)
-        return context.get_discrete_state(self._line).value()[: len(last)]
+        return context.get_discrete_state(self._delay_line).value()[: len(last)]
 
-    def _calc_delivered(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._delivered(context))
+    def _calc_delivered_command(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._eval_delivered(context))

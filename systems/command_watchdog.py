@@ -1,17 +1,17 @@
-"""Passes on valid commands, and holds the last one where they stop."""
+"""Watchdog that outputs the last valid command when commands stop."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.support.command_watch import CommandWatch
+from guiderail.systems.support.last_valid_pose import LastValidPose
 
 
 class CommandWatchdog(LeafSystem):
-    """Holds the last valid pose when commands stop, for robots whose controller has no watchdog of its own.
+    """Output the desired pose while it is valid, otherwise the last valid one.
 
-    A command is valid while it is finite, no older than a timeout and no more than a period from the future; see
-    `CommandWatch`, which also says when that is checked.
+    For robots whose controller has no command timeout. A command is valid while it is finite, not older than the
+    timeout, and not more than one period in the future; see `LastValidPose`.
 
     .. pydrake_system::
 
@@ -25,19 +25,20 @@ class CommandWatchdog(LeafSystem):
         - command_timed_out
 
     ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``command_time`` is (1,),
-    when ``desired_pose`` was given [s]; unconnected, commands never get stale. ``command_timed_out`` is (1,): 1 while a pose is
-    held.
+    the time stamp of ``desired_pose`` [s]; if it is not connected, commands never time out. ``command_timed_out`` (1,)
+    is 1 while no valid command is available.
     """
 
     def __init__(self, period: float, timeout: float = 0.1, pose_size: int = 6):
-        """
+        """Construct the system.
+
         Args:
-            period: at which commands are checked [s], positive; best the period at which they change.
-            timeout: age beyond which a command is stale [s], positive.
-            pose_size: O, at least 1.
+            period: Period of the check [s], positive; ideally the period of the commands.
+            timeout: Age above which a command is stale [s], positive.
+            pose_size: Number of coordinates O, at least 1.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         if pose_size < 1:
@@ -45,7 +46,7 @@ class CommandWatchdog(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", pose_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
-        self._watch = CommandWatch(
+        self._followed_pose = LastValidPose(
             self,
             self._desired_pose_port,
             self._command_time_port,
@@ -54,34 +55,37 @@ class CommandWatchdog(LeafSystem):
             timeout=timeout,
         )
         self._safe_pose_port = self.DeclareVectorOutputPort(
-            "safe_pose", pose_size, self._calc_safe_pose, prerequisites_of_calc=self._watch.tickets
+            "safe_pose", pose_size, self._calc_safe_pose, prerequisites_of_calc=self._followed_pose.tickets
         )
         self._command_timed_out_port = self.DeclareVectorOutputPort(
-            "command_timed_out", 1, self._watch.calc_holding, prerequisites_of_calc=self._watch.holding_tickets
+            "command_timed_out",
+            1,
+            self._followed_pose.calc_timed_out,
+            prerequisites_of_calc=self._followed_pose.timed_out_tickets,
         )
 
     def get_desired_pose_input_port(self) -> InputPort:
-        """The commanded pose, (O,)."""
+        """Return the port of the commanded pose, (O,)."""
         return self._desired_pose_port
 
     def get_pose_input_port(self) -> InputPort:
-        """The measured pose, (O,)."""
+        """Return the port of the measured pose, (O,)."""
         return self._pose_port
 
     def get_command_time_input_port(self) -> InputPort:
-        """When the desired pose was given, (1,) [s]; optional."""
+        """Return the port of the time stamp of the desired pose, (1,) [s]; optional."""
         return self._command_time_port
 
     def get_safe_pose_output_port(self) -> OutputPort:
-        """The commanded pose, or the held one, (O,)."""
+        """Return the port of the last valid desired pose, (O,)."""
         return self._safe_pose_port
 
     def get_command_timed_out_output_port(self) -> OutputPort:
-        """1 while a pose is held, (1,)."""
+        """Return the port of the flag that no valid command is available, (1,)."""
         return self._command_timed_out_port
 
     def _measured_pose(self, context: Context) -> np.ndarray:
         return self._pose_port.Eval(context)
 
     def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._watch.pose(context))
+        output.SetFromVector(self._followed_pose.eval(context))

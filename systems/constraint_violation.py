@@ -1,4 +1,4 @@
-"""By how much a pose violates linear constraints."""
+"""Constraint violation of a pose."""
 
 from pydrake.systems.framework import (
     BasicVector,
@@ -15,9 +15,9 @@ from guiderail.systems.support.sampling import check_period
 
 
 class ConstraintViolation(LeafSystem):
-    """Measures by how much a pose y violates linear constraints G y ≥ c.
+    """Maximum violation of linear constraints G y ≥ c by a pose y.
 
-        violation = max over the constraints of c − G y, negative where all are slack
+        violation = max(c − G y), negative if all constraints are slack
 
     .. pydrake_system::
 
@@ -27,22 +27,22 @@ class ConstraintViolation(LeafSystem):
         output_ports:
         - violation
 
-    ``pose`` (O,) is commanded or measured; ``violation`` (1,) is in the unit of c, and `UNCONSTRAINED` where there is
-    no constraint. It depends on the pose and the control step alone: it judges every guidance alike, whether that
-    knows of the constraints or not.
+    ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c; `UNCONSTRAINED` if there is no
+    constraint. It depends on the pose and the control step alone, so it evaluates every guidance in the same way.
     """
 
-    #: What stands for "no constraint": finite, so that it can be logged.
+    #: Violation if there is no constraint: finite, so that it can be logged.
     UNCONSTRAINED = -1e30
 
     def __init__(self, constraints: LinearConstraints, period: float):
-        """
+        """Construct the system.
+
         Args:
-            constraints: on O outputs; where they differ from step to step, the step counts control periods.
-            period: between two control steps [s], positive.
+            constraints: Constraints on O outputs, constant or one set per control step.
+            period: Control period [s], positive.
 
         Raises:
-            InputError: if the period is not positive.
+            InputError: If the period is not positive.
         """
         super().__init__()
         check_period(period)
@@ -59,11 +59,11 @@ class ConstraintViolation(LeafSystem):
         )
 
     def get_pose_input_port(self) -> InputPort:
-        """The pose to judge, (O,)."""
+        """Return the port of the pose, (O,)."""
         return self._pose_port
 
     def get_violation_output_port(self) -> OutputPort:
-        """max(c − G y), (1,)."""
+        """Return the port of the violation max(c − G y), (1,)."""
         return self._violation_port
 
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -73,5 +73,5 @@ class ConstraintViolation(LeafSystem):
     def _calc_violation(self, context: Context, output: BasicVector) -> None:
         step = 0 if self._step is None else int(context.get_discrete_state(self._step).value()[0])
         violation = self._constraints.violation(self._pose_port.Eval(context), step)
-        # Not max(UNCONSTRAINED, violation): that would turn a NaN into "no constraint".
+        # max(UNCONSTRAINED, violation) would turn NaN into "no constraint".
         output.SetAtIndex(0, self.UNCONSTRAINED if violation < self.UNCONSTRAINED else violation)

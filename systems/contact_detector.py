@@ -1,4 +1,4 @@
-"""Contact between two sets of bodies, checked at every step of the plant."""
+"""Contact between two sets of bodies, checked at every plant step."""
 
 from collections.abc import Sequence
 
@@ -12,10 +12,10 @@ from guiderail.systems.support.sampling import check_period
 
 
 class ContactDetector(LeafSystem):
-    """Detects contact between bodies and obstacles, at the present plant step and since the episode began.
+    """Detect contact between bodies and obstacles, at the present plant step and since the episode started.
 
-    The plant's contact results are evaluated at every plant step: a collision that is shorter than a control step
-    counts. All outputs are state: they are one plant step old and never feed through.
+    The contact results are evaluated at every plant step, so collisions shorter than a control step count. All outputs
+    are state: they are one plant step old, without direct feedthrough.
 
     .. pydrake_system::
 
@@ -27,23 +27,24 @@ class ContactDetector(LeafSystem):
         - has_collided
         - contact_force
 
-    ``contact_results`` is the plant's. ``collision`` is (1,): 1 while they are in contact; ``has_collided`` is (1,): 1 from
-    the first contact on; ``contact_force`` is (1,), the norm of the largest force between the two sets [N]. Point
-    contact and hydroelastic contact both count.
+    ``contact_results`` is the plant's output. ``collision`` (1,) is 1 while bodies and obstacles are in contact.
+    ``has_collided`` (1,) is 1 from the first contact of the episode on. ``contact_force`` is (1,), the norm of the
+    largest contact force between the two sets [N]. Point contact and hydroelastic contact both count.
     """
 
     def __init__(
         self, plant: MultibodyPlant, bodies: Sequence[RigidBody], obstacles: Sequence[RigidBody], period: float
     ):
-        """
+        """Construct the system.
+
         Args:
-            plant: finalized.
-            bodies: that must not touch `obstacles`.
-            obstacles: that must not be touched; no body may be in both.
-            period: of the plant's step [s], positive.
+            plant: Finalized plant.
+            bodies: Bodies that must not touch `obstacles`.
+            obstacles: Obstacles; no body may be in both sets.
+            period: Plant step [s], positive.
 
         Raises:
-            InputError: if the period is not positive, or a body is its own obstacle.
+            InputError: If the period is not positive, or a body is in both sets.
         """
         super().__init__()
         check_period(period)
@@ -57,31 +58,31 @@ class ContactDetector(LeafSystem):
             for geometry in plant.GetCollisionGeometriesForBody(body)
         }
         self._contact_results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
-        self._collision, self._touched, self._contact_force = (self.DeclareDiscreteState(1) for _ in range(3))
+        self._collision, self._has_collided, self._contact_force = (self.DeclareDiscreteState(1) for _ in range(3))
         self._collision_port = self.DeclareStateOutputPort("collision", self._collision)
-        self._has_collided_port = self.DeclareStateOutputPort("has_collided", self._touched)
+        self._has_collided_port = self.DeclareStateOutputPort("has_collided", self._has_collided)
         self._contact_force_port = self.DeclareStateOutputPort("contact_force", self._contact_force)
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_contact_results_input_port(self) -> InputPort:
-        """The plant's contact results."""
+        """Return the port of the plant's contact results."""
         return self._contact_results_port
 
     def get_collision_output_port(self) -> OutputPort:
-        """1 while they are in contact, (1,)."""
+        """Return the port of the flag that a body touches an obstacle now, (1,)."""
         return self._collision_port
 
     def get_has_collided_output_port(self) -> OutputPort:
-        """1 from the first contact of the episode on, (1,)."""
+        """Return the port of the flag that a contact has occurred in this episode, (1,)."""
         return self._has_collided_port
 
     def get_contact_force_output_port(self) -> OutputPort:
-        """The largest force between the two sets, (1,) [N]."""
+        """Return the port of the largest contact force between the two sets, (1,) [N]."""
         return self._contact_force_port
 
-    def _force(self, context: Context) -> float | None:
-        """The largest force [N] between the two sets; None where they are not in contact."""
+    def _largest_force(self, context: Context) -> float | None:
+        """Return the largest force [N] between the two sets, or None without contact."""
         results: ContactResults = self._contact_results_port.Eval(context)
         largest: float | None = None
         for i in range(results.num_point_pair_contacts()):
@@ -101,15 +102,15 @@ class ContactDetector(LeafSystem):
     def _is_collision(self, a: int, b: int) -> bool:
         return (a in self._bodies and b in self._obstacles) or (b in self._bodies and a in self._obstacles)
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        for index in (self._collision, self._touched, self._contact_force):
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        for index in (self._collision, self._has_collided, self._contact_force):
             discrete_state.set_value(index, [0.0])
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        force = self._force(context)
+        force = self._largest_force(context)
         discrete_state.set_value(self._collision, [float(force is not None)])
         discrete_state.set_value(self._contact_force, [force or 0.0])
         if force is not None:
-            discrete_state.set_value(self._touched, [1.0])
+            discrete_state.set_value(self._has_collided, [1.0])
         return EventStatus.Succeeded()

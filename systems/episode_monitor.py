@@ -1,4 +1,4 @@
-"""Termination of episodes: when one ends, and why."""
+"""Termination of episodes by named conditions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,16 @@ from guiderail.systems.support.sampling import check_period
 from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
-"""How an episode can end; a ``termination`` port carries an index into this. The empty one means that it goes on."""
+"""Reasons for the end of an episode; a ``termination`` port outputs an index into this tuple.
+
+- ``""``: the episode continues.
+- ``"success"``: the goal of the task was reached.
+- ``"collision"``: the contact force passed the limit of the task, or an obstacle was touched.
+- ``"spill"``: a ball was spilled.
+- ``"blocked"``: no progress for a number of steps.
+- ``"violation"``: a constraint was violated.
+- ``"time_limit"``: the maximum number of steps was reached.
+"""
 
 SUCCESS = TERMINATIONS.index("success")
 
@@ -30,18 +39,20 @@ class TerminationTerm:
     """A condition that terminates an episode.
 
     Args:
-        termination: what the episode ends as, one of `TERMINATIONS`.
-        inputs: the signals it depends on, name to size; conditions of one monitor that name the same signal share it.
-        holds: called with those signals by name, returns whether the condition holds; a pure function.
-        steps: control steps for which it must hold before the episode ends, at least 1.
-        progress: called like `holds`; where given, the steps counted are those since it last rose by `min_progress`
-            above its highest value so far, whether they follow one another or not; otherwise they must be consecutive.
-        min_progress: what counts as progress, in the units of `progress`.
+        termination: Reason that is reported, one of `TERMINATIONS`.
+        inputs: Size of each signal that the condition depends on, by name. Terms of one monitor that name the same
+            signal share its port.
+        condition: Pure function of these signals, called by name, that returns True if the condition is met.
+        steps: Number of control steps in which the condition must be met before the episode ends, at least 1.
+        progress: Function of the same signals, optional. If it is given, the steps need not be consecutive, and the
+            count is reset when its value exceeds its maximum so far by `min_progress`. Otherwise the steps must be
+            consecutive.
+        min_progress: Smallest increase of `progress` that resets the count.
     """
 
     termination: str
     inputs: Mapping[str, int]
-    holds: Callable[..., bool]
+    condition: Callable[..., bool]
     steps: int = 1
     progress: Callable[..., float] | None = None
     min_progress: float = 0.0
@@ -54,49 +65,50 @@ class TerminationTerm:
 
 
 class EpisodeMonitor(LeafSystem):
-    """Evaluates named conditions, in order of precedence, and outputs which one terminated the episode.
+    """Evaluate termination terms in order of precedence and output the reason of the first one that is met.
 
-    A condition counts every control step once: the output already counts the step that is just over, the state at the
-    event of that instant. Once a condition terminated the episode, the output is constant.
+    Each term counts a control step once. At the end of a step the output includes it already; the state includes it
+    after the event of that instant. Once a term has terminated the episode, the output is constant.
 
     .. pydrake_system::
 
         name: EpisodeMonitor
         input_ports:
-        - one per signal of the conditions
+        - one per signal of the terms
         output_ports:
         - termination
 
-    ``termination`` is (1,): an index into `TERMINATIONS`, 0 while the episode goes on.
+    ``termination`` is (1,), an index into `TERMINATIONS`; 0 while the episode continues.
     """
 
-    def __init__(self, conditions: Sequence[TerminationTerm], period: float, of: str = ""):
-        """
+    def __init__(self, terms: Sequence[TerminationTerm], period: float, task_name: str = ""):
+        """Construct the system.
+
         Args:
-            conditions: where two hold in the same step, the first one counts.
-            period: between two control steps [s], positive.
-            of: whose episodes they end, for sentences.
+            terms: Termination terms, at least one; the first one that is met takes precedence.
+            period: Control period [s], positive.
+            task_name: Name of the task, for messages.
 
         Raises:
-            InputError: if there is no condition, the period is not positive, two conditions disagree about the size
-                of a signal, or a function takes other names than its signals'.
+            InputError: If there is no term, the period is not positive, two terms disagree about the size of a signal,
+                or the parameters of a function are not named like its signals.
         """
         super().__init__()
-        if not conditions:
+        if not terms:
             raise InputError("a monitor needs at least one condition")
         check_period(period)
-        for condition in conditions:
-            for function in filter(None, (condition.holds, condition.progress)):
-                whose = f" of {of}" if of else ""
-                check_takes(function, condition.inputs, f"the condition {condition.termination!r}{whose}")
-        self._conditions = tuple(conditions)
-        self._indices = [TERMINATIONS.index(condition.termination) for condition in conditions]
-        self._signals = SignalPorts(self, *(condition.inputs for condition in conditions))
+        of_task = f" of {task_name}" if task_name else ""
+        for term in terms:
+            for function in filter(None, (term.condition, term.progress)):
+                check_takes(function, term.inputs, f"the condition {term.termination!r}{of_task}")
+        self._terms = tuple(terms)
+        self._indices = [TERMINATIONS.index(term.termination) for term in terms]
+        self._signals = SignalPorts(self, *(term.inputs for term in terms))
 
-        # Per condition the count and the best progress, then the termination, once there is one.
-        self._initial_state = np.append(np.tile([0.0, -np.inf], len(self._conditions)), 0.0)
+        # [count, maximum progress] of each term, then the index of the termination.
+        self._initial_state = np.append(np.tile([0.0, -np.inf], len(self._terms)), 0.0)
         self._state = self.DeclareDiscreteState(self._initial_state)
-        # One evaluation a step serves both the output and, at the same instant, the event.
+        # The output and the event of the same instant share one evaluation.
         self._next = declare_cache(
             self,
             "next_state",
@@ -110,31 +122,31 @@ class EpisodeMonitor(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_signal_input_port(self, name: str) -> InputPort:
-        """The signal of this name, of the size that its conditions gave it.
+        """Return the port of the signal `name`.
 
         Raises:
-            InputError: if no condition depends on such a signal.
+            InputError: If no term depends on such a signal.
         """
         return self._signals.port(name)
 
     def get_termination_output_port(self) -> OutputPort:
-        """Why the episode ended, (1,): an index into `TERMINATIONS`, 0 while it goes on."""
+        """Return the port of the termination, (1,), an index into `TERMINATIONS`; 0 while the episode continues."""
         return self._termination_port
 
     def _calc_next(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)
         state = context.get_discrete_state(self._state).value().copy()
-        for i, condition in enumerate(self._conditions):
-            own = {name: signals[name] for name in condition.inputs}
-            if condition.progress is not None:
-                progress = float(condition.progress(**own))
-                if progress > state[2 * i + 1] + condition.min_progress:
+        for i, term in enumerate(self._terms):
+            inputs = {name: signals[name] for name in term.inputs}
+            if term.progress is not None:
+                progress = float(term.progress(**inputs))
+                if progress > state[2 * i + 1] + term.min_progress:
                     state[2 * i : 2 * i + 2] = 0.0, progress
-                elif condition.holds(**own):
+                elif term.condition(**inputs):
                     state[2 * i] += 1
             else:
-                state[2 * i] = state[2 * i] + 1 if condition.holds(**own) else 0.0
-            if state[-1] == 0 and state[2 * i] >= condition.steps:
+                state[2 * i] = state[2 * i] + 1 if term.condition(**inputs) else 0.0
+            if state[-1] == 0 and state[2 * i] >= term.steps:
                 state[-1] = self._indices[i]
         return state
 
@@ -146,7 +158,7 @@ class EpisodeMonitor(LeafSystem):
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
+        # No step has ended at time zero. An event offset of one period would not coincide exactly with k * period.
         if context.get_time() > 0:
             discrete_state.set_value(self._next.Eval(context))
         return EventStatus.Succeeded()

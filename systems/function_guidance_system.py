@@ -1,4 +1,4 @@
-"""Guidance that is one function of what is asked for and what is measured, once a control period."""
+"""Guidance by a function of action, measured pose and measured wrench."""
 
 from collections.abc import Callable
 
@@ -9,15 +9,16 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 GuidanceFunction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Function of action (A,), pose (O,) and wrench (W,) that returns the desired pose (O,)."""
 
 
 class FunctionGuidanceSystem(LeafSystem):
-    """Samples a policy's action and the measurements once a control period, and commands what a law makes of them.
+    """Evaluate a function of the policy's action and the measurements once per control period.
 
-        desired_pose[k] = law(action[k], pose[k], wrench[k])
+        desired_pose[k] = function(action[k], pose[k], wrench[k])
 
-    Where the law returns anything but O finite numbers, the last desired pose stays commanded, at first the measured
-    pose, and ``fallback`` is 1: a robot is never sent NaN.
+    If the function does not return O finite numbers, the previous desired pose is repeated (initially the measured
+    pose) and ``fallback`` is 1, so that NaN is never commanded.
 
     .. pydrake_system::
 
@@ -32,82 +33,83 @@ class FunctionGuidanceSystem(LeafSystem):
         - fallback
 
     ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,). The
-    outputs are state: no input feeds through, so that a station's measured pose can close the loop.
+    outputs are state without direct feedthrough, so that the measured pose of a station can close the loop.
     """
 
-    def __init__(self, law: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
-        """
+    def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
+        """Construct the system.
+
         Args:
-            law: (action, pose, wrench) to a desired pose, a pure function: a reset can't restore a memory of its own.
+            function: Pure function (action, pose, wrench) → desired pose. A reset cannot restore internal memory.
             action_size: A, at least 1.
             pose_size: O, at least 1.
             wrench_size: W, at least 1.
-            period: between two control steps [s], positive.
+            period: Control period [s], positive.
 
         Raises:
-            InputError: if a size or the period is out of range.
+            InputError: If a size or the period is out of range.
         """
         super().__init__()
         check_period(period)
         if min(action_size, pose_size, wrench_size) < 1:
             raise InputError(f"guidance needs sizes of at least 1, not {action_size}, {pose_size} and {wrench_size}")
-        self._law = law
+        self._function = function
         self._action_port = self.DeclareVectorInputPort("action", action_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
-        self._desired = self.DeclareDiscreteState(pose_size)
-        self._held = self.DeclareDiscreteState(action_size)
-        self._lost = self.DeclareDiscreteState(1)
-        self._desired_pose_port = self.DeclareStateOutputPort("desired_pose", self._desired)
-        self._held_action_port = self.DeclareStateOutputPort("held_action", self._held)
-        self._fallback_port = self.DeclareStateOutputPort("fallback", self._lost)
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self._desired_pose = self.DeclareDiscreteState(pose_size)
+        self._held_action = self.DeclareDiscreteState(action_size)
+        self._fallback = self.DeclareDiscreteState(1)
+        self._desired_pose_port = self.DeclareStateOutputPort("desired_pose", self._desired_pose)
+        self._held_action_port = self.DeclareStateOutputPort("held_action", self._held_action)
+        self._fallback_port = self.DeclareStateOutputPort("fallback", self._fallback)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._step)
 
     def get_action_input_port(self) -> InputPort:
-        """The policy's action in [−1, 1], (A,)."""
+        """Return the port of the policy's action in [−1, 1], (A,)."""
         return self._action_port
 
     def get_pose_input_port(self) -> InputPort:
-        """The measured pose, (O,)."""
+        """Return the port of the measured pose, (O,)."""
         return self._pose_port
 
     def get_wrench_input_port(self) -> InputPort:
-        """The measured wrench, (W,)."""
+        """Return the port of the measured wrench, (W,)."""
         return self._wrench_port
 
     def get_desired_pose_output_port(self) -> OutputPort:
-        """What to command, (O,)."""
+        """Return the port of the desired pose, (O,)."""
         return self._desired_pose_port
 
     def get_held_action_output_port(self) -> OutputPort:
-        """The action that acts now, (A,)."""
+        """Return the port of the action of the present control step, (A,)."""
         return self._held_action_port
 
     def get_fallback_output_port(self) -> OutputPort:
-        """1 where the law gave nothing that can be commanded, (1,)."""
+        """Return the port of the flag that the function did not return O finite numbers, (1,)."""
         return self._fallback_port
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._desired, self._pose_port.Eval(context))
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._desired_pose, self._pose_port.Eval(context))
         return self._step(context, discrete_state)
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         action = self._action_port.Eval(context)
-        returned = self._law(
+        returned = self._function(
             action.copy(), self._pose_port.Eval(context).copy(), self._wrench_port.Eval(context).copy()
         )
         try:
             desired = np.asarray(returned)
         except ValueError:
             desired = np.empty(0)
-        usable = (
+        is_usable = (
             desired.shape == (self._desired_pose_port.size(),)
             and desired.dtype.kind in "fiu"
             and bool(np.isfinite(desired).all())
         )
-        if usable:
-            discrete_state.set_value(self._desired, desired)
-        discrete_state.set_value(self._held, action)
-        discrete_state.set_value(self._lost, [0.0 if usable else 1.0])
+        if is_usable:
+            discrete_state.set_value(self._desired_pose, desired)
+        discrete_state.set_value(self._held_action, action)
+        discrete_state.set_value(self._fallback, [float(not is_usable)])
         return EventStatus.Succeeded()

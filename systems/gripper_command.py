@@ -1,4 +1,4 @@
-"""What the drives of a gripper's joints are told."""
+"""Desired state of the position drives of a gripper."""
 
 import numpy as np
 from pydrake.systems.framework import (
@@ -15,10 +15,10 @@ from guiderail.models.common.errors import InputError
 
 
 class GripperCommand(LeafSystem):
-    """The desired state of a gripper's joints: the last sound desired positions, at rest.
+    """Desired state of gripper joints: the last finite desired positions, with zero velocity.
 
-    A position that is finite is moved into its joint's range; one that isn't, or a port that is not connected, leaves
-    that joint where it was told to be before, and at first where the gripper starts.
+    Desired positions are clipped to the joint limits. If a position is not finite, or the port is not connected, the
+    previous desired position remains in force; the first one is the initial opening.
 
     .. pydrake_system::
 
@@ -28,18 +28,20 @@ class GripperCommand(LeafSystem):
         output_ports:
         - desired_state
 
-    `position` is (n,) and `desired_state` (2n,), positions and velocities, [m] or [rad] and a second.
+    ``position`` is (n,) [m or rad]. ``desired_state`` is (2n,), positions and velocities.
     """
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, opening: np.ndarray, *, period: float):
-        """
+        """Construct the system.
+
         Args:
-            lower, upper: of the joints' ranges, (n,).
-            opening: at which the gripper starts, (n,).
-            period: at which the last sound position is remembered [s], positive.
+            lower: Lower joint limits, (n,) [m or rad].
+            upper: Upper joint limits, (n,) [m or rad].
+            opening: Initial joint positions, (n,) [m or rad].
+            period: Period at which the desired position is stored [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         self._lower, self._upper = np.array(lower, dtype=float), np.array(upper, dtype=float)
@@ -52,34 +54,34 @@ class GripperCommand(LeafSystem):
             raise InputError(f"a gripper command's period must be positive, not {period} s")
         num_joints = len(opening)
         self._position_port = self.DeclareVectorInputPort("position", num_joints)
-        self._last = self.DeclareDiscreteState(opening)
+        self._last_position = self.DeclareDiscreteState(opening)
         self._desired_state_port = self.DeclareVectorOutputPort(
             "desired_state",
             2 * num_joints,
             self._calc_desired_state,
-            prerequisites_of_calc={self._position_port.ticket(), self.discrete_state_ticket(self._last)},
+            prerequisites_of_calc={self._position_port.ticket(), self.discrete_state_ticket(self._last_position)},
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_position_input_port(self) -> InputPort:
-        """Desired positions, (n,); optional."""
+        """Return the port of desired positions, (n,); optional."""
         return self._position_port
 
     def get_desired_state_output_port(self) -> OutputPort:
-        """Desired positions and velocities, (2n,)."""
+        """Return the port of desired positions and velocities, (2n,)."""
         return self._desired_state_port
 
-    def _sound_position(self, context: Context) -> np.ndarray:
-        last = context.get_discrete_state(self._last).value()
+    def _valid_position(self, context: Context) -> np.ndarray:
+        last = context.get_discrete_state(self._last_position).value()
         if not self._position_port.HasValue(context):
             return last
-        wanted = self._position_port.Eval(context)
-        return np.where(np.isfinite(wanted), np.clip(wanted, self._lower, self._upper), last)
+        position = self._position_port.Eval(context)
+        return np.where(np.isfinite(position), np.clip(position, self._lower, self._upper), last)
 
     def _calc_desired_state(self, context: Context, output: BasicVector) -> None:
-        position = self._sound_position(context)
+        position = self._valid_position(context)
         output.SetFromVector(np.concatenate([position, np.zeros_like(position)]))
 
-    def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._sound_position(context))
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._valid_position(context))
         return EventStatus.Succeeded()

@@ -1,4 +1,4 @@
-"""The last outputs of a movement primitive, oldest first (thesis, equation 5.3)."""
+"""Buffer of the last outputs of a movement primitive (thesis, equation 5.3)."""
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, InputPort, LeafSystem, OutputPort
@@ -8,36 +8,37 @@ from guiderail.systems.support.sampling import check_period
 
 
 class HistoryBuffer(LeafSystem):
-    """Stores the last P outputs, which the movement primitive of sKGRL passes through.
+    """Store the last P outputs, through which the movement primitive of sKGRL passes.
 
         history = [y_{t−P} … y_{t−1}]    (T_p of equation 5.3)
 
-    At every control step the newest output enters and the oldest leaves. At initialization the history is filled with
-    ``initial_output`` where that is connected (the measured pose, for a commanded history), else with ``output``: as if
-    the robot had always been where it starts.
+    At every control step the newest output replaces the oldest. An initialization fills the history with
+    ``initial_output`` if it is connected (the measured pose, for a commanded history), otherwise with ``output``, as if
+    the robot had always been at its start.
 
     .. pydrake_system::
 
         name: HistoryBuffer
         input_ports:
         - output
-        - initial_output
+        - initial_output (optional)
         output_ports:
         - history
 
     ``output`` and ``initial_output`` are (O,), ``history`` is (P*O,), row-major, oldest first, in the units of
-    ``output``. ``history`` is state and never feeds through, so that the primitive can close a loop around it.
+    ``output``. ``history`` is state without direct feedthrough, so that the primitive can close a loop around it.
     """
 
     def __init__(self, num_outputs: int, length: int, period: float):
-        """
+        """Construct the system.
+
         Args:
             num_outputs: O, at least 1.
             length: P, at least 1.
-            period: between two control steps [s], positive.
+            period: Control period [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         if num_outputs < 1 or length < 1:
@@ -53,15 +54,15 @@ class HistoryBuffer(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._shift)
 
     def get_output_input_port(self) -> InputPort:
-        """The output to store, (O,)."""
+        """Return the port of the output to store, (O,)."""
         return self._output_port
 
     def get_initial_output_input_port(self) -> InputPort:
-        """What the history is filled with at initialization, (O,); may be left unconnected."""
+        """Return the port of the output that fills the history at initialization, (O,); optional."""
         return self._initial_output_port
 
     def get_history_output_port(self) -> OutputPort:
-        """The last P outputs, (P*O,), oldest first."""
+        """Return the port of the last P outputs, (P*O,), oldest first."""
         return self._history_port
 
     def _fill(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -70,9 +71,9 @@ class HistoryBuffer(LeafSystem):
         return EventStatus.Succeeded()
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        # At time zero nothing was executed yet. (An offset of one period would say the same, but period + k * period
-        # differs from (k + 1) * period in the last bit for every third k, and the shift would miss its instant.)
+        # Nothing has been executed at time zero. An event offset of one period would not do: period + k * period differs
+        # from (k + 1) * period in the last bit for every third k.
         if context.get_time() > 0:
-            kept = context.get_discrete_state(self._state).value()[self._shape[1] :]
-            discrete_state.set_value(np.concatenate([kept, self._output_port.Eval(context)]))
+            remaining = context.get_discrete_state(self._state).value()[self._shape[1] :]
+            discrete_state.set_value(np.concatenate([remaining, self._output_port.Eval(context)]))
         return EventStatus.Succeeded()

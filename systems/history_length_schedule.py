@@ -1,4 +1,4 @@
-"""The history length of sKGRL by contact: short in contact, long in free space (thesis, section 5.5)."""
+"""History length of sKGRL: short in contact, long in free space (thesis, section 5.5)."""
 
 from collections.abc import Sequence
 
@@ -18,11 +18,12 @@ from guiderail.systems.support.sampling import check_period
 
 
 class HistoryLengthSchedule(LeafSystem):
-    """Shortens the history of sKGRL while the robot is in contact, and lengthens it again in free space.
+    """Shorten the history of sKGRL in contact and lengthen it again in free space.
 
-    Lengths change one by one: to the next shorter at every control step in contact, to the next longer after every
-    `dwell_steps` control steps in free space. Contact is detected with hysteresis: it begins where the measured force
-    exceeds `contact_threshold` and ends where it falls to `release_threshold`; a force that is no number is contact.
+    In contact the length decreases to the next shorter one at every control step. In free space it increases to the
+    next longer one after every `dwell_steps` control steps. Contact is detected with hysteresis: it begins if the
+    measured force exceeds `contact_threshold` and ends if the force falls to `release_threshold`. NaN counts as
+    contact.
 
     .. pydrake_system::
 
@@ -32,8 +33,8 @@ class HistoryLengthSchedule(LeafSystem):
         output_ports:
         - history_length
 
-    ``wrench`` (W,) is measured, its first three numbers a force [N] (both, where there are only two).
-    ``history_length`` (1,) is P; it is state, and at initialization the longest.
+    ``wrench`` is (W,), measured; its first three entries are a force [N] (its first two for W = 2).
+    ``history_length`` is (1,), P; it is state, initially the longest.
     """
 
     def __init__(
@@ -46,18 +47,19 @@ class HistoryLengthSchedule(LeafSystem):
         dwell_steps: int = 10,
         wrench_size: int = 6,
     ):
-        """
+        """Construct the system.
+
         Args:
-            lengths: to choose from, in any order, each at least 1: without any history a command would not begin where
-                the last one ended.
-            period: between two control steps [s], positive.
-            contact_threshold: force above which contact begins [N].
-            release_threshold: force at which it ends [N], from 0 to `contact_threshold`.
-            dwell_steps: control steps in free space before the history gets one length longer, at least 1.
+            lengths: History lengths in any order, each at least 1, because without a history a command would not start
+                at the end of its predecessor.
+            period: Control period [s], positive.
+            contact_threshold: Force above which contact begins [N].
+            release_threshold: Force at which contact ends [N], from 0 to `contact_threshold`.
+            dwell_steps: Control steps in free space before the next longer length, at least 1.
             wrench_size: W, at least 1.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         if not len(lengths) or min(lengths) < 1:
@@ -82,33 +84,33 @@ class HistoryLengthSchedule(LeafSystem):
             self._calc_history_length,
             prerequisites_of_calc={self.discrete_state_ticket(self._state)},
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_wrench_input_port(self) -> InputPort:
-        """The measured wrench, (W,), force first."""
+        """Return the port of the measured wrench, (W,), force first."""
         return self._wrench_port
 
     def get_history_length_output_port(self) -> OutputPort:
-        """The history length P, (1,)."""
+        """Return the port of the history length P, (1,)."""
         return self._history_length_port
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._state, np.zeros(3))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        index, in_contact, waited = context.get_discrete_state(self._state).value()
+        index, in_contact, num_free_steps = context.get_discrete_state(self._state).value()
         force = float(np.linalg.norm(self._wrench_port.Eval(context)[:3]))
-        # Asked this way round, what is no number is contact.
+        # In this form NaN counts as contact.
         in_contact = not force <= (self._release_threshold if in_contact else self._contact_threshold)
         if in_contact:
-            index, waited = min(index + 1, len(self._lengths) - 1), 0
+            index, num_free_steps = min(index + 1, len(self._lengths) - 1), 0
         else:
-            waited += 1
-            if waited >= self._dwell_steps:
-                index, waited = max(index - 1, 0), 0
-        discrete_state.set_value(self._state, [index, in_contact, waited])
+            num_free_steps += 1
+            if num_free_steps >= self._dwell_steps:
+                index, num_free_steps = max(index - 1, 0), 0
+        discrete_state.set_value(self._state, [index, in_contact, num_free_steps])
         return EventStatus.Succeeded()
 
     def _calc_history_length(self, context: Context, output: BasicVector) -> None:

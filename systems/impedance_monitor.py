@@ -1,4 +1,4 @@
-"""Contact force and saturation of an impedance controller, from its wrench."""
+"""Contact force and saturation of an impedance controller."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
@@ -7,12 +7,12 @@ from guiderail.models.common.errors import InputError
 
 
 class ImpedanceMonitor(LeafSystem):
-    """Estimates the contact force from the wrench of an impedance, and detects its saturation.
+    """Estimate the contact force from the wrench of an impedance and detect its saturation.
 
         contact_force = ‖f‖,  at rest f = K (x_d − x)
 
-    In a collision it is a better measure than the contact force itself: an impact's instantaneous force depends on a
-    simulation's step, the impedance's does not.
+    In a collision this is a better measure than the contact force itself, because the instantaneous force of an impact
+    depends on the step of the simulation and the force of the impedance does not.
 
     .. pydrake_system::
 
@@ -23,17 +23,18 @@ class ImpedanceMonitor(LeafSystem):
         - contact_force
         - saturation
 
-    ``impedance_wrench`` is (6,), force [N] first, then torque [Nm]. ``contact_force`` is (1,) [N], the norm of its
-    force. ``saturation`` is (1,): 1 if any of the six is within 0.1 % of its limit, otherwise 0.
+    ``impedance_wrench`` is (6,), force [N] first, then torque [Nm]. ``contact_force`` is (1,), the norm of the force
+    [N]. ``saturation`` (1,) is 1 if any of the six components is within 0.1 % of its limit, otherwise 0.
     """
 
     def __init__(self, limits: np.ndarray):
-        """
+        """Construct the system.
+
         Args:
-            limits: of the wrench's magnitudes, (6,) [N, Nm], positive.
+            limits: Limits of the magnitudes of the components, (6,) [N, Nm], positive.
 
         Raises:
-            InputError: if there are not six positive limits.
+            InputError: If there are not six positive limits.
         """
         super().__init__()
         self._limits = np.array(limits, dtype=float)
@@ -49,15 +50,15 @@ class ImpedanceMonitor(LeafSystem):
         )
 
     def get_impedance_wrench_input_port(self) -> InputPort:
-        """The wrench that the impedance applies, (6,)."""
+        """Return the port of the wrench that the impedance applies, (6,)."""
         return self._impedance_wrench_port
 
     def get_contact_force_output_port(self) -> OutputPort:
-        """The norm of the impedance's force, (1,) [N]."""
+        """Return the port of the norm of the force of the impedance, (1,) [N]."""
         return self._contact_force_port
 
     def get_saturation_output_port(self) -> OutputPort:
-        """1 while any component is at its limit, otherwise 0, (1,)."""
+        """Return the port of the flag that a component is at its limit, (1,)."""
         return self._saturation_port
 
     def _calc_contact_force(self, context: Context, output: BasicVector) -> None:

@@ -1,4 +1,4 @@
-"""The wrench on a tool, estimated from an arm's external joint torques: for an arm without a wrist sensor."""
+"""Estimate of the wrench on a tool from external joint torques, for an arm without a wrist sensor."""
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
@@ -11,13 +11,13 @@ from guiderail.systems.support.sampling import check_period
 
 
 class JointTorqueWrench(LeafSystem):
-    """Estimates the wrench of the environment on a tool from external joint torques, low-pass filtered.
+    """Estimate the wrench of the environment on a tool from external joint torques, low-pass filtered.
 
         F = (Jᵀ)⁺ τ_external,  τ y' = F − y
 
-    τ_external are the measured joint torques less those of the arm's own weight and inertia; an arm with torque sensors
-    computes them itself. The pseudoinverse is damped: near a singular posture the estimate goes to zero instead of
-    diverging.
+    τ_external are the measured joint torques minus those of the arm's weight and inertia; an arm with torque sensors
+    computes them itself. The pseudoinverse is damped, so that near a singular posture the estimate tends to zero
+    instead of diverging.
 
     .. pydrake_system::
 
@@ -29,8 +29,8 @@ class JointTorqueWrench(LeafSystem):
         - wrench
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool centre P in the axes of
-    T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, and never feeds through. A
-    sample that is not finite is left out.
+    T, [fx fy fz tx ty tz] in N and Nm. It is state: one sample old, zero after a reset, without direct feedthrough.
+    Samples that are not finite are skipped.
     """
 
     def __init__(
@@ -43,17 +43,18 @@ class JointTorqueWrench(LeafSystem):
         time_constant: float,
         damping: float = 1e-4,
     ):
-        """
+        """Construct the system.
+
         Args:
-            plant: the arm alone, finalized.
-            target: T, in whose axes the wrench is reported.
-            tool_centre: P.
-            period: of the sampling [s], positive.
+            plant: Model of the arm alone, finalized.
+            target: Frame T.
+            tool_centre: Frame P.
+            period: Sampling period [s], positive.
             time_constant: τ of the filter [s]; 0 disables it.
-            damping: of the pseudoinverse, not negative.
+            damping: Damping of the pseudoinverse, not negative.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         check_period(period)
@@ -72,15 +73,15 @@ class JointTorqueWrench(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
     def get_positions_input_port(self) -> InputPort:
-        """Measured joint positions, (n,) [rad]."""
+        """Return the port of the measured joint positions, (n,) [rad]."""
         return self._positions_port
 
     def get_external_torque_input_port(self) -> InputPort:
-        """Joint torques that the environment causes, (n,) [Nm]."""
+        """Return the port of the external joint torques, (n,) [Nm]."""
         return self._external_torque_port
 
     def get_wrench_output_port(self) -> OutputPort:
-        """The filtered wrench of the environment on the tool, (6,), force first."""
+        """Return the port of the filtered wrench of the environment on the tool, (6,), force first."""
         return self._wrench_port
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
@@ -88,7 +89,7 @@ class JointTorqueWrench(LeafSystem):
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         external_torque = self._external_torque_port.Eval(context)
-        # A sample that is no number would stay in the filter for ever.
+        # NaN would remain in the filter for ever.
         if not np.isfinite([*self._positions_port.Eval(context), *external_torque]).all():
             return EventStatus.DidNothing()
         J = self._plant.CalcJacobianSpatialVelocity(

@@ -1,4 +1,4 @@
-"""A linearly constrained null-space movement primitive in a diagram (thesis, equations 4.21 and 5.1)."""
+"""Linearly constrained null-space movement primitive as a system (thesis, equations 4.21 and 5.1)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,14 +21,14 @@ from guiderail.systems.support.sampling import check_period
 
 
 @dataclass(frozen=True, slots=True)
-class _Command:
+class _Prediction:
     step: int
     output: np.ndarray
     fallback: float
 
 
 class LcNsKmpSystem(LeafSystem):
-    """Predicts the command of a linearly constrained null-space primitive (`LcNsKmp`) at every control step.
+    """Predict the command of a linearly constrained null-space primitive (`LcNsKmp`) at every control step.
 
         command = LC-NS-KMP(step, gain · null_space_action)             KGRL, equation 4.21
         command = LC-NS-KMP(step, gain · null_space_action, history)    sKGRL, equation 5.1
@@ -38,27 +38,27 @@ class LcNsKmpSystem(LeafSystem):
         name: LcNsKmpSystem
         input_ports:
         - null_space_action
-        - history (where P > 0)
-        - history_length (where there are primitives with shorter histories)
+        - history (if P > 0)
+        - history_length (if there are primitives with shorter histories)
         output_ports:
         - command
         - constraint_violation
         - fallback
 
-    ``null_space_action`` (O,) is the policy's, in [−1, 1] per output, held for a control step. ``history`` (P*O,) is
-    row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the length of its
-    history (`HistoryLengthSchedule`); each is given the newest part of ``history``, so that whichever is selected
-    begins where the last command ended. ``command`` (O,) is the command. ``constraint_violation`` (1,) is max(c − G y)
-    of that command: negative is slack, `UNCONSTRAINED` where there is no constraint. ``fallback`` (1,) is 1 where no
-    window within the constraints was found: then it is what is nearest to the last command within its own step's.
+    ``null_space_action`` is (O,), the policy's action in [−1, 1], constant during a control step. ``history`` is
+    (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the
+    length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so its command
+    starts at the end of the previous one. ``command`` is (O,). ``constraint_violation`` (1,) is max(c − G y) of the
+    command: negative if all constraints are slack, `UNCONSTRAINED` if there is none. ``fallback`` (1,) is 1 if no window
+    within the constraints was found; the command is then the point nearest to the last command within the constraints
+    of its step.
 
-    A history length that no primitive has raises an `InputError` where it is asked for.
-
-    The step is state and counts control periods since time zero; the output is a pure function of step, action and
-    history, evaluated once a control step (see CONTRIBUTING.md, "Rates and the order of events").
+    The step is state and counts control periods since time zero. The command is a pure function of step, action and
+    history, evaluated once per control step (see CONTRIBUTING.md, "Rates and the order of events"). The evaluation
+    raises an `InputError` if no primitive has the selected history length.
     """
 
-    #: ``constraint_violation`` where there is no constraint: finite, so that it can be logged and reduced.
+    #: ``constraint_violation`` if there is no constraint: finite, so that it can be logged and reduced.
     UNCONSTRAINED = -1e30
 
     def __init__(
@@ -68,19 +68,20 @@ class LcNsKmpSystem(LeafSystem):
         period: float,
         shorter: Sequence[tuple[LcNsKmp, np.ndarray]] = (),
     ):
-        """
+        """Construct the system.
+
         Args:
-            primitive: O outputs, P past outputs.
-            gain: (O,), raw null-space action per unit of the policy's action (`models.primitives.gains`); ones unless
-                given.
-            period: between two control steps [s], positive: that of the reference trajectory, or the motion is of
-                another speed than was demonstrated.
-            shorter: primitives of the same motion and constraints with histories of 1 … P − 1 outputs, and their
+            primitive: Primitive with O outputs and a history of P outputs.
+            gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); ones by
+                default.
+            period: Control period [s], positive. It must be that of the reference trajectory, otherwise the speed
+                differs from the demonstrations.
+            shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their
                 gains (O,).
 
         Raises:
-            InputError: if a gain has the wrong shape or is not finite, the period is not positive, or a shorter history
-                is not shorter, has a length that another has, or other constraints.
+            InputError: If a gain has the wrong shape or is not finite, the period is not positive, or a primitive in
+                `shorter` has no shorter history, the history length of another one, or other constraints.
         """
         super().__init__()
         outputs = primitive.num_outputs
@@ -89,14 +90,13 @@ class LcNsKmpSystem(LeafSystem):
         if len({other.history for other, _ in shorter}) < len(shorter):
             raise InputError("two shorter histories are of one length")
         for other, _ in shorter:
-            mine, its = primitive.constraints, other.constraints
-            if not (np.array_equal(mine.G, its.G) and np.array_equal(mine.c, its.c)):
+            constraints, others = primitive.constraints, other.constraints
+            if not (np.array_equal(constraints.G, others.G) and np.array_equal(constraints.c, others.c)):
                 raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
         check_period(period)
         self._primitive, self._period = primitive, period
         self._by_history_length = {
-            other.history: (other, _checked_gain(its_gain, outputs))
-            for other, its_gain in [(primitive, gain), *shorter]
+            one.history: (one, _checked_gain(one_gain, outputs)) for one, one_gain in [(primitive, gain), *shorter]
         }
 
         self._null_space_action_port = self.DeclareVectorInputPort("null_space_action", outputs)
@@ -105,92 +105,91 @@ class LcNsKmpSystem(LeafSystem):
         )
         self._history_length_port = self.DeclareVectorInputPort("history_length", 1) if shorter else None
         self._step = self.DeclareDiscreteState(1)
-        start = primitive.constraints.nearest(primitive.reference.means[0])
-        self._first_safe = start
-        self._last_safe = self.DeclareDiscreteState(start)
-        self.DeclareInitializationDiscreteUpdateEvent(self._begin)
+        self._initial_command = primitive.constraints.nearest(primitive.reference.means[0])
+        self._last_command = self.DeclareDiscreteState(self._initial_command)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._advance)
 
         prerequisites = {
             self._null_space_action_port.ticket(),
             self.discrete_state_ticket(self._step),
-            self.discrete_state_ticket(self._last_safe),
+            self.discrete_state_ticket(self._last_command),
         }
         prerequisites |= {port.ticket() for port in (self._history_port, self._history_length_port) if port is not None}
-        self._command = declare_cache(self, "command", self._calc_command, prerequisites_of_calc=prerequisites)
-        command = {self._command.ticket()}
+        self._prediction = declare_cache(self, "prediction", self._predict, prerequisites_of_calc=prerequisites)
+        prediction = {self._prediction.ticket()}
         self._command_port = self.DeclareVectorOutputPort(
-            "command", outputs, self._calc_output, prerequisites_of_calc=command
+            "command", outputs, self._calc_command, prerequisites_of_calc=prediction
         )
         self._constraint_violation_port = self.DeclareVectorOutputPort(
-            "constraint_violation", 1, self._calc_constraint_violation, prerequisites_of_calc=command
+            "constraint_violation", 1, self._calc_constraint_violation, prerequisites_of_calc=prediction
         )
         self._fallback_port = self.DeclareVectorOutputPort(
-            "fallback", 1, self._calc_fallback, prerequisites_of_calc=command
+            "fallback", 1, self._calc_fallback, prerequisites_of_calc=prediction
         )
 
     @property
     def primitive(self) -> LcNsKmp:
-        """The primitive with the longest history."""
+        """Primitive with the longest history."""
         return self._primitive
 
     @property
     def gain(self) -> np.ndarray:
-        """Its raw null-space action per unit of the policy's action, (O,)."""
+        """Raw null-space action per unit of the policy's action, (O,)."""
         return self._by_history_length[self._primitive.history][1].copy()
 
     def get_null_space_action_input_port(self) -> InputPort:
-        """The policy's action in [−1, 1], (O,)."""
+        """Return the port of the policy's action in [−1, 1], (O,)."""
         return self._null_space_action_port
 
     def get_history_input_port(self) -> InputPort:
-        """The last outputs (P*O,), oldest first.
+        """Return the port of the last outputs, (P*O,), oldest first.
 
         Raises:
-            InputError: if the primitive has no history.
+            InputError: If the primitive has no history.
         """
         if self._history_port is None:
             raise InputError("this primitive has no history (P = 0), hence no such port")
         return self._history_port
 
     def get_history_length_input_port(self) -> InputPort:
-        """The length of the history that is used, (1,).
+        """Return the port of the history length, (1,).
 
         Raises:
-            InputError: if there is only one.
+            InputError: If there is only one primitive.
         """
         if self._history_length_port is None:
             raise InputError("this system has one primitive, hence no such port: give it shorter ones")
         return self._history_length_port
 
     def get_command_output_port(self) -> OutputPort:
-        """The command, (O,)."""
+        """Return the port of the command, (O,)."""
         return self._command_port
 
     def get_constraint_violation_output_port(self) -> OutputPort:
-        """max(c − G y) of the command, (1,)."""
+        """Return the port of the violation max(c − G y) of the command, (1,)."""
         return self._constraint_violation_port
 
     def get_fallback_output_port(self) -> OutputPort:
-        """1 where the command is what is nearest to the last one within the constraints, (1,)."""
+        """Return the port of the flag that the command is a fallback, (1,)."""
         return self._fallback_port
 
-    def _begin(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         step = round(context.get_time() / self._period)
         discrete_state.set_value(self._step, [step])
-        if step == 0:  # whoever goes on from a later state falls back to the last command
-            discrete_state.set_value(self._last_safe, self._first_safe)
+        if step == 0:  # an initialization at a later time keeps the last command for fallbacks
+            discrete_state.set_value(self._last_command, self._initial_command)
         return EventStatus.Succeeded()
 
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         step = round(context.get_time() / self._period)
         if step > 0:
-            command = self._command.Eval(context)
-            discrete_state.set_value(self._last_safe, command.output)
+            prediction = self._prediction.Eval(context)
+            discrete_state.set_value(self._last_command, prediction.output)
         discrete_state.set_value(self._step, [step])
         return EventStatus.Succeeded()
 
-    def _calc_command(self, context: Context) -> _Command:
+    def _predict(self, context: Context) -> _Prediction:
         step = int(context.get_discrete_state(self._step).value()[0])
         length = self._primitive.history
         if self._history_length_port is not None:
@@ -208,26 +207,26 @@ class LcNsKmpSystem(LeafSystem):
             output, fallback = primitive.predict(step, action, history).output, 0.0
         except UnsolvableError:
             output, fallback = self._fall_back(context, step), 1.0
-        return _Command(step, output, fallback)
+        return _Prediction(step, output, fallback)
 
     def _fall_back(self, context: Context, step: int) -> np.ndarray:
-        """What is nearest to the last command: what was safe a step ago need not be now, where constraints change."""
-        last_safe = context.get_discrete_state(self._last_safe).value()
+        """Return the point nearest to the last command within the constraints of this step, which may have changed."""
+        last_command = context.get_discrete_state(self._last_command).value()
         try:
-            return self._primitive.constraints.nearest(last_safe, step)
+            return self._primitive.constraints.nearest(last_command, step)
         except UnsolvableError:
-            return last_safe.copy()  # the arm still has to be told something
+            return last_command.copy()  # a command must be output at every step
 
-    def _calc_output(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._command.Eval(context).output)
+    def _calc_command(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._prediction.Eval(context).output)
 
     def _calc_constraint_violation(self, context: Context, output: BasicVector) -> None:
-        command = self._command.Eval(context)
-        violation = self._primitive.constraints.violation(command.output, command.step)
+        prediction = self._prediction.Eval(context)
+        violation = self._primitive.constraints.violation(prediction.output, prediction.step)
         output.SetAtIndex(0, max(violation, self.UNCONSTRAINED))
 
     def _calc_fallback(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._command.Eval(context).fallback)
+        output.SetAtIndex(0, self._prediction.Eval(context).fallback)
 
 
 def _checked_gain(gain: np.ndarray | None, outputs: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Contact forces, averaged over a control step."""
+"""Mean contact force of a control step."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
@@ -8,12 +8,12 @@ from guiderail.systems.support.sampling import declare_sample
 
 
 class MeanForce(LeafSystem):
-    """Averages a force over the control step that is just over, from the running sum of the plant's forces.
+    """Mean force of the last control step, from the running sum of the forces of all plant steps.
 
         force = (force_sum − force_sum at the last control step) / substeps
 
-    A plant takes many steps within one control step. Its force at the end of the last of them misses a contact that is
-    already over, and during an impact depends on the size of the plant's step; the mean does neither.
+    A control step consists of many plant steps. The force at the end of the last one misses contacts that are already
+    over and depends on the plant step during an impact; the mean does neither.
 
     .. pydrake_system::
 
@@ -24,27 +24,28 @@ class MeanForce(LeafSystem):
         - force
         - magnitude
 
-    ``force_sum`` (D,) is the sum over all plant steps so far [N]; ``force`` (D,) the mean over the plant steps since
-    the last control step [N], and ``magnitude`` (1,) its norm.
+    ``force_sum`` is (D,), the sum over all plant steps so far [N]. ``force`` is (D,), the mean over the plant steps
+    since the last control step [N]. ``magnitude`` is (1,), its norm [N].
     """
 
     def __init__(self, size: int, substeps: int, period: float):
-        """
+        """Construct the system.
+
         Args:
             size: D, at least 1.
-            substeps: plant steps in a control step, at least 1.
-            period: between two control steps [s], positive.
+            substeps: Plant steps per control step, at least 1.
+            period: Control period [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         if size < 1 or substeps < 1:
             raise InputError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
         self._scale = 1.0 / substeps
         self._force_sum_port = self.DeclareVectorInputPort("force_sum", size)
-        self._last = declare_sample(self, self._force_sum_port, period)
-        prerequisites = {self._force_sum_port.ticket(), self.discrete_state_ticket(self._last)}
+        self._last_sum = declare_sample(self, self._force_sum_port, period)
+        prerequisites = {self._force_sum_port.ticket(), self.discrete_state_ticket(self._last_sum)}
         self._force_port = self.DeclareVectorOutputPort(
             "force", size, self._calc_force, prerequisites_of_calc=prerequisites
         )
@@ -53,19 +54,19 @@ class MeanForce(LeafSystem):
         )
 
     def get_force_sum_input_port(self) -> InputPort:
-        """The sum of the forces of all plant steps so far, (D,) [N]."""
+        """Return the port of the sum of the forces of all plant steps so far, (D,) [N]."""
         return self._force_sum_port
 
     def get_force_output_port(self) -> OutputPort:
-        """The mean force of the control step, (D,) [N]."""
+        """Return the port of the mean force of the control step, (D,) [N]."""
         return self._force_port
 
     def get_magnitude_output_port(self) -> OutputPort:
-        """The norm of the mean force, (1,) [N]."""
+        """Return the port of the norm of the mean force, (1,) [N]."""
         return self._magnitude_port
 
     def _mean(self, context: Context) -> np.ndarray:
-        return (self._force_sum_port.Eval(context) - context.get_discrete_state(self._last).value()) * self._scale
+        return (self._force_sum_port.Eval(context) - context.get_discrete_state(self._last_sum).value()) * self._scale
 
     def _calc_force(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._mean(context))

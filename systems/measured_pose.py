@@ -1,4 +1,4 @@
-"""The measured pose of a body, in the coordinates of a station's poses."""
+"""Measured pose of a body in the pose coordinates of a station."""
 
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
@@ -9,7 +9,7 @@ from guiderail.models.common.poses import transform_to_pose
 
 
 class MeasuredPose(LeafSystem):
-    """Measures the pose of a body P in a frame T that is fixed in the world.
+    """Pose of a body P in a frame T that is fixed in the world.
 
         X_TP = X_TW X_WP
 
@@ -21,15 +21,16 @@ class MeasuredPose(LeafSystem):
         output_ports:
         - pose
 
-    ``body_poses`` is the plant's; ``pose`` is (6,), [x y z Rz Ry Rx] in metres and radians.
+    ``body_poses`` is the plant's output. ``pose`` is (6,), [x y z Rz Ry Rx] in metres and radians.
     """
 
     def __init__(self, plant: MultibodyPlant, body: RigidBody, X_WT: RigidTransform):
-        """
+        """Construct the system.
+
         Args:
-            plant: finalized.
-            body: whose pose is measured.
-            X_WT: the frame that it is measured in.
+            plant: Finalized plant.
+            body: Body P.
+            X_WT: Pose of frame T in the world.
         """
         super().__init__()
         self._body = int(body.index())
@@ -42,11 +43,11 @@ class MeasuredPose(LeafSystem):
         )
 
     def get_body_poses_input_port(self) -> InputPort:
-        """The plant's body poses."""
+        """Return the port of the plant's body poses."""
         return self._body_poses_port
 
     def get_pose_output_port(self) -> OutputPort:
-        """X_TP, (6,)."""
+        """Return the port of the pose X_TP, (6,)."""
         return self._pose_port
 
     def _calc_pose(self, context: Context, output: BasicVector) -> None:

@@ -1,4 +1,4 @@
-"""Teleoperation from Meshcat: by a gamepad where there is one, by sliders and keys everywhere."""
+"""Teleoperation input from Meshcat: gamepad, sliders and keys."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support.sampling import check_period
 
 DEAD_ZONE = 0.1
-"""Of a gamepad's axes: a stick that is released is rarely at zero."""
+"""Dead zone of the gamepad axes, because a released stick is rarely exactly at zero."""
 
 
 class MeshcatDevice(LeafSystem):
-    """Samples a person's inputs, to take the place of a policy's actions.
+    """Sample the operator's input, which replaces the action of a policy.
 
     .. pydrake_system::
 
@@ -22,22 +22,23 @@ class MeshcatDevice(LeafSystem):
         output_ports:
         - action
 
-    ``action`` is (n,), in [−1, 1], sampled at the control period. An input is its gamepad axis while that is out of its
-    dead zone, and its slider otherwise; each slider has two keys.
+    ``action`` is (n,), in [−1, 1], sampled once per control period. An entry is the value of its gamepad axis outside
+    the dead zone, otherwise the value of its slider; each slider has two keys.
     """
 
     def __init__(
         self, meshcat: Meshcat, axes: Sequence[tuple[int, float]], keys: Sequence[tuple[str, str]], period: float
     ):
-        """
+        """Construct the system.
+
         Args:
-            meshcat: that shows the sliders and reads the gamepad.
-            axes: for each input the number of the gamepad's axis and its sign.
-            keys: for each input the keys that lower and raise its slider, by JavaScript's codes.
-            period: between two samples [s], positive.
+            meshcat: Meshcat instance that shows the sliders and reads the gamepad.
+            axes: Index and sign of the gamepad axis of each entry.
+            keys: JavaScript codes of the keys that decrease and increase the slider of each entry.
+            period: Sampling period [s], positive.
 
         Raises:
-            InputError: if the period is not positive, or there are not as many axes as pairs of keys.
+            InputError: If the period is not positive, or the numbers of axes and key pairs differ.
         """
         super().__init__()
         check_period(period)
@@ -53,11 +54,11 @@ class MeshcatDevice(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
     def get_action_output_port(self) -> OutputPort:
-        """The person's inputs, (n,), in [−1, 1]."""
+        """Return the port of the operator's input, (n,), in [−1, 1]."""
         return self._action_port
 
     def read(self) -> np.ndarray:
-        """The person's inputs at this moment, (n,), in [−1, 1]."""
+        """Return the operator's present input, (n,), in [−1, 1]."""
         gamepad = self._meshcat.GetGamepad()
         values = []
         for (axis, sign), slider in zip(self._axes, self._sliders, strict=True):

@@ -1,8 +1,8 @@
-"""A workcell on six rails, stepped by MuJoCo."""
-
-from __future__ import annotations
+"""Workcell with a tool on a gantry, simulated by MuJoCo."""
 
 import math
+from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,15 +29,11 @@ if TYPE_CHECKING:
     import mujoco
 
 
-from importlib import import_module
-from types import ModuleType
-
-
 def mujoco_engine() -> ModuleType:
-    """The module `mujoco`.
+    """Import and return the module `mujoco`.
 
     Raises:
-        InputError: if it isn't installed.
+        InputError: If MuJoCo is not installed.
     """
     try:
         return import_module("mujoco")
@@ -48,11 +44,11 @@ def mujoco_engine() -> ModuleType:
 
 
 class DivergedError(RuntimeError):
-    """An engine's state is nothing that the physics could have led to."""
+    """Raised if the state of the physics engine has diverged."""
 
 
 class MovedBodies(NamedTuple):
-    """Bodies of a plant that the engine moves, or places anew: the fixture, the tool, and what is fixed to the tool."""
+    """Bodies of a plant whose poses the engine computes: the fixture, the tool, and the workpiece fixed to the tool."""
 
     fixture: RigidBody
     tool: RigidBody
@@ -60,7 +56,7 @@ class MovedBodies(NamedTuple):
 
 
 class _Nominal(NamedTuple):
-    """What `set_contact` multiplies, as the model was given; the names are MuJoCo's."""
+    """Nominal values of the model parameters that `set_contact` scales; the names are MuJoCo's."""
 
     timestep: float
     geom_friction: np.ndarray
@@ -70,17 +66,17 @@ class _Nominal(NamedTuple):
 
 
 class MujocoGantry(LeafSystem):
-    """Steps a MuJoCo model whose first six joints are x, y, z, Rz, Ry, Rx of a tool in a target frame T.
+    """Simulate a MuJoCo model whose first six joints are x, y, z, Rz, Ry, Rx of a tool in a target frame T.
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
 
-    with the engine's own contact forces f; w is their wrench on the tool at its centre, in the axes of T. A plant
-    that doesn't move says where the fixture stands and how the workpiece sits in the tool, offsets included: the
-    model's own bodies are put there before every step.
+    with the contact forces f of the engine; w is their wrench on the tool at its centre, in the axes of T. A static
+    plant defines the pose of the fixture and the pose of the workpiece in the tool, offsets included. The bodies of the
+    model are placed accordingly before every update.
 
     .. pydrake_system::
 
-        name: MujocoRails
+        name: MujocoGantry
         input_ports:
         - desired_pose
         - nominal_body_poses
@@ -91,36 +87,37 @@ class MujocoGantry(LeafSystem):
         - body_poses
         - geometry_poses
 
-    ``desired_pose`` and ``pose`` are (6,), X_TP as [x y z Rz Ry Rx]. ``nominal_body_poses`` is the plant's,
-    ``body_poses`` the same with tool and workpiece where they are, ``geometry_poses`` those of all frames with
-    geometry. ``wrench`` is the filtered y, (6,), force first, in N and Nm; ``impedance_wrench`` is (6,), what the six
-    motors push with, in the order of the pose. All that changes is declared state: the engine's positions, velocities
-    and warm start, and the filter.
+    ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in metres and radians. ``nominal_body_poses`` is the
+    output of the static plant; ``body_poses`` contains the same poses with the simulated ones of tool and workpiece.
+    ``geometry_poses`` contains the poses of all frames with geometry. ``wrench`` is the filtered wrench y, (6,), force
+    first, in N and Nm. ``impedance_wrench`` is (6,), the forces and torques of the six motors in the order of the pose.
+    Positions, velocities and warm start of the engine and the state of the filter are declared state.
 
-    Where the engine diverges an update raises a `DivergedError`; the engine's own way, to go on from its zero, would
-    put the tool at the target.
+    If the engine diverges, the update raises a `DivergedError`. The engine's automatic reset is disabled, because it
+    would move the tool to the target.
     """
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        model: "mujoco.MjModel",
         plant: MultibodyPlant,
         moved: MovedBodies,
         X_WT: RigidTransform,
         period: float,
         time_constant: float,
     ):
-        """
+        """Construct the system.
+
         Args:
-            model: with bodies of the names in `MovedBodies`; this system writes to it.
-            plant: finalized, without joints, and registered as a source of geometry.
-            moved: which of its bodies are the model's.
-            X_WT: the target frame in the plant's world; it is the model's world.
-            period: of an update [s], positive, a whole number of the model's steps.
-            time_constant: τ of the wrench's filter [s]; 0 disables it.
+            model: MuJoCo model with bodies of the names in `MovedBodies`; this system writes to it.
+            plant: Finalized plant without joints, registered as a source of geometry.
+            moved: Bodies of the plant that the model simulates.
+            X_WT: Pose of the target frame in the world of the plant. The target frame is the world of the model.
+            period: Update period [s], positive, an integer multiple of the model's step.
+            time_constant: τ of the wrench filter [s]; 0 disables it.
 
         Raises:
-            InputError: if a number is out of range, or the model's step does not divide the period.
+            InputError: If a number is out of range, or the model's step does not divide the period.
         """
         super().__init__()
         check_period(period)
@@ -132,12 +129,12 @@ class MujocoGantry(LeafSystem):
             raise InputError(f"MuJoCo's step of {step} s does not divide the period of {period} s")
         self._mujoco = mujoco_engine()
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-        # Scratch: every update writes all that it depends on, so that nothing in it outlives one.
+        # Work memory: every update writes all values that it reads, so no state survives in it.
         self.model, self._data = model, self._mujoco.MjData(model)
-        # Diverged; or out of memory, where the engine goes on without the contacts that it has no room for.
+        # Divergence, or a full buffer, in which case the engine would ignore further contacts.
         failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
         self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
-        # With the solver's warm start, so that a state that is restored goes on identically.
+        # Includes the warm start of the solver, so that a restored state continues identically.
         self._parts = self._mujoco.mjtState.mjSTATE_INTEGRATION
         self._time_constant = time_constant
         self._X_WT, self._X_TW = X_WT, X_WT.inverse()
@@ -147,7 +144,7 @@ class MujocoGantry(LeafSystem):
         size = self._mujoco.mj_stateSize(model, self._parts)
         self._physics = slice(0, size)
         self._filtered = slice(size, size + 6)
-        # The engine's state begins with its time, the positions and the velocities.
+        # The state of the engine starts with time, positions and velocities.
         self._positions = slice(1, 1 + POSE_SIZE)
         self._velocities = slice(1 + model.nq, 1 + model.nq + POSE_SIZE)
         poses = plant.get_body_poses_output_port()
@@ -157,16 +154,16 @@ class MujocoGantry(LeafSystem):
         self._factors = self.DeclareNumericParameter(BasicVector(np.ones(2)))
         self._state = self.DeclareDiscreteState(self._at_rest(np.zeros(POSE_SIZE)))
         state = {self.discrete_state_ticket(self._state)}
-        placed = state | {self._nominal_body_poses_port.ticket()}
+        body_poses = state | {self._nominal_body_poses_port.ticket()}
 
-        def part(name: str, which: slice) -> OutputPort:
+        def declare_state_output(name: str, entries: slice) -> OutputPort:
             def calc(context: Context, output: BasicVector) -> None:
-                output.SetFromVector(self._values(context)[which])
+                output.SetFromVector(self._values(context)[entries])
 
             return self.DeclareVectorOutputPort(name, 6, calc, prerequisites_of_calc=state)
 
-        self._pose_port = part("pose", self._positions)
-        self._wrench_port = part("wrench", self._filtered)
+        self._pose_port = declare_state_output("pose", self._positions)
+        self._wrench_port = declare_state_output("wrench", self._filtered)
         self._impedance_wrench_port = self.DeclareVectorOutputPort(
             "impedance_wrench",
             6,
@@ -174,52 +171,57 @@ class MujocoGantry(LeafSystem):
             prerequisites_of_calc=state | {self._desired_pose_port.ticket()},
         )
         self._body_poses_port = self.DeclareAbstractOutputPort(
-            "body_poses", poses.Allocate, self._calc_body_poses, prerequisites_of_calc=placed
+            "body_poses", poses.Allocate, self._calc_body_poses, prerequisites_of_calc=body_poses
         )
         self._geometry_poses_port = self.DeclareAbstractOutputPort(
             "geometry_poses",
             lambda: Value(FramePoseVector()),
             self._calc_geometry_poses,
-            prerequisites_of_calc=placed,
+            prerequisites_of_calc=body_poses,
         )
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_desired_pose_input_port(self) -> InputPort:
-        """Where the tool centre shall be, (6,)."""
+        """Return the port of the desired pose of the tool centre, (6,)."""
         return self._desired_pose_port
 
     def get_nominal_body_poses_input_port(self) -> InputPort:
-        """The body poses of the plant that doesn't move."""
+        """Return the port of the body poses of the static plant."""
         return self._nominal_body_poses_port
 
     def get_pose_output_port(self) -> OutputPort:
-        """Where the tool centre is, (6,)."""
+        """Return the port of the pose of the tool centre, (6,)."""
         return self._pose_port
 
     def get_wrench_output_port(self) -> OutputPort:
-        """The filtered wrench of the surroundings on the tool, (6,), force first."""
+        """Return the port of the filtered wrench of the environment on the tool, (6,), force first."""
         return self._wrench_port
 
     def get_impedance_wrench_output_port(self) -> OutputPort:
-        """What the six motors push with, (6,)."""
+        """Return the port of forces and torques of the six motors, (6,)."""
         return self._impedance_wrench_port
 
     def get_body_poses_output_port(self) -> OutputPort:
-        """The poses of all bodies of the plant, those that moved included."""
+        """Return the port of the poses of all bodies of the plant, including the simulated ones."""
         return self._body_poses_port
 
     def get_geometry_poses_output_port(self) -> OutputPort:
-        """The poses of all frames with geometry, for a scene graph."""
+        """Return the port of the poses of all frames with geometry, for a scene graph."""
         return self._geometry_poses_port
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the tool at rest at `pose`, (6,); `context` is this system's own."""
+        """Put the tool at rest at `pose`, (6,); `context` is this system's."""
         context.SetDiscreteState(self._state, self._at_rest(pose))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Multiplies all friction, and the stiffness of contacts and springs; `context` is this system's own.
+        """Scale the friction coefficients and the stiffness of contacts and springs; `context` is this system's.
 
-        What is stiffer is stepped more finely: √modulus times, or the next whole number of times.
+        For a modulus above 1 the step of the engine is divided by √modulus, rounded up.
+
+        Args:
+            context: Context of this system.
+            friction: Factor of all friction coefficients.
+            modulus: Factor of the stiffness of contacts and springs.
         """
         context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
 
@@ -240,14 +242,16 @@ class MujocoGantry(LeafSystem):
         model, data = self.model, self._data
         state = self._values(context)
         self._place(self._nominal_body_poses_port.Eval(context))
-        finer = self._soften(*context.get_numeric_parameter(self._factors).value())
+        num_substeps = self._scale_contact(*context.get_numeric_parameter(self._factors).value())
         self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
         data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
         for warning in self._failures:
-            data.warning[warning].number = 1  # of the first one the engine would write a file in the working directory
+            data.warning[
+                warning
+            ].number = 1  # at a count of 0 the engine would write a log file to the working directory
         filtered = state[self._filtered]
         decay = np.exp(-model.opt.timestep / self._time_constant) if self._time_constant > 0.0 else 0.0
-        for _ in range(finer * self._num_steps):
+        for _ in range(num_substeps * self._num_steps):
             self._mujoco.mj_step(model, data)
             self._check_warnings()
             newest = self._contact_wrench()
@@ -272,34 +276,33 @@ class MujocoGantry(LeafSystem):
             self.model.body_pos[body] = X.translation()
             self.model.body_quat[body] = X.rotation().ToQuaternion().wxyz()
 
-    def _soften(self, friction: float, modulus: float) -> int:
-        """Sets the model's contact; returns how many steps take the place of one.
+    def _scale_contact(self, friction: float, modulus: float) -> int:
+        """Scale the model's contact parameters and return the number of substeps that replace one step.
 
-        A spring's natural frequency times the step, and a contact's time constant in steps, stay what the engine
-        integrates; a spring that is stiffer keeps its damping ratio.
+        The natural frequency of a spring times the step, and the time constant of a contact in steps, remain in the
+        range that the engine integrates. A stiffer spring has the same damping ratio.
         """
         model, nominal = self.model, self._nominal
-        finer = max(math.ceil(math.sqrt(modulus) - 1e-9), 1)
-        model.opt.timestep = nominal.timestep / finer
+        num_substeps = max(math.ceil(math.sqrt(modulus) - 1e-9), 1)
+        model.opt.timestep = nominal.timestep / num_substeps
         model.geom_friction[:] = nominal.geom_friction * friction
         model.jnt_stiffness[:] = nominal.jnt_stiffness * modulus
         model.dof_damping[:] = nominal.dof_damping * math.sqrt(max(modulus, 1.0))
         constants = nominal.geom_solref[:, 0] / math.sqrt(modulus)
         model.geom_solref[:, 0] = np.maximum(constants, 2.0 * model.opt.timestep)
-        return finer
+        return num_substeps
 
     def _contact_wrench(self) -> np.ndarray:
-        """What the contacts do to the joints, turned back: slides are T's axes, about hinges a torque t does a · t."""
+        """Return the wrench of the generalized contact forces: slides are the axes of T, a hinge a has the force a · t."""
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
 
     def _calc_impedance_wrench(self, context: Context, output: BasicVector) -> None:
-        """What the motors push with now, by the law that the engine's actuators follow."""
         model, state = self.model, self._values(context)
         springs, dampers = model.actuator_gainprm[:POSE_SIZE, 0], -model.actuator_biasprm[:POSE_SIZE, 2]
-        pull = springs * (self._desired_pose_port.Eval(context) - state[self._positions])
+        spring_force = springs * (self._desired_pose_port.Eval(context) - state[self._positions])
         limits = model.actuator_forcerange[:POSE_SIZE]
-        output.SetFromVector(np.clip(pull - dampers * state[self._velocities], limits[:, 0], limits[:, 1]))
+        output.SetFromVector(np.clip(spring_force - dampers * state[self._velocities], limits[:, 0], limits[:, 1]))
 
     def _calc_body_poses(self, context: Context, output: AbstractValue) -> None:
         poses = list(self._nominal_body_poses_port.Eval(context))
@@ -316,6 +319,6 @@ class MujocoGantry(LeafSystem):
 
 
 def _geometry_frames(plant: MultibodyPlant) -> list[tuple[int, object]]:
-    """Bodies and the frames that their geometry is on; the world's needs no pose."""
+    """Return the bodies with geometry, except the world, and their geometry frames."""
     frames = [(i, plant.GetBodyFrameIdIfExists(BodyIndex(i))) for i in range(1, plant.num_bodies())]
     return [(body, frame) for body, frame in frames if frame is not None]

@@ -1,4 +1,4 @@
-"""A policy in a diagram, in the place where an environment writes its actions."""
+"""Policy as a system, in the place where an environment writes its actions."""
 
 from collections.abc import Callable
 
@@ -11,18 +11,18 @@ from guiderail.systems.support.sampling import check_period
 
 
 class PolicyError(RuntimeError):
-    """A policy returned something that is no action. A robot must stop then: there is nothing safe to guess."""
+    """Raised if a policy does not return an action; the robot must stop, because no other action is known to be safe."""
 
 
 class PolicySystem(LeafSystem):
-    """Runs a policy once a decision period, before everything else that happens at that instant.
+    """Evaluate a policy once per action period, before all other updates of that instant.
 
         action[k] = clip(policy(observation[k]), −1, 1)
 
-    The observation is that from just before the instant k·period. The action is set by an unrestricted update, which
-    Drake performs before the discrete updates of the same instant: a `ZeroOrderHold` of the control period behind it
-    holds the new action from that very instant on. So a `Simulator` that runs a task's diagram with this system does
-    bit for bit what `GuidedEnv` does with the same policy (see CONTRIBUTING.md, "Rates and the order of events").
+    The observation is the one just before the instant k·period. The action is set by an unrestricted update, which
+    Drake performs before the discrete updates of the same instant, so a `ZeroOrderHold` of the control period outputs
+    the new action from that instant on. A `Simulator` of a task diagram with this system therefore gives bit for bit
+    the results of `GuidedEnv` with the same policy (see CONTRIBUTING.md, "Rates and the order of events").
 
     .. pydrake_system::
 
@@ -32,9 +32,9 @@ class PolicySystem(LeafSystem):
         output_ports:
         - action
 
-    ``observation`` is a vector (N,), or an abstract image. The policy is called with what an environment returns: an
-    array (N,) of float32, or (h, w, 3) of uint8. ``action`` (A,) is in the units of the action space, [−1, 1]. It is
-    state: zero before the first decision and after a reset, and it never feeds through.
+    ``observation`` is a vector (N,) or an abstract image. The policy's argument is an array as returned by an
+    environment: (N,) of float32 or (h, w, 3) of uint8. ``action`` is (A,), in [−1, 1]. It is state without direct
+    feedthrough: zero before the first evaluation and after a reset.
     """
 
     def __init__(
@@ -44,16 +44,16 @@ class PolicySystem(LeafSystem):
         action_size: int,
         period: float,
     ):
-        """
+        """Construct the system.
+
         Args:
-            policy: observation to action (A,), a pure function: a reset can't restore a memory of its own. Actions
-                beyond [−1, 1] are clipped.
+            policy: Pure function observation → action (A,), clipped to [−1, 1]. A reset cannot restore internal memory.
             observation: N, at least 1, or a model value of an image port, `Value(ImageRgba8U(w, h))`.
             action_size: A, at least 1.
-            period: between two decisions [s], positive, an integer multiple of the control period.
+            period: Action period [s], positive, an integer multiple of the control period.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         check_period(period)
@@ -69,21 +69,21 @@ class PolicySystem(LeafSystem):
             raise InputError(f"a policy's observation has at least one number, not {observation}")
         self._action = self.DeclareDiscreteState(action_size)
         self._action_port = self.DeclareStateOutputPort("action", self._action)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._decide)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
     def get_observation_input_port(self) -> InputPort:
-        """What the policy observes, (N,) or an image."""
+        """Return the port of the observation, (N,) or an image."""
         return self._observation_port
 
     def get_action_output_port(self) -> OutputPort:
-        """The policy's last action, (A,), in [−1, 1]."""
+        """Return the port of the last action, (A,), in [−1, 1]."""
         return self._action_port
 
-    def _decide(self, context: Context, state: State) -> EventStatus:
-        """Sets the action.
+    def _update(self, context: Context, state: State) -> EventStatus:
+        """Set the action.
 
         Raises:
-            PolicyError: if the policy returns anything but A finite numbers.
+            PolicyError: If the policy does not return A finite numbers.
         """
         returned = self._policy(self._observe(context))
         try:

@@ -1,4 +1,4 @@
-"""Where an arm is told to go: from where it is to where it is commanded, never faster than it may."""
+"""Rate limiter of a desired pose."""
 
 import numpy as np
 from pydrake.systems.framework import (
@@ -16,12 +16,12 @@ from guiderail.systems.support.sampling import check_period
 
 
 class PoseRateLimiter(LeafSystem):
-    """Follows a desired pose with limited speed, starting from the measured pose.
+    """Follow a desired pose with limited speed, starting from the measured pose.
 
-    While the authority is zero the output is the measured pose; where there is authority at initialization already, it
-    starts from the pose measured then. From then on it goes to the desired pose: at most the speed times the period in
-    each period, along a straight line, and each angle on its own the shorter way. A desired pose that keeps to the
-    speed is passed on as it is.
+    While the blend factor is zero the output is the measured pose. If it is positive at initialization, the output
+    starts from the pose measured then. Afterwards the output moves towards the desired pose: along a straight line by
+    at most speed times period in each period, and each angle separately in the shorter direction. A desired pose within
+    the speed limits is output unchanged. A desired pose that is not finite is ignored.
 
     .. pydrake_system::
 
@@ -34,18 +34,19 @@ class PoseRateLimiter(LeafSystem):
         - limited_pose
 
     ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in metres and radians.
-    ``blend_factor`` is (1,), a `TorqueSafetyLimiter`'s.
+    ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`.
     """
 
     def __init__(self, *, period: float, speed: float = 0.25, angular_speed: float = 1.5):
-        """
+        """Construct the system.
+
         Args:
-            period: [s], positive.
-            speed: of the tool centre [m/s], positive.
-            angular_speed: of each angle [rad/s], positive.
+            period: Sampling period [s], positive.
+            speed: Speed limit of the tool centre [m/s], positive.
+            angular_speed: Speed limit of each angle [rad/s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         check_period(period)
@@ -55,7 +56,7 @@ class PoseRateLimiter(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
-        self._last = self.DeclareDiscreteState(6)
+        self._last_pose = self.DeclareDiscreteState(6)
         self._limited_pose_port = self.DeclareVectorOutputPort(
             "limited_pose",
             6,
@@ -64,35 +65,35 @@ class PoseRateLimiter(LeafSystem):
                 self._desired_pose_port.ticket(),
                 self._pose_port.ticket(),
                 self._blend_factor_port.ticket(),
-                self.discrete_state_ticket(self._last),
+                self.discrete_state_ticket(self._last_pose),
             },
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._remember)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_desired_pose_input_port(self) -> InputPort:
-        """The commanded pose, (6,)."""
+        """Return the port of the commanded pose, (6,)."""
         return self._desired_pose_port
 
     def get_pose_input_port(self) -> InputPort:
-        """The measured pose, (6,)."""
+        """Return the port of the measured pose, (6,)."""
         return self._pose_port
 
     def get_blend_factor_input_port(self) -> InputPort:
-        """0 while the arm stands by, (1,)."""
+        """Return the port of the blend factor, (1,); 0 while the arm is not controlled."""
         return self._blend_factor_port
 
     def get_limited_pose_output_port(self) -> OutputPort:
-        """Where the arm is told to be, (6,)."""
+        """Return the port of the rate-limited pose, (6,)."""
         return self._limited_pose_port
 
-    def _limited_pose(self, context: Context) -> np.ndarray:
+    def _eval_limited_pose(self, context: Context) -> np.ndarray:
         if self._blend_factor_port.Eval(context)[0] <= 0.0:
             return self._pose_port.Eval(context)
-        last = context.get_discrete_state(self._last).value()
+        last = context.get_discrete_state(self._last_pose).value()
         desired = self._desired_pose_port.Eval(context)
         if not np.isfinite(desired).all():
-            return last  # or it would be no number for ever
+            return last  # NaN would remain in the state for ever
         change = desired - last
         change[3:] = (change[3:] + np.pi) % (2.0 * np.pi) - np.pi
         distance = float(np.linalg.norm(change[:3]))
@@ -104,12 +105,12 @@ class PoseRateLimiter(LeafSystem):
         return last + change
 
     def _calc_limited_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._limited_pose(context))
+        output.SetFromVector(self._eval_limited_pose(context))
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         discrete_state.set_value(self._pose_port.Eval(context))
         return EventStatus.Succeeded()
 
-    def _remember(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._limited_pose(context))
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._eval_limited_pose(context))
         return EventStatus.Succeeded()

@@ -1,4 +1,4 @@
-"""The wrench on a tool whose pose is a plant's coordinates, from their generalized forces."""
+"""Wrench on a tool from the generalized forces along its pose coordinates."""
 
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
 
@@ -6,12 +6,12 @@ from guiderail.models.common.poses import POSE_SIZE, WRENCH_SIZE, wrench_of_gene
 
 
 class PoseWrench(LeafSystem):
-    """Turns generalized forces along a pose's coordinates into the wrench at the tool centre.
+    """Transform generalized forces along pose coordinates into the wrench at the tool centre.
 
         f = τ_xyz,  [ez, Rz(a) ey, Rz(a) Ry(b) ex]ᵀ t = τ_abc
 
-    (`wrench_of_generalized_force`). For a tool on rails, whose joints' positions are its pose: the plant's generalized
-    contact forces are then what the surroundings do to it, without its own weight and inertia.
+    See `wrench_of_generalized_force`. On a gantry the joint positions are the pose of the tool, so the generalized
+    contact forces of the plant are the wrench of the environment, without the tool's weight and inertia.
 
     .. pydrake_system::
 
@@ -22,8 +22,8 @@ class PoseWrench(LeafSystem):
         output_ports:
         - wrench
 
-    ``pose`` is X_TP as (6,) [x y z a b c] in metres and radians, ``generalized_force`` (6,) [N, Nm] along and about
-    these. ``wrench`` is (6,), [fx fy fz tx ty tz] at P in the axes of T.
+    ``pose`` is X_TP as (6,) [x y z a b c] in metres and radians. ``generalized_force`` is (6,), along and about these
+    coordinates [N, Nm]. ``wrench`` is (6,), [fx fy fz tx ty tz] at P in the axes of T.
     """
 
     def __init__(self) -> None:
@@ -36,15 +36,15 @@ class PoseWrench(LeafSystem):
         )
 
     def get_pose_input_port(self) -> InputPort:
-        """X_TP, (6,)."""
+        """Return the port of the pose X_TP, (6,)."""
         return self._pose_port
 
     def get_generalized_force_input_port(self) -> InputPort:
-        """Along and about the pose's coordinates, (6,)."""
+        """Return the port of the generalized forces along and about the pose coordinates, (6,)."""
         return self._generalized_force_port
 
     def get_wrench_output_port(self) -> OutputPort:
-        """At P in the axes of T, (6,), force first."""
+        """Return the port of the wrench at P in the axes of T, (6,), force first."""
         return self._wrench_port
 
     def _calc_wrench(self, context: Context, output: BasicVector) -> None:

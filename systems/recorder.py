@@ -1,4 +1,4 @@
-"""A recording of signals in declared state, which a reset clears."""
+"""Recorder of signals in declared state, which a reset clears."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,11 +13,11 @@ from guiderail.systems.support.signal_ports import SignalPorts
 
 @dataclass(frozen=True)
 class Recording:
-    """N samples of named signals.
+    """Samples of named signals.
 
     Args:
-        times: (N,) [s], the beginnings of the control periods at whose ends the signals were sampled.
-        signals: name to (N, size).
+        times: Start times of the N control periods at whose ends the signals were sampled, (N,) [s].
+        signals: Samples of each signal by name, (N, size).
     """
 
     times: np.ndarray
@@ -28,10 +28,10 @@ class Recording:
 
 
 class Recorder(LeafSystem):
-    """Samples named signals once a control period, at its end.
+    """Record named signals at the end of each control period.
 
-    The sample at the instant k·period has the values just before: the command that was held since (k−1)·period and what
-    it led to, one row of a demonstration. Once there are `num_samples` it records no more. The samples are declared
+    The sample at the instant k·period contains the values just before it: the command since (k−1)·period and its
+    result, which is one row of a demonstration. Recording stops after `num_samples` samples. The samples are declared
     state, which a reset clears.
 
     .. pydrake_system::
@@ -42,18 +42,19 @@ class Recorder(LeafSystem):
         output_ports:
         - num_recorded
 
-    ``num_recorded`` is (1,). The samples themselves are read with `recording`.
+    ``num_recorded`` is (1,), the number of samples so far. `recording` returns the samples.
     """
 
     def __init__(self, signals: Mapping[str, int], num_samples: int, period: float):
-        """
+        """Construct the system.
+
         Args:
-            signals: name to size of what is recorded, at least one.
-            num_samples: the greatest number of samples, at least 1.
-            period: of the sampling [s], positive.
+            signals: Size of each signal by name, at least one signal.
+            num_samples: Maximum number of samples, at least 1.
+            period: Control period [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         if not signals or num_samples < 1:
@@ -70,19 +71,19 @@ class Recorder(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._record)
 
     def get_signal_input_port(self, name: str) -> InputPort:
-        """The signal of this name.
+        """Return the port of the signal `name`.
 
         Raises:
-            InputError: if no such signal is recorded.
+            InputError: If no such signal is recorded.
         """
         return self._signals.port(name)
 
     def get_num_recorded_output_port(self) -> OutputPort:
-        """The number of samples so far, (1,)."""
+        """Return the port of the number of samples so far, (1,)."""
         return self._num_recorded_port
 
     def recording(self, context: Context) -> Recording:
-        """A copy of the samples so far; `context` is this system's."""
+        """Return a copy of the samples so far; `context` is this system's."""
         count = int(context.get_discrete_state(self._count).value()[0])
         samples = context.get_discrete_state(self._samples).value().reshape(-1, self._width)[:count]
         ends = np.cumsum(list(self._sizes.values()))
@@ -94,7 +95,7 @@ class Recorder(LeafSystem):
 
     def _record(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = int(context.get_discrete_state(self._count).value()[0])
-        # At time zero no step is over yet; an offset of one period instead would not fall on k * period exactly.
+        # No step has ended at time zero. An event offset of one period would not coincide exactly with k * period.
         if context.get_time() == 0 or count == self._num_samples:
             return EventStatus.DidNothing()
         row = np.concatenate(list(self._signals.eval(context).values()))

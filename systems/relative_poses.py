@@ -1,4 +1,4 @@
-"""Poses of bodies of a plant, relative to another one."""
+"""Poses of bodies of a plant relative to a reference body."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from guiderail.models.common.errors import InputError
 
 
 class RelativePoses(LeafSystem):
-    """Measures the poses of bodies B relative to a reference body R.
+    """Poses of bodies B relative to a reference body R.
 
         X_RB = X_RW X_WB
 
@@ -23,19 +23,20 @@ class RelativePoses(LeafSystem):
         output_ports:
         - relative_poses
 
-    ``body_poses`` is the plant's. ``relative_poses`` is (6·n,), for each body its position in metres and its
-    orientation as a rotation vector in radians, of at most π.
+    ``body_poses`` is the plant's output. ``relative_poses`` is (6·n,): for each body its position in metres and its
+    orientation as a rotation vector of at most π radians.
     """
 
     def __init__(self, plant: MultibodyPlant, bodies: Sequence[RigidBody], reference: RigidBody):
-        """
+        """Construct the system.
+
         Args:
-            plant: finalized.
-            bodies: B, at least one.
-            reference: R.
+            plant: Finalized plant.
+            bodies: Bodies B, at least one.
+            reference: Body R.
 
         Raises:
-            InputError: if there is no body.
+            InputError: If there is no body.
         """
         super().__init__()
         if not bodies:
@@ -53,11 +54,11 @@ class RelativePoses(LeafSystem):
         )
 
     def get_body_poses_input_port(self) -> InputPort:
-        """The plant's body poses."""
+        """Return the port of the plant's body poses."""
         return self._body_poses_port
 
     def get_relative_poses_output_port(self) -> OutputPort:
-        """Position and rotation vector of each body, (6·n,)."""
+        """Return the port of position and rotation vector of each body, (6·n,)."""
         return self._relative_poses_port
 
     def _calc_relative_poses(self, context: Context, output: BasicVector) -> None:

@@ -1,4 +1,4 @@
-"""Residual learning's sum of a reference and a policy's action."""
+"""Sum of a reference and a residual, for residual learning."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
@@ -7,7 +7,7 @@ from guiderail.models.common.errors import InputError
 
 
 class Residual(LeafSystem):
-    """Adds a policy's residual to a reference (thesis, section 4.4.1).
+    """Add the residual of a policy to a reference (thesis, section 4.4.1).
 
         desired_pose = reference + K action
 
@@ -20,17 +20,18 @@ class Residual(LeafSystem):
         output_ports:
         - desired_pose
 
-    All are (O,); ``action`` is in [−1, 1]. (Drake's `Adder` computes the same but counts as depending on time: what is
-    connected behind it would be computed anew at every step of the plant.)
+    All are (O,); ``action`` is in [−1, 1]. Drake's `Adder` computes the same sum, but its output counts as
+    time-dependent, so downstream outputs would be computed again at every plant step.
     """
 
     def __init__(self, gain: np.ndarray):
-        """
+        """Construct the system.
+
         Args:
-            gain: the diagonal of K, (O,), in the reference's units per unit of action.
+            gain: Diagonal of K, (O,), in units of the reference per unit of action.
 
         Raises:
-            InputError: if the gain is not a vector of finite numbers.
+            InputError: If the gain is not a vector of finite numbers.
         """
         super().__init__()
         self._gain = np.array(gain, dtype=float)
@@ -46,15 +47,15 @@ class Residual(LeafSystem):
         )
 
     def get_reference_input_port(self) -> InputPort:
-        """The command without the residual, (O,)."""
+        """Return the port of the reference, (O,)."""
         return self._reference_port
 
     def get_action_input_port(self) -> InputPort:
-        """The policy's action, (O,)."""
+        """Return the port of the policy's action, (O,)."""
         return self._action_port
 
     def get_desired_pose_output_port(self) -> OutputPort:
-        """The sum, (O,)."""
+        """Return the port of the desired pose, (O,)."""
         return self._desired_pose_port
 
     def _calc_desired_pose(self, context: Context, output: BasicVector) -> None:

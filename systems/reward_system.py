@@ -1,4 +1,4 @@
-"""A reward as a sum of named terms."""
+"""Reward as a sum of named terms."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -14,12 +14,12 @@ from guiderail.systems.support.signal_ports import SignalPorts, check_takes
 
 @dataclass(frozen=True)
 class RewardTerm:
-    """One term of a reward.
+    """Named term of a reward.
 
     Args:
-        name: of its output port.
-        inputs: the signals it depends on, name to size; terms that name the same signal share it.
-        value: called with those signals by name, returns the term of this control step; a pure function.
+        name: Name of the term and of its output port.
+        inputs: Size of each signal that the term depends on, by name. Terms that name the same signal share its port.
+        value: Pure function of these signals, called by name, that returns the term of this control step.
     """
 
     name: str
@@ -28,7 +28,7 @@ class RewardTerm:
 
 
 class RewardSystem(LeafSystem):
-    """Computes a reward as the sum of named terms, each of which is an output too.
+    """Sum of named reward terms, each of which is an output too.
 
         r = Σ_i r_i    (as in equation 4.22)
 
@@ -41,29 +41,32 @@ class RewardSystem(LeafSystem):
         - reward
         - one per term
 
-    Every output is (1,). The system has no state: a term that depends on the last control step gets its values from a
-    `ZeroOrderHold` of the control period.
+    All outputs are (1,). The system has no state: values of the previous control step come from a `ZeroOrderHold` of
+    the control period.
     """
 
-    def __init__(self, terms: Sequence[RewardTerm], of: str = ""):
-        """
+    def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):
+        """Construct the system.
+
         Args:
-            terms: at least one, of different names, none of them empty or "reward".
-            of: whose reward it is, for sentences.
+            terms: Reward terms, at least one, with different names, neither empty nor "reward".
+            task_name: Name of the task, for messages.
 
         Raises:
-            InputError: if there is no term, a name is taken, two terms disagree about the size of a signal, or a
-                function takes other names than its signals'. When it is evaluated: if a term is no finite number.
+            InputError: If there is no term, a name is not allowed, two terms disagree about the size of a signal, or
+                the parameters of a function are not named like its signals. At evaluation, if a term is not one finite
+                number.
         """
         super().__init__()
         names = [term.name for term in terms]
-        self._terms, self._of = tuple(terms), f" of {of}" if of else ""
+        self._terms, self._of_task = tuple(terms), f" of {task_name}" if task_name else ""
         if not names or len(set(names)) < len(names) or "reward" in names or "" in names:
             raise InputError(
-                f"a reward{self._of} needs terms of different names, neither empty nor 'reward', not {brief(names)}"
+                f"a reward{self._of_task} needs terms of different names, neither empty nor 'reward', "
+                f"not {brief(names)}"
             )
         for term in terms:
-            check_takes(term.value, term.inputs, f"reward term {term.name!r}{self._of}")
+            check_takes(term.value, term.inputs, f"reward term {term.name!r}{self._of_task}")
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
         self._values = declare_cache(
             self,
@@ -80,26 +83,26 @@ class RewardSystem(LeafSystem):
 
     @property
     def term_names(self) -> tuple[str, ...]:
-        """The names of the terms, in order."""
+        """Names of the terms, in order."""
         return tuple(self._term_ports)
 
     def get_signal_input_port(self, name: str) -> InputPort:
-        """The signal of this name, of the size that its terms gave it.
+        """Return the port of the signal `name`.
 
         Raises:
-            InputError: if no term depends on such a signal.
+            InputError: If no term depends on such a signal.
         """
         return self._signals.port(name)
 
     def get_reward_output_port(self) -> OutputPort:
-        """The sum of all terms, (1,)."""
+        """Return the port of the sum of all terms, (1,)."""
         return self._reward_port
 
     def get_term_output_port(self, name: str) -> OutputPort:
-        """The term of this name, (1,).
+        """Return the port of the term `name`, (1,).
 
         Raises:
-            InputError: if there is none.
+            InputError: If there is no such term.
         """
         if name not in self._term_ports:
             raise InputError(f"the reward has no term '{name}', only {', '.join(self._term_ports)}")
@@ -113,11 +116,11 @@ class RewardSystem(LeafSystem):
         value = term.value(**{name: signals[name] for name in term.inputs})
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "fiub":
-            raise InputError(f"reward term {term.name!r}{self._of} must be one number, and it is {brief(value)}")
+            raise InputError(f"reward term {term.name!r}{self._of_task} must be one number, and it is {brief(value)}")
         number = float(array.item())
-        # A learner that takes this in diverges, and is blamed for it episodes later.
+        # A learner would diverge episodes later, far from the cause.
         if not math.isfinite(number):
-            raise InputError(f"reward term {term.name!r}{self._of} is not finite, but {number}")
+            raise InputError(f"reward term {term.name!r}{self._of_task} is not finite, but {number}")
         return number
 
     def _calc_reward(self, context: Context, output: BasicVector) -> None:

@@ -1,4 +1,4 @@
-"""Projects commanded positions out of boxes that must not be entered."""
+"""Safety filter that projects commanded positions out of keep-out boxes."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, InputPort, LeafSystem, OutputPort
@@ -9,11 +9,11 @@ from guiderail.systems.support.sampling import declare_sample
 
 
 class SafetyFilter(LeafSystem):
-    """Projects commanded positions by hand-made active constraints (thesis, section 4.4.1).
+    """Project commanded positions by active constraints (thesis, section 4.4.1).
 
         safe_pose = project(pose, desired_pose)
 
-    (`KeepOut.project`). The measured pose is sampled at control steps: between two of them the command is constant.
+    See `KeepOut.project`. The measured pose is sampled at control steps, so the command is constant between them.
 
     .. pydrake_system::
 
@@ -25,30 +25,31 @@ class SafetyFilter(LeafSystem):
         - safe_pose
         - intervention
 
-    ``desired_pose`` and ``pose`` (measured) are (O,). ``safe_pose`` (O,) is what may be commanded, ``intervention``
-    (1,) is 1 where a box changed the command.
+    ``desired_pose``, ``pose`` (measured) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1 if a box changed the
+    command.
     """
 
     def __init__(self, keep_out: KeepOut, period: float):
-        """
+        """Construct the system.
+
         Args:
-            keep_out: the boxes and constraints.
-            period: between two control steps [s], positive.
+            keep_out: Boxes and constraints.
+            period: Control period [s], positive.
 
         Raises:
-            InputError: if the period is not positive.
+            InputError: If the period is not positive.
         """
         super().__init__()
         self._keep_out = keep_out
         outputs = keep_out.num_outputs
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
-        self._sampled = declare_sample(self, self._pose_port, period)
+        self._sampled_pose = declare_sample(self, self._pose_port, period)
         self._projection = declare_cache(
             self,
             "projection",
             self._calc_projection,
-            prerequisites_of_calc={self._desired_pose_port.ticket(), self.discrete_state_ticket(self._sampled)},
+            prerequisites_of_calc={self._desired_pose_port.ticket(), self.discrete_state_ticket(self._sampled_pose)},
         )
         projection = {self._projection.ticket()}
         self._safe_pose_port = self.DeclareVectorOutputPort(
@@ -59,26 +60,26 @@ class SafetyFilter(LeafSystem):
         )
 
     def get_desired_pose_input_port(self) -> InputPort:
-        """The command to check, (O,)."""
+        """Return the port of the desired pose, (O,)."""
         return self._desired_pose_port
 
     def get_pose_input_port(self) -> InputPort:
-        """The measured pose, (O,)."""
+        """Return the port of the measured pose, (O,)."""
         return self._pose_port
 
     def get_safe_pose_output_port(self) -> OutputPort:
-        """What may be commanded, (O,)."""
+        """Return the port of the projected pose, (O,)."""
         return self._safe_pose_port
 
     def get_intervention_output_port(self) -> OutputPort:
-        """1 where a box changed the command, (1,)."""
+        """Return the port of the flag that a box changed the command, (1,)."""
         return self._intervention_port
 
     def _calc_projection(self, context: Context) -> np.ndarray:
-        """The safe pose (O,), and 1 if a box changed the command, else 0."""
-        position = context.get_discrete_state(self._sampled).value()
-        safe, intervened = self._keep_out.project(position, self._desired_pose_port.Eval(context))
-        return np.append(safe, float(intervened))
+        """Return the safe pose and the intervention flag, (O + 1,)."""
+        pose = context.get_discrete_state(self._sampled_pose).value()
+        safe_pose, is_changed = self._keep_out.project(pose, self._desired_pose_port.Eval(context))
+        return np.append(safe_pose, float(is_changed))
 
     def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self._projection.Eval(context)[:-1])

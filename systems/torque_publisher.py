@@ -1,4 +1,4 @@
-"""Sends torques over a bus, or nothing."""
+"""Publisher of joint torque commands on LCM."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from guiderail.systems.support.sampling import check_period
 
 
 class TorquePublisher(LeafSystem):
-    """Sends the torques once a period while it may, and nothing at all otherwise: not even zeros.
+    """Publish joint torques once per period while enabled; otherwise no message is sent, not even zeros.
 
     .. pydrake_system::
 
@@ -20,7 +20,7 @@ class TorquePublisher(LeafSystem):
         - torque
         - is_sending
 
-    ``torque`` is (n,) [Nm]. ``is_sending`` is (1,): nothing goes out while it is 0.
+    ``torque`` is (n,) [Nm]. ``is_sending`` is (1,); no message is sent while it is 0.
     """
 
     def __init__(
@@ -32,16 +32,17 @@ class TorquePublisher(LeafSystem):
         *,
         period: float,
     ):
-        """
+        """Construct the system.
+
         Args:
-            lcm: the bus.
-            channel: its channel.
-            encode: from the time [s] and the torques (n,) to a message.
+            lcm: LCM interface.
+            channel: Channel of the command messages.
+            encode: Function of time [s] and torques (n,) [Nm] that returns an encoded message.
             num_joints: n, at least 1.
-            period: [s], positive.
+            period: Publishing period [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         check_period(period)
@@ -53,11 +54,11 @@ class TorquePublisher(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
 
     def get_torque_input_port(self) -> InputPort:
-        """What is sent, (n,) [Nm]."""
+        """Return the port of the torques, (n,) [Nm]."""
         return self._torque_port
 
     def get_is_sending_input_port(self) -> InputPort:
-        """0 while nothing is sent, (1,)."""
+        """Return the port of the enable flag, (1,); no message is sent while it is 0."""
         return self._is_sending_port
 
     def _publish(self, context: Context) -> EventStatus:

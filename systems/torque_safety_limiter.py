@@ -1,4 +1,4 @@
-"""Lets an arm's torques through while all is well, and brings the arm to rest where it isn't."""
+"""Limiter of joint torques that brings the arm to rest on any fault."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -20,14 +20,18 @@ from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault, dam
 from guiderail.systems.support.caching import declare_cache, declare_plant_context
 from guiderail.systems.support.sampling import check_period
 
-# Entries of the state.
-_PHASE, _FAULT, _PHASE_TIME, _AUTHORITY = range(4)
-# For how long no torque is said once more before a silent robot is sent nothing [s].
-ZERO_TORQUE_TIME = 0.05
+# Indices into the discrete state.
+_ARM_STATE = 0  # value of `ArmState`
+_FAULT = 1  # code of `Fault` that caused the last stop
+_STATE_TIME = 2  # time since the arm state changed [s]
+_BLEND_FACTOR = 3  # from 0 to 1
+
+ZERO_TORQUE_TIME = 0.05  # zero torque is sent this long to a robot without status before publishing stops [s]
+MAX_VELOCITY_AGE = 0.1  # maximum age of a velocity measurement used for damping [s]
 
 
 class ArmState(IntEnum):
-    """What a guarded arm does: wait for its robot, take over, follow, come to rest, be free of torque."""
+    """Lifecycle state of an arm: waiting for its status, taking over, running, coming to rest, without torque."""
 
     WAITING = 0
     RAMPING = 1
@@ -38,17 +42,17 @@ class ArmState(IntEnum):
 
 @dataclass(frozen=True)
 class SafetyLimits:
-    """What a guarded arm keeps to, and how it stops and starts.
+    """Limits of an arm, and the times in which it stops and starts.
 
     Args:
-        velocity: of each joint (n,) [rad/s], positive.
-        torque: that is sent to each joint (n,) [Nm], positive.
-        external_torque: with which the surroundings may load each joint (n,) [Nm], positive.
-        force: on the tool [N], positive.
-        lower, upper: corners of the box in which the tool centre stays, in the target's axes (3,) [m].
-        damping_time: for which a stop damps before there is no torque [s], positive.
-        decay_time: with which damping takes the joints' speed away [s], at least two periods.
-        ramp_time: in which the arm takes over [s], positive.
+        velocity: Velocity limit of each joint (n,) [rad/s], positive.
+        torque: Limit of the torque sent to each joint (n,) [Nm], positive.
+        external_torque: Limit of the external torque of each joint (n,) [Nm], positive.
+        force: Limit of the force on the tool [N], positive.
+        lower, upper: Corners of the workspace of the tool centre, in the axes of the target (3,) [m].
+        damping_time: Duration of damping in a stop, after which zero torque is sent [s], positive.
+        decay_time: Decay time of the joint velocities during damping [s], at least two periods.
+        ramp_time: Time in which the blend factor increases to 1 [s], positive.
     """
 
     velocity: tuple[float, ...]
@@ -69,28 +73,24 @@ class SafetyLimits:
             if not 0.0 < value < np.inf:
                 raise InputError(f"an arm's limits and times must be positive, not {value}")
         if not (np.array(self.lower) < np.array(self.upper)).all():
-            raise InputError(f"a workspace from {self.lower} to {self.upper} holds nothing")
-
-
-MAX_VELOCITY_AGE = 0.1  # [s] after which nobody knows how fast an arm is
+            raise InputError(f"a workspace from {self.lower} to {self.upper} is empty")
 
 
 class TorqueSafetyLimiter(LeafSystem):
-    """Passes wanted torques on while nothing is wrong; otherwise the arm is brought to rest, and then has no torque.
+    """Pass commanded torques through; on any fault, damp the arm to rest and then command zero torque.
 
-        τ = clip(a f τ_wanted + (1 − a) τ_damping)
+        τ = clip(a f τ_commanded + (1 − a) τ_damping)
 
-    a is the authority, which grows from 0 to 1 in the ramp time. f is 1 for a status that is a period
-    old at most, and 0 for one that is two periods old: what was wanted of an arm that isn't seen, or is seen too late,
-    would drive it ever faster. τ_damping (`damping_torque`)
-    takes away all joints' speed with the decay time; where no status comes any more, what was seen last is taken away
-    once, and with it what the arm was given since: a period of what was wanted is more than standstill allows.
+    The blend factor a increases from 0 to 1 in the ramp time. The freshness f is 1 for a status that is at most one
+    period old and 0 for one that is two periods old, because torques computed from an old state would accelerate the
+    arm. τ_damping (`damping_torque`) reduces all joint velocities with the decay time. If no status arrives, the
+    momentum of the last status and the impulses applied since are damped once.
 
-    A limit that is passed, or a fault of the status, stops the arm at once and is remembered; it goes on when `resume`
-    is called. At first it waits until the status is sound, and takes over by itself. A robot that comes back
-    after a silence with a clock that is behind was started anew, and what it had of speed is gone: it is left without
-    torque. What is sent is always finite and within the torque limits. Where a robot stays silent nothing is sent to it
-    any more, nor right after it is back.
+    A limit violation or a fault of the status stops the arm at once. The fault is stored until `resume` is called. At
+    the start the limiter waits for a valid status and then takes over by itself. If a robot returns after a timeout
+    with a clock that was set back, its controller has restarted and its velocity is unknown: zero torque is commanded.
+    The output is always finite and within the torque limits. While a robot sends no status nothing is sent to it, nor
+    immediately after its return.
 
     .. pydrake_system::
 
@@ -114,24 +114,26 @@ class TorqueSafetyLimiter(LeafSystem):
         - is_sending
         - not_following
 
-    ``torque`` and ``safe_torque`` are (n,) [Nm], ``estimated_state`` (2n,), ``external_torque`` (n,) [Nm], ``wrench`` (6,), force
-    first. ``pose`` and ``desired_pose`` are (6,), of which the positions are watched. ``status_fault``, ``status_age``
-    and ``status_is_new`` are (1,), a `StatusWatchdog`'s. ``command_timed_out`` is (1,): 1 while a command watchdog holds.
+    ``torque`` (commanded) and ``safe_torque`` are (n,) [Nm], ``estimated_state`` is (2n,), ``external_torque`` (n,)
+    [Nm], ``wrench`` (6,), force first. ``pose`` and ``desired_pose`` are (6,); their positions are checked.
+    ``status_fault``, ``status_age`` and ``status_is_new`` are (1,), outputs of a `StatusWatchdog`.
+    ``command_timed_out`` is (1,), the output of a `CommandWatchdog`.
 
-    ``fault`` is (1,), a code of `Fault`: why the arm is stopped, or 0. ``arm_state`` is (1,), a number of `ArmState`, and
-    ``blend_factor`` (1,). ``is_sending`` is (1,): 1 while commands may go out. ``not_following`` is (1,): 1 while the arm
-    isn't told to go where it is commanded, as it is stopped, takes over, or a command watchdog holds.
+    ``fault`` is (1,), the code of the `Fault` that stopped the arm, or 0. ``arm_state`` is (1,), a value of `ArmState`.
+    ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are sent. ``not_following`` (1,) is 1 while the
+    desired pose is not followed: the arm is stopped or taking over, or no valid command is available.
     """
 
     def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float):
-        """
+        """Construct the limiter.
+
         Args:
-            plant: the arm with what it carries and nothing else, finalized; only its inertia is used.
-            limits: of what is measured and sent.
-            period: at which the phase changes [s], positive: how often torques are sent.
+            plant: Model of the arm and its payload alone, finalized; its inertia is used.
+            limits: Limits of measured and sent values.
+            period: Period of the torque commands [s], positive.
 
         Raises:
-            InputError: if an argument is out of range.
+            InputError: If an argument is out of range.
         """
         super().__init__()
         check_period(period)
@@ -153,10 +155,10 @@ class TorqueSafetyLimiter(LeafSystem):
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._status_is_new_port = self.DeclareVectorInputPort("status_is_new", 1)
         self._command_timed_out_port = self.DeclareVectorInputPort("command_timed_out", 1)
-        self._memory = self.DeclareDiscreteState(4)
-        self._given = self.DeclareDiscreteState(num_joints)  # momentum since the last status [Nms]
+        self._state = self.DeclareDiscreteState(4)
+        self._impulse = self.DeclareDiscreteState(num_joints)  # applied since the last status [Nms]
 
-        memory, fault = {self.discrete_state_ticket(self._memory)}, {self._status_fault_port.ticket()}
+        state, status_fault = {self.discrete_state_ticket(self._state)}, {self._status_fault_port.ticket()}
         measured = {
             port.ticket()
             for port in (
@@ -170,162 +172,161 @@ class TorqueSafetyLimiter(LeafSystem):
         self._plant_context = declare_plant_context(
             self, plant, self._set_plant_state, prerequisites_of_calc={self._estimated_state_port.ticket()}
         )
-        self._found = declare_cache(
+        self._present_fault = declare_cache(
             self,
-            "found",
+            "present_fault",
             self._find_fault,
-            prerequisites_of_calc=memory
-            | fault
+            prerequisites_of_calc=state
+            | status_fault
             | measured
             | {self._torque_port.ticket(), self._status_age_port.ticket()},
         )
-        found = {self._found.ticket()}
+        present_fault = {self._present_fault.ticket()}
         self._safe_torque_port = self.DeclareVectorOutputPort(
             "safe_torque",
             num_joints,
             self._calc_safe_torque,
-            prerequisites_of_calc=found
-            | memory
-            | fault
+            prerequisites_of_calc=present_fault
+            | state
+            | status_fault
             | {self._torque_port.ticket(), self._estimated_state_port.ticket()}
             | {self._status_age_port.ticket(), self._status_is_new_port.ticket()}
-            | {self.discrete_state_ticket(self._given)},
+            | {self.discrete_state_ticket(self._impulse)},
         )
         self._fault_port = self.DeclareVectorOutputPort(
-            "fault", 1, self._calc_fault, prerequisites_of_calc=found | memory
+            "fault", 1, self._calc_fault, prerequisites_of_calc=present_fault | state
         )
         self._arm_state_port = self.DeclareVectorOutputPort(
-            "arm_state", 1, self._calc_phase, prerequisites_of_calc=memory
+            "arm_state", 1, self._calc_arm_state, prerequisites_of_calc=state
         )
         self._blend_factor_port = self.DeclareVectorOutputPort(
-            "blend_factor", 1, self._calc_authority, prerequisites_of_calc=memory
+            "blend_factor", 1, self._calc_blend_factor, prerequisites_of_calc=state
         )
         self._is_sending_port = self.DeclareVectorOutputPort(
-            "is_sending", 1, self._calc_sending, prerequisites_of_calc=memory | fault
+            "is_sending", 1, self._calc_is_sending, prerequisites_of_calc=state | status_fault
         )
         self._not_following_port = self.DeclareVectorOutputPort(
             "not_following",
             1,
             self._calc_not_following,
-            prerequisites_of_calc=memory | {self._command_timed_out_port.ticket()},
+            prerequisites_of_calc=state | {self._command_timed_out_port.ticket()},
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._forget)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_torque_input_port(self) -> InputPort:
-        """The wanted torques, (n,) [Nm]."""
+        """Return the port of the commanded torques, (n,) [Nm]."""
         return self._torque_port
 
     def get_estimated_state_input_port(self) -> InputPort:
-        """Joint positions and velocities, (2n,) [rad, rad/s]."""
+        """Return the port of joint positions and velocities, (2n,) [rad, rad/s]."""
         return self._estimated_state_port
 
     def get_external_torque_input_port(self) -> InputPort:
-        """With which the surroundings load the joints, (n,) [Nm]."""
+        """Return the port of the external joint torques, (n,) [Nm]."""
         return self._external_torque_port
 
     def get_wrench_input_port(self) -> InputPort:
-        """Of the surroundings on the tool, (6,), force first."""
+        """Return the port of the wrench of the environment on the tool, (6,), force first."""
         return self._wrench_port
 
     def get_pose_input_port(self) -> InputPort:
-        """Where the tool centre is, (6,)."""
+        """Return the port of the pose of the tool centre, (6,)."""
         return self._pose_port
 
     def get_desired_pose_input_port(self) -> InputPort:
-        """Where it is told to be, (6,)."""
+        """Return the port of the desired pose of the tool centre, (6,)."""
         return self._desired_pose_port
 
     def get_status_fault_input_port(self) -> InputPort:
-        """What is wrong with the status, (1,)."""
+        """Return the port of the status fault, (1,), a code of `Fault`."""
         return self._status_fault_port
 
     def get_status_age_input_port(self) -> InputPort:
-        """How old the status is, (1,) [s]."""
+        """Return the port of the age of the status, (1,) [s]."""
         return self._status_age_port
 
     def get_status_is_new_input_port(self) -> InputPort:
-        """1 where a status has just come, (1,)."""
+        """Return the port of the flag that a new status has been accepted, (1,)."""
         return self._status_is_new_port
 
     def get_command_timed_out_input_port(self) -> InputPort:
-        """1 while a command watchdog holds, (1,)."""
+        """Return the port of the flag that no valid command is available, (1,)."""
         return self._command_timed_out_port
 
     def get_safe_torque_output_port(self) -> OutputPort:
-        """What may be sent, (n,) [Nm]."""
+        """Return the port of the limited torques, (n,) [Nm]."""
         return self._safe_torque_port
 
     def get_fault_output_port(self) -> OutputPort:
-        """Why the arm is stopped, (1,): a code of `Fault`."""
+        """Return the port of the fault, (1,), a code of `Fault`."""
         return self._fault_port
 
     def get_arm_state_output_port(self) -> OutputPort:
-        """What the arm does, (1,): a number of `ArmState`."""
+        """Return the port of the arm state, (1,), a value of `ArmState`."""
         return self._arm_state_port
 
     def get_blend_factor_output_port(self) -> OutputPort:
-        """The share of the wanted torques, (1,), from 0 to 1."""
+        """Return the port of the blend factor, (1,), from 0 to 1."""
         return self._blend_factor_port
 
     def get_is_sending_output_port(self) -> OutputPort:
-        """1 while commands may go out, (1,)."""
+        """Return the port of the flag that commands are sent, (1,)."""
         return self._is_sending_port
 
     def get_not_following_output_port(self) -> OutputPort:
-        """1 while the arm isn't told to go where it is commanded, (1,)."""
+        """Return the port of the flag that the desired pose is not followed, (1,)."""
         return self._not_following_port
 
     def stop(self, context: Context) -> None:
-        """Stops the arm because somebody asks for it; `context` is this system's."""
-        phase = context.get_discrete_state(self._memory).value()[_PHASE]
-        if phase == ArmState.WAITING:
-            # Of an arm that was never taken over no speed is believed yet, and there is no last command to take back.
-            context.SetDiscreteState(self._memory, [ArmState.OFF, Fault.USER_STOP, np.inf, 0.0])
-        elif phase in (ArmState.RAMPING, ArmState.RUNNING):
-            context.SetDiscreteState(self._memory, [ArmState.DAMPING, Fault.USER_STOP, 0.0, 0.0])
+        """Stop the arm with the fault `Fault.USER_STOP`; `context` is this system's."""
+        arm_state = self._state_of(context)[_ARM_STATE]
+        if arm_state == ArmState.WAITING:
+            # No velocity has been accepted yet and no torque has been sent, so there is nothing to damp.
+            context.SetDiscreteState(self._state, [ArmState.OFF, Fault.USER_STOP, np.inf, 0.0])
+        elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
+            context.SetDiscreteState(self._state, [ArmState.DAMPING, Fault.USER_STOP, 0.0, 0.0])
 
     def resume(self, context: Context) -> None:
-        """Goes on after a stop, from where the arm is; `context` is this system's.
+        """Resume after a stop, from the present pose of the arm; `context` is this system's.
 
         Raises:
-            InputError: if the arm is not stopped, not yet at rest, or something is wrong still.
+            InputError: If the arm is not stopped, not yet at rest, or a fault is present.
         """
-        phase = context.get_discrete_state(self._memory).value()[_PHASE]
-        if phase != ArmState.OFF:
+        arm_state = self._state_of(context)[_ARM_STATE]
+        if arm_state != ArmState.OFF:
             raise InputError(
-                f"only an arm that is stopped can go on, and this one is {ArmState(int(phase)).name.lower()}"
+                f"only an arm that is stopped can go on, and this one is {ArmState(int(arm_state)).name.lower()}"
             )
-        found = self._found.Eval(context)
-        if found:
-            raise InputError(f"the arm can't go on yet: {FAULT_DESCRIPTIONS[found]}")
-        context.SetDiscreteState(self._memory, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
+        fault = self._present_fault.Eval(context)
+        if fault:
+            raise InputError(f"the arm can't go on yet: {FAULT_DESCRIPTIONS[fault]}")
+        context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
 
     def _set_plant_state(self, context: Context, plant_context: Context) -> None:
         self._plant.SetPositionsAndVelocities(plant_context, self._estimated_state_port.Eval(context))
 
-    def _memory_of(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state(self._memory).value()
+    def _state_of(self, context: Context) -> np.ndarray:
+        return context.get_discrete_state(self._state).value()
 
     def _find_fault(self, context: Context) -> Fault:
-        """What is wrong now."""
+        """Return the first fault that is present now; in the form `not value <= limit`, NaN violates a limit."""
         limits, n = self._limits, self._num_joints
         status_fault = Fault(int(self._status_fault_port.Eval(context)[0]))
         if status_fault:
             return status_fault
-        # Asked this way round, what is no number is never within a limit.
         if not self._status_age_port.Eval(context)[0] <= np.inf:
             return Fault.STALE
-        state = self._estimated_state_port.Eval(context)
-        if not np.isfinite(state).all():
+        joint_state = self._estimated_state_port.Eval(context)
+        if not np.isfinite(joint_state).all():
             return Fault.NOT_FINITE
-        if not (np.abs(state[n:]) <= limits.velocity).all():
+        if not (np.abs(joint_state[n:]) <= limits.velocity).all():
             return Fault.VELOCITY_LIMIT
-        places = [self._pose_port.Eval(context)[:3]]
-        if self._memory_of(context)[_PHASE] in (ArmState.RAMPING, ArmState.RUNNING):
-            places.append(self._desired_pose_port.Eval(context)[:3])
-        for place in places:
-            if not ((place >= limits.lower) & (place <= limits.upper)).all():
+        positions = [self._pose_port.Eval(context)[:3]]
+        if self._state_of(context)[_ARM_STATE] in (ArmState.RAMPING, ArmState.RUNNING):
+            positions.append(self._desired_pose_port.Eval(context)[:3])
+        for position in positions:
+            if not ((position >= limits.lower) & (position <= limits.upper)).all():
                 return Fault.WORKSPACE_LIMIT
         if not np.linalg.norm(self._wrench_port.Eval(context)[:3]) <= limits.force:
             return Fault.FORCE_LIMIT
@@ -335,102 +336,106 @@ class TorqueSafetyLimiter(LeafSystem):
             return Fault.TORQUE_NOT_FINITE
         return Fault.NONE
 
-    def _forget(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        discrete_state.set_value(self._memory, [ArmState.WAITING, Fault.NONE, 0.0, 0.0])
-        discrete_state.set_value(self._given, np.zeros(self._num_joints))
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._state, [ArmState.WAITING, Fault.NONE, 0.0, 0.0])
+        discrete_state.set_value(self._impulse, np.zeros(self._num_joints))
         return EventStatus.Succeeded()
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        phase, fault, phase_time, blend_factor = self._memory_of(context)
-        phase_time += self._period
-        found = self._found.Eval(context)
-        given = self._given_until_now(context)
-        if phase in (ArmState.RAMPING, ArmState.RUNNING) and not found:
-            push = self._safe_torque_port.Eval(context)
-            push = push + self._freshness(context) * self._external_torque_port.Eval(context)
-            given = given + self._period * push
-        discrete_state.set_value(self._given, given)
-        if phase == ArmState.WAITING:
-            if not found:
-                phase, phase_time = ArmState.RAMPING, 0.0
-        elif phase in (ArmState.RAMPING, ArmState.RUNNING):
-            if found:
-                phase, fault, phase_time, blend_factor = ArmState.DAMPING, found, 0.0, 0.0
+        arm_state, fault, state_time, blend_factor = self._state_of(context)
+        state_time += self._period
+        present_fault = self._present_fault.Eval(context)
+        impulse = self._impulse_since_status(context)
+        if arm_state in (ArmState.RAMPING, ArmState.RUNNING) and not present_fault:
+            total_torque = self._safe_torque_port.Eval(context)
+            total_torque = total_torque + self._freshness(context) * self._external_torque_port.Eval(context)
+            impulse = impulse + self._period * total_torque
+        discrete_state.set_value(self._impulse, impulse)
+        if arm_state == ArmState.WAITING:
+            if not present_fault:
+                arm_state, state_time = ArmState.RAMPING, 0.0
+        elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
+            if present_fault:
+                arm_state, fault, state_time, blend_factor = ArmState.DAMPING, present_fault, 0.0, 0.0
             else:
                 blend_factor = min(blend_factor + self._period / self._limits.ramp_time, 1.0)
-                if phase == ArmState.RAMPING and blend_factor == 1.0:
-                    phase, phase_time = ArmState.RUNNING, 0.0
-        elif phase == ArmState.DAMPING and (phase_time >= self._limits.damping_time or self._is_started_anew(context)):
-            phase, phase_time = ArmState.OFF, 0.0
-        discrete_state.set_value(self._memory, [phase, fault, phase_time, blend_factor])
+                if arm_state == ArmState.RAMPING and blend_factor == 1.0:
+                    arm_state, state_time = ArmState.RUNNING, 0.0
+        elif arm_state == ArmState.DAMPING and (
+            state_time >= self._limits.damping_time or self._has_robot_restarted(context)
+        ):
+            arm_state, state_time = ArmState.OFF, 0.0
+        discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor])
         return EventStatus.Succeeded()
 
     def _calc_safe_torque(self, context: Context, output: BasicVector) -> None:
-        phase, _, phase_time, blend_factor = self._memory_of(context)
-        is_active = phase in (ArmState.RAMPING, ArmState.RUNNING)
+        arm_state, _, state_time, blend_factor = self._state_of(context)
+        is_active = arm_state in (ArmState.RAMPING, ArmState.RUNNING)
         torque = np.zeros(self._num_joints)
-        if is_active and not self._found.Eval(context):
+        if is_active and not self._present_fault.Eval(context):
             torque = blend_factor * self._freshness(context) * self._torque_port.Eval(context)
             if blend_factor < 1.0:
                 torque = torque + (1.0 - blend_factor) * self._damping_torque(context, np.inf)
         elif is_active:
             torque = self._damping_torque(context, 0.0)
-        elif phase == ArmState.DAMPING and not self._is_started_anew(context):
-            torque = self._damping_torque(context, phase_time + self._period)
+        elif arm_state == ArmState.DAMPING and not self._has_robot_restarted(context):
+            torque = self._damping_torque(context, state_time + self._period)
         torque = np.where(np.isfinite(torque), torque, 0.0)
         output.SetFromVector(np.clip(torque, -self._torque_limits, self._torque_limits))
 
-    def _is_started_anew(self, context: Context) -> bool:
-        """Whether a robot for whose silence the arm is stopped speaks again, by a clock that is behind the one before.
+    def _has_robot_restarted(self, context: Context) -> bool:
+        """Return True if the arm was stopped by a status timeout and the robot's clock has since been set back.
 
-        One that is ahead proves nothing: statuses that were delayed for a while look so when they come in time again.
+        A clock that is ahead is no proof: delayed messages look the same when they arrive in time again.
         """
         status_fault = self._status_fault_port.Eval(context)[0]
-        return bool(self._memory_of(context)[_FAULT] == Fault.STALE and status_fault == Fault.OUT_OF_ORDER)
+        return bool(self._state_of(context)[_FAULT] == Fault.STALE and status_fault == Fault.OUT_OF_ORDER)
 
     def _freshness(self, context: Context) -> float:
         return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))
 
-    def _given_until_now(self, context: Context) -> np.ndarray:
-        """What the arm was given since the last status, (n,) [Nms]: nothing where that one is new."""
+    def _impulse_since_status(self, context: Context) -> np.ndarray:
+        """Return the joint impulse applied since the last status, (n,) [Nms]."""
         is_new = self._status_is_new_port.Eval(context)[0] > 0.0
-        return np.zeros(self._num_joints) if is_new else context.get_discrete_state(self._given).value().copy()
+        return np.zeros(self._num_joints) if is_new else context.get_discrete_state(self._impulse).value().copy()
 
     def _damping_torque(self, context: Context, elapsed: float) -> np.ndarray:
-        """What takes the speed away that was seen last, `elapsed` being for how long the arm has been damped [s].
+        """Return the torque (n,) [Nm] that damps the last measured velocity, `elapsed` [s] after damping began.
 
-        Nothing where that speed was old when the damping began: whoever was held up himself knows no speed, and
-        somebody else may have stopped the arm meanwhile. Nothing either where it, its age or the posture is no number.
+        It is zero if that velocity was already old when damping began: after a delay of this program the velocity is
+        unknown, and the safety monitor may have stopped the arm. It is also zero if velocity, age or posture is not
+        finite.
         """
         age = float(self._status_age_port.Eval(context)[0])
-        state = self._estimated_state_port.Eval(context)
-        if (np.isfinite(elapsed) and not age - elapsed <= MAX_VELOCITY_AGE) or not np.isfinite(state).all():
+        joint_state = self._estimated_state_port.Eval(context)
+        is_stale = np.isfinite(elapsed) and not age - elapsed <= MAX_VELOCITY_AGE
+        if is_stale or not np.isfinite(joint_state).all():
             return np.zeros(self._num_joints)
         M = self._plant.CalcMassMatrix(self._plant_context.Eval(context))
-        v = state[self._num_joints :]
+        v = joint_state[self._num_joints :]
         if np.isfinite(elapsed):
-            v = v + np.linalg.solve(M, self._given_until_now(context))
+            v = v + np.linalg.solve(M, self._impulse_since_status(context))
         elapsed = min(age, elapsed)
         return damping_torque(M, v, self._limits.decay_time, period=self._period, elapsed=elapsed)
 
     def _calc_fault(self, context: Context, output: BasicVector) -> None:
-        phase, fault, _, _ = self._memory_of(context)
-        is_stopped = phase in (ArmState.DAMPING, ArmState.OFF)
-        output.SetAtIndex(0, float(fault if is_stopped else self._found.Eval(context)))
+        arm_state, fault, _, _ = self._state_of(context)
+        is_stopped = arm_state in (ArmState.DAMPING, ArmState.OFF)
+        output.SetAtIndex(0, float(fault if is_stopped else self._present_fault.Eval(context)))
 
-    def _calc_phase(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._memory_of(context)[_PHASE])
+    def _calc_arm_state(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._state_of(context)[_ARM_STATE])
 
-    def _calc_authority(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, self._memory_of(context)[_AUTHORITY])
+    def _calc_blend_factor(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._state_of(context)[_BLEND_FACTOR])
 
-    def _calc_sending(self, context: Context, output: BasicVector) -> None:
-        phase, _, phase_time, _ = self._memory_of(context)
-        is_sending = phase in (ArmState.RAMPING, ArmState.RUNNING, ArmState.DAMPING)
-        if phase == ArmState.OFF:
-            is_sending = phase_time <= ZERO_TORQUE_TIME or self._status_fault_port.Eval(context)[0] == Fault.NONE
+    def _calc_is_sending(self, context: Context, output: BasicVector) -> None:
+        arm_state, _, state_time, _ = self._state_of(context)
+        is_sending = arm_state in (ArmState.RAMPING, ArmState.RUNNING, ArmState.DAMPING)
+        if arm_state == ArmState.OFF:
+            is_sending = state_time <= ZERO_TORQUE_TIME or self._status_fault_port.Eval(context)[0] == Fault.NONE
         output.SetAtIndex(0, float(is_sending))
 
     def _calc_not_following(self, context: Context, output: BasicVector) -> None:
-        holds = self._command_timed_out_port.Eval(context)[0] > 0.0
-        output.SetAtIndex(0, float(holds or self._memory_of(context)[_PHASE] != ArmState.RUNNING))
+        has_timed_out = self._command_timed_out_port.Eval(context)[0] > 0.0
+        output.SetAtIndex(0, float(has_timed_out or self._state_of(context)[_ARM_STATE] != ArmState.RUNNING))

@@ -1,4 +1,4 @@
-"""A wrist force/torque sensor, compensated for the tool's weight and inertia."""
+"""Wrist force/torque sensor with compensation of the tool's weight and inertia."""
 
 import numpy as np
 from pydrake.common.value import Value
@@ -22,12 +22,12 @@ from guiderail.systems.support.sampling import check_period
 
 
 class WrenchSensor(LeafSystem):
-    """Measures the wrench of the environment on a tool at its centre of compliance, low-pass filtered.
+    """Measure the wrench of the environment on a tool at its centre of compliance, low-pass filtered.
 
         F = M A + bias(V) − M [0, g] − F_wrist,  τ y' = F − y
 
-    (`external_wrench`). The wrist is a joint, the tool is rigid and welded to its child. F is moved to the centre of
-    compliance P and expressed in the axes of a frame that is fixed in the world.
+    See `external_wrench`. The wrist is a joint; the tool is rigid and welded to the child of the wrist. F is
+    transformed to the centre of compliance P and expressed in axes that are fixed in the world.
 
     .. pydrake_system::
 
@@ -40,8 +40,8 @@ class WrenchSensor(LeafSystem):
         output_ports:
         - wrench
 
-    The inputs are the plant's output ports of those names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is
-    state: one sample old, zero after a reset, and never feeds through.
+    The inputs are the plant's outputs of the same names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is
+    state: one sample old, zero after a reset, without direct feedthrough.
     """
 
     def __init__(
@@ -54,18 +54,19 @@ class WrenchSensor(LeafSystem):
         period: float,
         time_constant: float,
     ):
-        """
+        """Construct the system.
+
         Args:
-            plant: finalized; its output ports feed this system.
-            wrist: whose reaction is measured; its child is the first of `tool`.
-            tool: the bodies behind the wrist, welded together.
-            centre: the centre of compliance P, fixed to the first of `tool`.
-            R_WAxes: the axes in which the wrench is expressed.
-            period: of the sampling [s], positive; best the plant's time step.
+            plant: Finalized plant, connected to this system.
+            wrist: Joint at which the reaction is measured; its child is the first body of `tool`.
+            tool: Bodies behind the wrist, welded together.
+            centre: Centre of compliance P, fixed to the first body of `tool`.
+            R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
+            period: Sampling period [s], positive; ideally the plant's time step.
             time_constant: τ of the filter [s]; 0 disables it.
 
         Raises:
-            InputError: if an argument is out of range, or the first of `tool` is not the wrist's child.
+            InputError: If an argument is out of range, or the first body of `tool` is not the child of the wrist.
         """
         super().__init__()
         check_period(period)
@@ -78,7 +79,7 @@ class WrenchSensor(LeafSystem):
         self._tool = int(tool[0].index())
         X_ToolWrist = wrist.frame_on_child().CalcPose(nominal, tool[0].body_frame())
         X_ToolP = centre.CalcPose(nominal, tool[0].body_frame())
-        # About the tool's own origin and in its axes, its inertia and the two wrench transforms are constant.
+        # The inertia and the two wrench transforms are constant in the frame of the tool.
         self._M_Tool = plant.CalcSpatialInertia(
             nominal, tool[0].body_frame(), [body.index() for body in tool]
         ).CopyToFullMatrix6()
@@ -104,30 +105,30 @@ class WrenchSensor(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 
     def connect(self, builder: DiagramBuilder, plant: MultibodyPlant) -> None:
-        """Connects all inputs to the plant's output ports."""
+        """Connect all inputs to the output ports of the plant."""
         builder.Connect(plant.get_reaction_forces_output_port(), self._reaction_forces_port)
         builder.Connect(plant.get_body_poses_output_port(), self._body_poses_port)
         builder.Connect(plant.get_body_spatial_velocities_output_port(), self._body_spatial_velocities_port)
         builder.Connect(plant.get_body_spatial_accelerations_output_port(), self._body_spatial_accelerations_port)
 
     def get_reaction_forces_input_port(self) -> InputPort:
-        """The plant's joint reaction forces."""
+        """Return the port of the plant's joint reaction forces."""
         return self._reaction_forces_port
 
     def get_body_poses_input_port(self) -> InputPort:
-        """The plant's body poses."""
+        """Return the port of the plant's body poses."""
         return self._body_poses_port
 
     def get_body_spatial_velocities_input_port(self) -> InputPort:
-        """The plant's body velocities."""
+        """Return the port of the plant's body velocities."""
         return self._body_spatial_velocities_port
 
     def get_body_spatial_accelerations_input_port(self) -> InputPort:
-        """The plant's body accelerations."""
+        """Return the port of the plant's body accelerations."""
         return self._body_spatial_accelerations_port
 
     def get_wrench_output_port(self) -> OutputPort:
-        """The filtered wrench of the environment on the tool, (6,), force first."""
+        """Return the port of the filtered wrench of the environment on the tool, (6,), force first."""
         return self._wrench_port
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
@@ -153,6 +154,6 @@ class WrenchSensor(LeafSystem):
 
 
 def _wrench_transform(R: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """The (6, 6) that transforms a wrench [torque, force] at B, in B's axes, to A's origin and axes; X_AB = (R, p)."""
+    """Return the (6, 6) matrix that transforms a wrench [torque, force] from frame B to frame A; X_AB = (R, p)."""
     p_cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
     return np.block([[R, p_cross @ R], [np.zeros((3, 3)), R]])

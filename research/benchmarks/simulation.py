@@ -32,7 +32,7 @@ from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.pose_wrench import PoseWrench
 from guiderail.systems.recorder import Recorder
-from guiderail.systems.support.command_watch import CommandWatch
+from guiderail.systems.support.last_valid_pose import LastValidPose
 from guiderail.systems.wrench_sensor import WrenchSensor
 from research.benchmarks import told
 
@@ -44,7 +44,7 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (CartesianPositionController, "_step"),
     (MeasuredPose, "_calc_pose"),
     (ContactDetector, "_update"),
-    (CommandWatch, "_update"),
+    (LastValidPose, "_update"),
     (CommandWatchdog, "_calc_safe_pose"),
     (ImpedanceMonitor, "_calc_contact_force"),
     (ImpedanceMonitor, "_calc_saturation"),

@@ -1,1 +1,1 @@
-"""What several systems are made of, and what is no LeafSystem itself."""
+"""Building blocks shared by several systems."""

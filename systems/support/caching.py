@@ -1,4 +1,4 @@
-"""Cache entries: what is computed once, however many outputs and events of an instant need it."""
+"""Declaration of cache entries, so that outputs and events of one instant share a computation."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,14 @@ def declare_cache(
     *,
     prerequisites_of_calc: set[DependencyTicket],
 ) -> CacheEntry:
-    """Declares a cache entry of `system` that holds what `calc` returns until one of the prerequisites changes."""
+    """Declare a cache entry whose value is computed by `calc`.
+
+    Args:
+        system: System under construction.
+        name: Description of the cache entry.
+        calc: Function of the system's context that returns the value.
+        prerequisites_of_calc: Tickets of the values that `calc` reads.
+    """
     return system.DeclareCacheEntry(
         description=name,
         value_producer=ValueProducer(
@@ -31,13 +38,13 @@ def declare_plant_context(
     *,
     prerequisites_of_calc: set[DependencyTicket],
 ) -> CacheEntry:
-    """Declares a cache entry of `system` that holds a context of `plant`, for its kinematics and its inertia.
+    """Declare a cache entry that contains a context of `plant`, for its kinematics and inertia.
 
     Args:
-        system: under construction.
-        plant: finalized.
-        set_state: called with the system's context and the plant's; writes the plant's state.
-        prerequisites_of_calc: what `set_state` reads.
+        system: System under construction.
+        plant: Finalized plant.
+        set_state: Function of the system's context and the plant's context that writes the plant's state.
+        prerequisites_of_calc: Tickets of the values that `set_state` reads.
     """
     return system.DeclareCacheEntry(
         description="plant_context",

@@ -1,4 +1,4 @@
-"""Control periods, and inputs that are sampled once in each."""
+"""Check of periods, and inputs sampled once per control period."""
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteStateIndex, DiscreteValues, EventStatus, InputPort, LeafSystem
@@ -7,23 +7,28 @@ from guiderail.models.common.errors import InputError
 
 
 def check_period(period: float) -> None:
-    """Refuses a period that no event can have.
-
-    Args:
-        period: [s].
+    """Raise an InputError if the period [s] is not positive and finite.
 
     Raises:
-        InputError: if it is not positive and finite.
+        InputError: See above.
     """
     if not 0.0 < period < np.inf:
         raise InputError(f"a system's period must be positive and finite, not {period} s")
 
 
 def declare_sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
-    """Declares a discrete state of `system` that holds `port`, sampled at initialization and once a period.
+    """Declare a discrete state that contains `port`, sampled at initialization and once per period.
+
+    Args:
+        system: System under construction.
+        port: Its vector input port.
+        period: Sampling period [s].
+
+    Returns:
+        Index of the discrete state.
 
     Raises:
-        InputError: if the period is not positive and finite.
+        InputError: If the period is not positive and finite.
     """
     check_period(period)
     state = system.DeclareDiscreteState(port.size())

@@ -1,4 +1,4 @@
-"""Input ports that are declared by name and size, and read by name."""
+"""Input ports declared and read by signal name."""
 
 from collections.abc import Callable, Iterable, Mapping
 from inspect import signature
@@ -11,17 +11,17 @@ from guiderail.models.common.errors import InputError
 
 
 class SignalPorts:
-    """The signals of a system whose input ports are not known before it is constructed: one vector port per name."""
+    """Vector input ports of a system, one per named signal, whose names are constructor arguments.
+
+    Args:
+        system: System under construction; ports are declared in the order in which names first appear.
+        signals: Mappings from name to size, at least 1. Equal names share one port.
+
+    Raises:
+        InputError: If a size is below 1, or a signal has two sizes.
+    """
 
     def __init__(self, system: LeafSystem, *signals: Mapping[str, int]):
-        """
-        Args:
-            system: under construction; the ports are declared in it, in the order in which names first appear.
-            signals: name to size, at least 1; those that name the same signal share its port.
-
-        Raises:
-            InputError: if a size is below 1, or a signal is given two sizes.
-        """
         sizes: dict[str, int] = {}
         for name, size in (item for mapping in signals for item in mapping.items()):
             if size < 1:
@@ -32,39 +32,39 @@ class SignalPorts:
 
     @property
     def tickets(self) -> set[DependencyTicket]:
-        """What depends on all of them."""
+        """Tickets of all ports."""
         return {port.ticket() for port in self._ports.values()}
 
     def port(self, name: str) -> InputPort:
-        """The port of this name.
+        """Return the port of the signal `name`.
 
         Raises:
-            InputError: if there is none.
+            InputError: If there is no such signal.
         """
         if name not in self._ports:
             raise InputError(f"there is no signal '{name}', only {', '.join(self._ports) or 'none at all'}")
         return self._ports[name]
 
     def eval(self, context: Context) -> dict[str, np.ndarray]:
-        """All of them by name; `context` is the system's."""
+        """Return the values of all signals by name; `context` is the system's."""
         return {name: port.Eval(context) for name, port in self._ports.items()}
 
 
 def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
-    """Refuses a function that can't be called with signals by these names, before anything moves.
+    """Raise an InputError if a function does not accept the signals as keyword arguments.
 
     Args:
-        function: what is called with them.
-        names: of the signals.
-        what: the function is, in a sentence.
+        function: Function of the signals.
+        names: Names of the signals.
+        what: Description of the function for the message.
 
     Raises:
-        InputError: if it takes other names.
+        InputError: If the parameters of the function have other names.
     """
     try:
         takes = signature(function)
     except (ValueError, TypeError):
-        return  # one that is written in C doesn't say
+        return  # functions written in C may have no signature
     names = list(names)
     try:
         takes.bind(**dict.fromkeys(names))

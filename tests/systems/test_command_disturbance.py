@@ -38,22 +38,22 @@ def test_a_good_line_delivers_every_command():
 
 
 def test_late_commands_come_whole_periods_later_and_before_them_the_robot_stays():
-    found = delivered(late=2)
+    found = delivered(delay=2)
     np.testing.assert_allclose(found[2:], np.arange(10.0), atol=1e-9)
     assert found[0] == POSE
 
 
 def test_a_lost_command_leaves_the_last_one_that_arrived():
-    found = delivered(400, lost=0.3, seed=1)
+    found = delivered(400, loss_probability=0.3, seed=1)
     lost = np.abs(found - np.arange(400.0)) > 1e-6
     assert 0.2 < lost.mean() < 0.4
     for step in np.flatnonzero(lost[1:]) + 1:
         assert found[step] == found[step - 1]
-    np.testing.assert_array_equal(delivered(400, lost=0.3, seed=1), found)
-    assert not np.array_equal(delivered(400, lost=0.3, seed=2), found)
+    np.testing.assert_array_equal(delivered(400, loss_probability=0.3, seed=1), found)
+    assert not np.array_equal(delivered(400, loss_probability=0.3, seed=2), found)
 
 
-@pytest.mark.parametrize("wrong", [{"lost": 1.0}, {"lost": -0.1}, {"late": -1}])
+@pytest.mark.parametrize("wrong", [{"loss_probability": 1.0}, {"loss_probability": -0.1}, {"delay": -1}])
 def test_what_makes_no_sense_is_refused(wrong):
     with pytest.raises(InputError):
         CommandDisturbance(1, PERIOD, **wrong)

@@ -64,7 +64,7 @@ def built():
         systems.ActiveConstraintProjector(template, frames, PERIOD),
         systems.CartesianImpedanceController(plant, arm.target, arm.tool_centre, gains, period=PERIOD),
         systems.CartesianPositionController(plant, arm.target, arm.tool_centre, posture=np.zeros(7), period=PERIOD),
-        systems.CommandDisturbance(2, PERIOD, lost=0.5, late=1),
+        systems.CommandDisturbance(2, PERIOD, loss_probability=0.5, delay=1),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.CenterOfPressure(0.5),

@@ -303,7 +303,7 @@ class Teaching:
         context = plant.GetMyContextFromRoot(self.simulator.get_context())
         X = plant.GetFrameByName(task.workpiece).CalcPose(context, plant.GetFrameByName(task.fixture))
         turn = X.rotation().ToAngleAxis()
-        return bool(success.holds(np.concatenate([X.translation(), turn.angle() * turn.axis()])))
+        return bool(success.condition(np.concatenate([X.translation(), turn.angle() * turn.axis()])))
 
     def learned(self) -> dict[str, Any]:
         """What was shown: its mean, drawn with its spread, its bounds, and whether the mean alone succeeds."""

@@ -20,7 +20,7 @@ def judged(in_mug, fallen):
     places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
     balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
     _, success, spill = conditions(CONFIG, needed=5)
-    return success.holds(balls), spill.holds(balls, balls)
+    return success.condition(balls), spill.condition(balls, balls)
 
 
 @pytest.mark.parametrize(

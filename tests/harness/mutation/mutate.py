@@ -57,7 +57,7 @@ TARGETS = {
         for path in sorted((ROOT / "systems").glob("*.py"))
         if path.stem != "__init__"
     },
-    "systems/support/command_watch.py": [
+    "systems/support/last_valid_pose.py": [
         "tests/systems/test_command_watchdog.py",
         "tests/systems/test_torque_safety_limiter.py",
     ],

@@ -1,0 +1,127 @@
+"""Validity check of timed commands, and the last valid desired pose."""
+
+from collections.abc import Callable
+
+import numpy as np
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DependencyTicket,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+)
+
+from guiderail.models.common.errors import InputError
+from guiderail.systems.support.sampling import check_period
+
+_TIME_TOLERANCE = 1e-6  # [s], far above the rounding error of a time of days, far below any period
+
+
+class CommandValidity:
+    """Check of a command: finite, neither stale nor in the future.
+
+    A command with time stamp t_c is valid at t if −period ≤ t − t_c ≤ timeout. A time stamp further ahead is refused,
+    because the command would not time out in time; so is one that is not finite.
+
+    Args:
+        desired_pose: Input port of the system, (O,).
+        command_time: Input port of the time stamp of the command, (1,) [s]; if it is not connected, commands never time
+            out.
+        period: Period of the check [s], positive.
+        timeout: Age above which a command is stale [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, desired_pose: InputPort, command_time: InputPort, *, period: float, timeout: float):
+        check_period(period)
+        if not timeout > 0.0:
+            raise InputError(f"the timeout of commands must be positive, not {timeout} s")
+        self._desired_pose, self._command_time = desired_pose, command_time
+        self._min_age, self._max_age = -(period + _TIME_TOLERANCE), timeout
+
+    def is_valid(self, context: Context, time: float) -> bool:
+        """Return True if the present command is valid at `time` [s]; `context` is the system's."""
+        if not np.isfinite(self._desired_pose.Eval(context)).all():
+            return False
+        if not self._command_time.HasValue(context):
+            return True
+        age = time - float(self._command_time.Eval(context)[0])
+        return self._min_age <= age <= self._max_age
+
+
+class LastValidPose:
+    """Desired pose to follow: the present command while it is valid, otherwise the last valid one.
+
+    The last valid pose and the time of the last check are discrete states, updated by a periodic event. Validity is
+    evaluated at the time of the last check instead of the present time, so that outputs which depend on it are computed
+    again only when the command changes or an event occurs. A command becomes stale at the first event after its
+    timeout; a new command is valid at once. Before the first valid command the pose is the one measured at
+    initialization.
+
+    Args:
+        system: System under construction, in which two states and two events are declared.
+        desired_pose: Its input port of the command, (O,).
+        command_time: Its input port of the time stamp, (1,) [s]; if it is not connected, commands never time out.
+        measured_pose: Function of the system's context that returns the measured pose, (O,), for initialization.
+        period: Period of the check [s], positive; ideally the period of the commands.
+        timeout: Age above which a command is stale [s], positive.
+
+    Attributes:
+        tickets: Dependencies of `eval`.
+        timed_out_tickets: Dependencies of `calc_timed_out`.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        system: LeafSystem,
+        desired_pose: InputPort,
+        command_time: InputPort,
+        measured_pose: Callable[[Context], np.ndarray],
+        *,
+        period: float,
+        timeout: float,
+    ):
+        self._desired_pose, self._measured_pose = desired_pose, measured_pose
+        self._validity = CommandValidity(desired_pose, command_time, period=period, timeout=timeout)
+        self._last_pose = system.DeclareDiscreteState(desired_pose.size())
+        self._check_time = system.DeclareDiscreteState(1)
+        system.DeclareInitializationDiscreteUpdateEvent(self._reset)
+        system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.timed_out_tickets: set[DependencyTicket] = {
+            desired_pose.ticket(),
+            command_time.ticket(),
+            system.discrete_state_ticket(self._check_time),
+        }
+        self.tickets = self.timed_out_tickets | {system.discrete_state_ticket(self._last_pose)}
+
+    def eval(self, context: Context) -> np.ndarray:
+        """Return the desired pose to follow, (O,)."""
+        if self._is_valid(context):
+            return self._desired_pose.Eval(context)
+        return context.get_discrete_state(self._last_pose).value()
+
+    def calc_timed_out(self, context: Context, output: BasicVector) -> None:
+        """Set the output (1,) to 1 if the present command is not valid, otherwise to 0."""
+        output.SetAtIndex(0, float(not self._is_valid(context)))
+
+    def _is_valid(self, context: Context) -> bool:
+        return self._validity.is_valid(context, float(context.get_discrete_state(self._check_time).value()[0]))
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        discrete_state.set_value(self._last_pose, self._measured_pose(context))
+        discrete_state.set_value(self._check_time, [context.get_time()])
+        return EventStatus.Succeeded()
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+        # Validity at the last check: the pose followed until now is stored, even if it becomes stale now.
+        if self._is_valid(context):
+            discrete_state.set_value(self._last_pose, self._desired_pose.Eval(context))
+        discrete_state.set_value(self._check_time, [context.get_time()])
+        return EventStatus.Succeeded()
