@@ -57,9 +57,9 @@ class CartesianImpedanceController(LeafSystem):
 
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
 
-    See `impedance_torques`. K may be given in the axes of any frame. The orientation error is computed from quaternions,
-    so no orientation is singular. D follows from K and the arm's inertia in its present posture. If commands stop, the
-    last valid one remains in force (`LastValidPose`).
+    See `impedance_torques`. K may be given in the axes of any frame. The orientation error is computed from
+    quaternions, so no orientation is singular. D follows from K and the arm's inertia in its present posture. If
+    commands stop, the last valid one remains in force (`LastValidPose`).
 
     .. pydrake_system::
 

@@ -228,7 +228,7 @@ class CartesianPositionController(LeafSystem):
     def _joint_velocities(
         self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray | None, bool]:
-        """Return joint velocities for the tool velocity V (None if there are none), and True if V cannot be followed."""
+        """Return joint velocities for the tool velocity V, or None, and True if V cannot be followed."""
         velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
         if not is_regular:
             velocities /= max(1.0, float((np.abs(velocities) / self._velocity_limits[1]).max()))

@@ -71,8 +71,8 @@ class HistoryBuffer(LeafSystem):
         return EventStatus.Succeeded()
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
-        # Nothing has been executed at time zero. An event offset of one period would not do: period + k * period differs
-        # from (k + 1) * period in the last bit for every third k.
+        # Nothing has been executed at time zero. An event offset of one period would not do: period + k * period
+        # differs from (k + 1) * period in the last bit for every third k.
         if context.get_time() > 0:
             remaining = context.get_discrete_state(self._state).value()[self._shape[1] :]
             discrete_state.set_value(np.concatenate([remaining, self._output_port.Eval(context)]))

@@ -293,7 +293,7 @@ class MujocoGantry(LeafSystem):
         return num_substeps
 
     def _contact_wrench(self) -> np.ndarray:
-        """Return the wrench of the generalized contact forces: slides are the axes of T, a hinge a has the force a · t."""
+        """Return the wrench of the generalized contact forces: slides are the axes of T, a hinge a carries a · t."""
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])
 

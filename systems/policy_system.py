@@ -11,7 +11,7 @@ from guiderail.systems.support.sampling import check_period
 
 
 class PolicyError(RuntimeError):
-    """Raised if a policy does not return an action; the robot must stop, because no other action is known to be safe."""
+    """Raised if a policy does not return an action: the robot must stop, as no other action is known to be safe."""
 
 
 class PolicySystem(LeafSystem):
