@@ -3,7 +3,9 @@
 import gymnasium
 import numpy as np
 
-env = gymnasium.make("guiderail.diagrams:guiderail/GridClamp-v0", guidance="sct", action_repeat=10, reward="shaped")
+import guiderail  # noqa: F401 (registers the environments)
+
+env = gymnasium.make("guiderail/GridClamp-v0", guidance="sct", action_repeat=10, reward="shaped")
 print("observes", env.observation_space.shape, "acts", env.action_space.shape)
 rng = np.random.default_rng(0)
 observation, info = env.reset(seed=0)

@@ -4,10 +4,12 @@ import multiprocessing
 
 import gymnasium
 
+import guiderail  # noqa: F401 (registers the environments)
+
 if __name__ == "__main__":  # each process imports this file first
     multiprocessing.set_forkserver_preload(["guiderail.diagrams.envs.make"])  # once, and not by each of them
     envs = gymnasium.make_vec(
-        "guiderail.diagrams:guiderail/NarrowPassage-v0",  # so that each process registers it, too
+        "guiderail/NarrowPassage-v0",
         num_envs=2,
         vectorization_mode="async",
         # Forks of a process that is begun anew: forks of this one would share its threads' locks.

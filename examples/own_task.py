@@ -8,7 +8,6 @@ import numpy as np
 from pydrake.systems.framework import Context, Diagram
 
 import guiderail as gr
-from guiderail.diagrams.tasks.registry import register_envs
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 WORLD = PassageGeometry(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=(0.28, 0.42))
@@ -49,7 +48,6 @@ class WideGap(gr.Task):
         return {"start": start}
 
 
-register_envs()
 env = gymnasium.make("examples/WideGap-v0", guidance="skgrl", action_repeat=5)
 print("starts at", env.reset(seed=1)[1]["start"].round(3), "and ends as", end="")
 over = False

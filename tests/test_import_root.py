@@ -38,3 +38,13 @@ def bare(code, tmp_path):
 def test_importing_costs_nothing_before_a_name_is_used(tmp_path):
     code = "import sys, guiderail; print(guiderail.__version__, 'pydrake' in sys.modules, 'torch' in sys.modules)"
     assert bare(code, tmp_path).stdout.split()[1:] == ["False", "False"]
+
+
+def test_import_registers_environments_without_drake(tmp_path):
+    code = """
+import sys, gymnasium, guiderail
+imported = {"pydrake", "pydantic", "torch"} & {*sys.modules}
+env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="kgrl")
+print(imported, env.unwrapped.action_space.shape)
+"""
+    assert bare(code, tmp_path).stdout.split() == ["set()", "(2,)"]

@@ -15,10 +15,9 @@ import gymnasium
 from gymnasium.envs.registration import load_env_creator
 from threadpoolctl import threadpool_limits
 
-import guiderail.diagrams  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.options import Options, validate_options
 from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_envs, register_task_folder
+from guiderail.diagrams.tasks.registry import TASKS, environment_id, is_task_folder, register_task_folder
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import parse_yaml
@@ -55,7 +54,6 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
             names.append(_imported(module, partial(import_module, module)).__name__)
         else:
             raise InputError(f"--import takes a module or a file (.py), and there is none for {brief(module)}")
-    register_envs()
     return tuple(names)
 
 
@@ -68,7 +66,6 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
     if typed in TASKS.names() or not is_task_folder(typed):
         return typed, ()
     name = register_task_folder(typed)
-    register_envs()
     return name, (str(Path(typed).resolve()),)
 
 

@@ -1,50 +1,59 @@
-"""Tasks by name."""
+"""Registry of tasks, and their registration as Gymnasium environments.
+
+This module is imported by `import guiderail`, so it imports neither Drake nor pydantic.
+"""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import gymnasium
 import numpy as np
 
-from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.task import Task
 
-    AnyTask = TypeVar("AnyTask", bound=type[Task])
-
-import gymnasium
+    TaskClass = TypeVar("TaskClass", bound=type[Task])
 
 TASKS: Registry[type[Task]] = Registry(
     "task", package="guiderail.diagrams.tasks", decorator="register_task", entry_points="guiderail.tasks"
 )
 
 
-def register_task(name: str) -> Callable[[AnyTask], AnyTask]:
-    """A decorator that adds a task.
+def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
+    """Return a decorator that registers a task, and its environment with Gymnasium.
 
     Args:
-        name: what it is called; it may have a namespace of its own, as in "lab/Peg".
+        name: Name of the task; it may have a namespace of its own, as in "lab/Peg".
 
     Raises:
-        InputError: when it decorates, if another task has that name, or what it declares is not of the right kind.
+        InputError: When it decorates, if another task has that name, a required method is missing, or a declaration has
+            the wrong type.
     """
 
-    def add(task: AnyTask) -> AnyTask:
+    def add(task: TaskClass) -> TaskClass:
         _check(name, task)
         task.name = name
         TASKS.register(name, task)
+        _register_env(name)
         return task
 
     return add
 
 
 def _check(name: str, task: type[Task]) -> None:
-    """Refuses declarations of the wrong kind, while whoever wrote them looks on."""
+    """Refuse a task class that lacks a method or declares something of the wrong type."""
+    from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions
+
+    if inspect.isabstract(task):
+        missing = ", ".join(f"{method}()" for method in sorted(task.__abstractmethods__))
+        raise InputError(f"{name} lacks {missing}: write what every task needs")
     for attribute, kind in (("Options", Options), ("Reset", ResetOptions)):
         given = getattr(task, attribute)
         if not (isinstance(given, type) and issubclass(given, kind)):
@@ -55,7 +64,7 @@ def _check(name: str, task: type[Task]) -> None:
             raise InputError(f"{attribute} of {name} must be some words, such as ('sparse',), not {brief(given)}")
     if STANDARD not in task.difficulties:
         raise InputError(f"difficulties of {name} must have {STANDARD!r}, not only {brief(list(task.difficulties))}")
-    num_steps = getattr(task, "num_steps", None)  # some say it in their constructor, or as a property
+    num_steps = getattr(task, "num_steps", None)  # a constructor or a property may set it instead
     if isinstance(num_steps, int | float | complex | str | np.number):
         check_num_steps(name, num_steps)
     if not isinstance(task.clip, int | float) or not task.clip > 0:
@@ -63,27 +72,27 @@ def _check(name: str, task: type[Task]) -> None:
 
 
 def check_num_steps(name: str, num_steps: Any) -> None:
-    """Refuses what no episode can last.
+    """Refuse a number of control steps that an episode cannot have.
 
     Raises:
-        InputError: if it is no whole number of at least 1.
+        InputError: If it is not a whole number of at least 1.
     """
     if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer) or num_steps < 1:
         raise InputError(f"num_steps of {name} must be a whole number of at least 1, not {brief(num_steps)}")
 
 
 def is_task_folder(name: str | Path) -> bool:
-    """Whether that is a folder that `guiderail onboard` made, by its path."""
+    """Return True if `name` is the path of a folder that `guiderail create-task` made."""
     return (Path(name) / "task.yaml").is_file()
 
 
 def register_task_folder(folder: str | Path) -> str:
-    """Adds the task of a folder, and returns what it is called. Doing it again reads the folder anew.
+    """Register the task of a folder and return its name; calling it again reads the folder again.
 
     Raises:
-        InputError: if something in it makes no sense, or another task has its name.
+        InputError: If the folder's task is not valid, or another task has its name.
     """
-    from guiderail.diagrams.tasks.part.task import load_task_folder  # Drake takes a second
+    from guiderail.diagrams.tasks.part.task import load_task_folder  # imports Drake
 
     task = load_task_folder(Path(folder))
     register_task(task.file.name)(task)
@@ -91,14 +100,18 @@ def register_task_folder(folder: str | Path) -> str:
 
 
 def environment_id(name: str) -> str:
-    """What `gymnasium.make` calls a task."""
+    """Return the id of a task's environment for `gymnasium.make`."""
     return f"{name if '/' in name else f'guiderail/{name}'}-v0"
 
 
 def register_envs() -> None:
-    """Registers `guiderail/<Task>-v0`, or `<namespace>/<Task>-v0`, for every task; calling it again adds new ones."""
+    """Register the environments of all tasks of this package and of installed packages; `import guiderail` calls it."""
     for name in TASKS.names():
-        if environment_id(name) not in gymnasium.registry:
-            gymnasium.register(
-                id=environment_id(name), entry_point="guiderail.diagrams.envs.make:make_env", kwargs={"task": name}
-            )
+        _register_env(name)
+
+
+def _register_env(name: str) -> None:
+    if environment_id(name) not in gymnasium.registry:
+        gymnasium.register(
+            id=environment_id(name), entry_point="guiderail.diagrams.envs.make:make_env", kwargs={"task": name}
+        )

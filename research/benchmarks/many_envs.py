@@ -15,9 +15,10 @@ from typing import Any
 
 import gymnasium
 
+import guiderail  # noqa: F401 (registers the environments)
 from research.benchmarks import told
 
-ENVIRONMENT = "guiderail.diagrams:guiderail/BncConnector-v0"
+ENVIRONMENT = "guiderail/BncConnector-v0"
 OPTIONS: dict[str, Any] = {"guidance": "kgrl", "fixture_offset": "per_episode", "action_repeat": 5}
 ASKED = 16  # cores
 STEPS = 300  # of the vector environment, in each measurement

@@ -9,5 +9,9 @@ from importlib.metadata import version
 
 import lazy_loader
 
+from guiderail.diagrams.tasks.registry import register_envs
+
 __version__ = version("guiderail")
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+register_envs()

@@ -115,6 +115,11 @@ def test_what_no_environment_can_be_made_of_is_a_sentence(attributes, says):
         EnvConfig.resolve("lab/Own", {})
 
 
+def test_task_that_lacks_methods_is_refused_with_their_names():
+    with pytest.raises(InputError, match=r"lab/Own lacks reset\(\), workcell\(\): write what every task needs"):
+        declare(of=Task, observation_terms=None, reward_terms=None, termination_terms=None)
+
+
 def test_settings_of_another_guidance_are_no_mistake():
     declare(difficulties={"standard": {}, "hard": {"history": 4}}, defaults={"guidance": "kmp"})
     assert EnvConfig.resolve("lab/Own", {"difficulty": "hard"}).options["guidance"] == "kmp"
@@ -259,7 +264,6 @@ def test_collisions_are_counted_only_where_a_task_says_what_they_are():
 
 def test_a_task_of_ones_own_is_stressed_through_every_guidance_that_it_has():
     declare()
-    import_modules(["json"])  # what makes Gymnasium's environments of tasks
     found = stress("lab/Own", episodes=3)
     assert found["wrong"] == []
     assert found["cases"].keys() <= {"kgrl", "kmp", "residual", "skgrl"}

@@ -212,7 +212,8 @@ def _source(safety: dict[str, list[dict[str, Any]]]) -> str:
 def _differences(methods: dict[str, list[Run]]) -> list[dict[str, Any]]:
     """What all methods differ in from the thesis, and then what single ones do."""
     told = {
-        name: list(dict.fromkeys(w for run in runs for w in describe_differences(run.config))) for name, runs in methods.items()
+        name: list(dict.fromkeys(w for run in runs for w in describe_differences(run.config)))
+        for name, runs in methods.items()
     }
     first = next(iter(told.values()))
     common = [words for words in first if all(words in others for others in told.values())]

@@ -10,8 +10,8 @@ from pydrake.systems.framework import DiagramBuilder
 from guiderail.diagrams.envs.cameras import Camera, add_camera
 
 RENDERS = """
-import gymnasium
-env = gymnasium.make("guiderail.diagrams:guiderail/NarrowPassage-v0", guidance="kgrl", observation="image")
+import gymnasium, guiderail
+env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="kgrl", observation="image")
 env.reset(seed=0)
 import torch._dynamo
 env.step(env.action_space.sample())

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import guiderail.diagrams  # noqa: F401 (registers)
+import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import ALIGNMENT_REWARD, DEPTH_REWARD

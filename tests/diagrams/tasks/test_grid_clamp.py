@@ -6,7 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
-import guiderail.diagrams  # noqa: F401 (registers)
+import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.grid_clamp.task import (
     CENTRE,

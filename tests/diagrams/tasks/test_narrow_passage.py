@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check
 from stable_baselines3.common.env_checker import check_env as sb3_check
 
-import guiderail.diagrams  # registers the environments
+import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs import cameras
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage as Task
@@ -279,8 +279,8 @@ def test_a_nan_in_the_plant_ends_the_episode_and_not_the_training():
 def test_made_in_one_go_hundreds_of_resets_do_not_grow(forks, tmp_path):
     # In a process of its own, elsewhere: what other tests leave behind is none of its business.
     script = """
-import gymnasium
-env = gymnasium.make("guiderail.diagrams:guiderail/NarrowPassage-v0", guidance="skgrl", hold=1).unwrapped
+import gymnasium, guiderail
+env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="skgrl", action_repeat=1).unwrapped
 import gc, resource
 import numpy as np
 def run(resets):

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-import guiderail.diagrams  # noqa: F401 (registers the environments)
+import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.pouring.scripted import ADVERSARIES, scripted_pour
 from guiderail.diagrams.tasks.pouring.task import START_HEIGHT, START_RADIUS
