@@ -230,8 +230,8 @@ def describe_differences(config: RunConfig, *, learns: bool = True) -> list[str]
         )
     differences += _non_defaults(config, setting)
     chamfer = environment.get("mouth_chamfer", BncDimensions().mouth_chamfer)
-    values = {"action_scale": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
-    return differences + [text.format(**values) for text, applies in setting.remarks if applies(environment)]
+    remarked = {"action_scale": 1.0, "mouth_chamfer_mm": chamfer / MM, **environment}
+    return differences + [text.format(**remarked) for text, applies in setting.remarks if applies(environment)]
 
 
 def _is_given(name: str, environment: Mapping[str, Any]) -> bool:
@@ -245,7 +245,9 @@ def _non_defaults(config: RunConfig, setting: Setting) -> list[str]:
     from guiderail.tools.environments import beyond_defaults, check_environment  # imports Drake, which takes a second
 
     task, environment = config.task, config.environment
-    chosen = {key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment}
+    chosen: dict[str, Any] = {
+        key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment
+    }
     defaults = check_environment(task, chosen) | {"station": check_environment(task, {})["station"]}
     differences = []
     for name, value in beyond_defaults(task, environment).items():

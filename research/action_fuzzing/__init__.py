@@ -1,14 +1,9 @@
-"""Episodes of actions that no policy should send: a module for each task that is tried."""
+"""Fuzzing of tasks with actions that no trained policy sends, `python -m research.action_fuzzing TASK`."""
 
-STRESSED = {
+CAMPAIGNS = {
     "BncConnector": "bnc_connector",
     "GridClamp": "grid_clamp",
     "NarrowPassage": "narrow_passage",
     "Pouring": "pouring",
 }
-EVERY = "all"
-
-
-def stressed() -> list[str]:
-    """What can be stressed."""
-    return [*STRESSED, EVERY]
+ALL = "all"

@@ -1,4 +1,4 @@
-"""Tries to make the narrow passage fail: random, held and saturated actions against walls, obstacle and zone."""
+"""Fuzzing of the narrow passage: actions towards walls, obstacle and restricted zone."""
 
 import itertools
 
@@ -6,21 +6,21 @@ from research.action_fuzzing.campaign import Campaign, Case
 
 
 def campaign() -> Campaign:
-    """KGRL and sKGRL, whose commands must keep the constraint, at two lengths of a decision; no wall may be touched.
+    """Return the campaign: KGRL and sKGRL, at two action repeats, must satisfy the constraint and touch no wall.
 
-    The others are there for the physics: safe residual learning stops before walls, and nothing keeps plain residual
-    learning and the demonstrations from anything.
+    Safe residual learning may stop before walls. Residual learning and the demonstrations are not constrained; they
+    check the simulation.
     """
     cases = [
         Case(
-            f"{guidance}, hold {action_repeat}",
+            f"{guidance}, action repeat {action_repeat}",
             {"guidance": guidance, "action_repeat": action_repeat},
             constrained=True,
         )
         for guidance, action_repeat in itertools.product(("kgrl", "skgrl"), (1, 5))
     ]
     cases += [
-        Case("safe_residual", {"guidance": "safe_residual", "action_repeat": 5}, constrained=True, waits=True),
+        Case("safe_residual", {"guidance": "safe_residual", "action_repeat": 5}, constrained=True, may_wait=True),
         Case("residual", {"guidance": "residual", "action_repeat": 5}, constrained=False, limits={}),
         Case("kmp", {"guidance": "kmp", "action_repeat": 5}, constrained=False, limits={}),
     ]

@@ -1,4 +1,4 @@
-"""How fast things are on this machine: `guiderail bench`."""
+"""Benchmarks of speed on this machine, `python -m research.benchmarks NAME`."""
 
 import sys
 from collections.abc import Callable, Collection, Iterator
@@ -24,44 +24,47 @@ BENCHMARKS = (
     "cold_start",
     "many_envs",
 )
-OF_A_TASK = ("training", "cold_start")  # those that are told which task, and how it is set up
-OF_OTHER_PROCESSES = ("cold_start",)  # those that have to tell them what registers the task
-DRAWN = ("time_step", "engines")  # those that can be drawn
+WITH_TASK = ("training", "cold_start")  # benchmarks of a task that the caller names
+WITH_IMPORTS = ("cold_start",)  # benchmarks that start other processes, which have to import the task's modules
+WITH_PICTURE = ("time_step", "engines")
 
 
 def run_benchmark(
-    what: str, *, picture: Path | None = None, **told_of: Any
+    name: str, *, picture: Path | None = None, **options: Any
 ) -> tuple[dict[str, Any], Callable[[dict[str, Any]], None]]:
-    """What one of `BENCHMARKS` measured, with its progress on standard error; and what shows it to a person.
+    """Run a benchmark, with its progress on standard error.
 
     Args:
-        what: its name.
-        picture: where a picture of it is written, if it can be drawn.
-        told_of: `task`, `environment` and `imports`, where it takes them.
+        name: One of `BENCHMARKS`.
+        picture: File of a picture of the results, for benchmarks in `WITH_PICTURE`.
+        options: `task`, `environment` and `imports`, for benchmarks in `WITH_TASK`.
+
+    Returns:
+        The results, and the function that prints them.
 
     Raises:
-        InputError: if there is no such benchmark, it takes no task, or it can't be drawn.
+        InputError: If there is no such benchmark, or it has no such option.
     """
-    if what not in BENCHMARKS:
-        raise InputError(f"there is no benchmark {what!r}: {did_you_mean(what, BENCHMARKS)}")
-    given = {name: value for name, value in told_of.items() if value}
-    if given and what not in OF_A_TASK:
-        raise InputError(f"the benchmark {what} is of no task: leave {' and '.join(given)} out")
-    if picture is not None and what not in DRAWN:
-        raise InputError(f"the benchmark {what} is printed and not drawn: leave --picture out")
+    if name not in BENCHMARKS:
+        raise InputError(f"there is no benchmark {name!r}: {did_you_mean(name, BENCHMARKS)}")
+    given = {option: value for option, value in options.items() if value}
+    if given and name not in WITH_TASK:
+        raise InputError(f"the benchmark {name} has no task: leave {' and '.join(given)} out")
+    if picture is not None and name not in WITH_PICTURE:
+        raise InputError(f"the benchmark {name} has no picture: leave --picture out")
     if picture is not None:
         check_picture(picture)
-    if what not in OF_OTHER_PROCESSES:
+    if name not in WITH_IMPORTS:
         given.pop("imports", None)
-    module = import_module(f"research.benchmarks.{what}")
+    module = import_module(f"research.benchmarks.{name}")
     results = module.measure(**given)
     if picture is not None:
         module.draw(results, picture)
     return results, module.show
 
 
-def told(what: Collection[Item], words: str) -> Iterator[Item]:
-    """One after the other, and on standard error which one it is."""
-    for index, item in enumerate(what, 1):
-        print(f"{words} {index}/{len(what)}: {item}", file=sys.stderr, flush=True)
+def with_progress(items: Collection[Item], label: str) -> Iterator[Item]:
+    """Yield items one after the other, and print each on standard error."""
+    for index, item in enumerate(items, 1):
+        print(f"{label} {index}/{len(items)}: {item}", file=sys.stderr, flush=True)
         yield item

@@ -22,7 +22,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import evaluate_run
 from guiderail.tools.evaluation.rollout import check_compatible
 from guiderail.tools.learning.run_folder import RunFolder
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 TASK = "BncConnector"
 ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "fixture_offset": "per_run"}
@@ -59,7 +59,7 @@ def measure(
     task = task or TASK
     runs = []
     with tempfile.TemporaryDirectory() as folder:
-        for seed, kind in told([(seed, kind) for seed in seeds for kind in KINDS], "run"):
+        for seed, kind in with_progress([(seed, kind) for seed in seeds for kind in KINDS], "run"):
             out = Path(folder) / f"{seed}-{KINDS[kind]}"
             seconds = _train(task, options, episodes, seed, KINDS[kind], out, imports)
             judged = evaluate_run(

@@ -21,7 +21,7 @@ from guiderail.models.objects.bnc_connector.motion import poses
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
 from guiderail.systems.recorder import Recording
 from guiderail.tools.visualization.style import legend, new_figure, save_figure
-from research.benchmarks import told
+from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 
 ENGINES = {"Drake": "gantry", "MuJoCo": "mujoco"}
@@ -51,19 +51,21 @@ CONTACTS = {  # station, step [s] and margin [m]
 def measure() -> dict[str, Any]:
     """Force profiles and real-time factors of both engines, by one process's CPU time, and the rim's levers."""
     jobs = [(task, engine) for task in TASKS for engine in ENGINES]
-    profiles = {f"{task} {engine}": _profile(task, ENGINES[engine]) for task, engine in told(jobs, "motion")}
+    profiles = {f"{task} {engine}": _profile(task, ENGINES[engine]) for task, engine in with_progress(jobs, "motion")}
     pressed = [("Drake", modulus) for modulus in MODULI] + [("MuJoCo", 1.0)]
     levers = {
         f"{engine}, modulus × {modulus:g}" if engine == "Drake" else engine: [
             _lever(ENGINES[engine], offset * MM, modulus) / MM for offset in OFFSETS
         ]
-        for engine, modulus in told(pressed, "rim")
+        for engine, modulus in with_progress(pressed, "rim")
     }
     levers["two points, rigid"] = [rigid_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
-    captures |= {engine: _capture(*how) / MM for engine, how in told(CAPTURES.items(), "capture")}
-    drags = {contact: [drag(*how, speed) for speed in SPEEDS] for contact, how in told(CONTACTS.items(), "drag")}
+    captures |= {engine: _capture(*how) / MM for engine, how in with_progress(CAPTURES.items(), "capture")}
+    drags = {
+        contact: [drag(*how, speed) for speed in SPEEDS] for contact, how in with_progress(CONTACTS.items(), "drag")
+    }
     measured = {"levers_mm": levers, "captures_mm": captures, "drags": drags}
     return {"profiles": profiles, "offsets_mm": list(OFFSETS), **measured}
 

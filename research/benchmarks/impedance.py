@@ -24,7 +24,7 @@ from guiderail.models.objects.bnc_connector.motion import insert_and_lock
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.scripted import make_baseline
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 CONTROLS = ("joint", "cartesian")
 TIME_STEPS = {"joint": (1, 2, 4, 16), "cartesian": (4, 8, 16)}  # parts of a control period; the last is the finest
@@ -49,7 +49,7 @@ def measure() -> dict[str, Any]:
     jobs = [(control, parts) for control in CONTROLS for parts in reversed(TIME_STEPS[control])]
     motions: list[dict[str, Any]] = []
     finest: dict[str, np.ndarray] = {}
-    for control, parts in told(jobs, "motion"):
+    for control, parts in with_progress(jobs, "motion"):
         row, pose = insertion(control, CONTROL_PERIOD / parts)
         finest.setdefault(control, pose)
         motions.append(row | _apart(pose, finest[control], "own"))
@@ -60,7 +60,7 @@ def measure() -> dict[str, Any]:
     return {
         "motion": motions,
         "step": [step_response(control) for control in CONTROLS],
-        "episodes": [_episodes(*one) for one in told(acting, "episodes")],
+        "episodes": [_episodes(*one) for one in with_progress(acting, "episodes")],
     }
 
 

@@ -27,7 +27,7 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import register_learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 
 @register_learner("plain_sac")
@@ -68,7 +68,9 @@ def measure(turns: int = TURNS) -> dict[str, Any]:
     """Milliseconds of a gradient step by algorithm and preset, and how many times faster it is here."""
     torch.set_num_threads(1)
     results: dict[str, Any] = {}
-    for algorithm, preset in told([(algorithm, preset) for algorithm in LEARNERS for preset in PRESETS], "learner"):
+    for algorithm, preset in with_progress(
+        [(algorithm, preset) for algorithm in LEARNERS for preset in PRESETS], "learner"
+    ):
         results[f"{algorithm} {preset}"] = _compare(algorithm, preset, turns)
     results["fast_enough"] = results[REQUIRED_OF]["times_faster"] >= REQUIRED_RATIO
     return results

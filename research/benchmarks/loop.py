@@ -26,7 +26,7 @@ from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, Si
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.policy import FORMAT, Policy
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 TASK, HOLD = "BncConnector", 10
 UNITS = 128
@@ -39,7 +39,7 @@ Row = dict[str, Any]
 def measure() -> dict[str, list[Row]]:
     """Rows for the machine as it is, and for a busy one."""
     found = {}
-    for load in told(("as it is", "busy"), "load"):
+    for load in with_progress(("as it is", "busy"), "load"):
         with _busy(load == "busy"):
             found[load] = [*_parts(), *_transport()]
     return found

@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium
 
 import guiderail  # noqa: F401 (registers the environments)
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 ENVIRONMENT = "guiderail/BncConnector-v0"
 OPTIONS: dict[str, Any] = {"guidance": "kgrl", "fixture_offset": "per_episode", "action_repeat": 5}
@@ -34,7 +34,7 @@ def measure(*, steps: int = STEPS, counts: tuple[int, ...] | None = None) -> dic
     cores = len(os.sched_getaffinity(0))
     counts = counts or tuple(sorted({1, cores}))
     multiprocessing.set_forkserver_preload(["guiderail.diagrams.envs.make"])
-    measured = {count: _measured(count, steps) for count in told(counts, "environments")}
+    measured = {count: _measured(count, steps) for count in with_progress(counts, "environments")}
     alone = measured[min(measured)]
     serial = measured[max(measured)]["own_seconds"] / max(measured)
     action_repeat = OPTIONS["action_repeat"]

@@ -16,7 +16,7 @@ import numpy as np
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
 from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.qp import SOLVERS
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 #: O, F, H, P: planar, connector, and something larger than either.
 SIZES = ((2, 1, 40, 10), (6, 4, 40, 10), (6, 12, 100, 20))
@@ -239,7 +239,7 @@ def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
 def measure(steps: int = STEPS) -> dict:
     """Everything the benchmark reports, by size."""
     report = {}
-    for size in told(SIZES, "primitive, O F H P"):
+    for size in with_progress(SIZES, "primitive, O F H P"):
         name = "O{} F{} H{} P{}".format(*size)
         report[name] = {
             "predict": _predict(size, steps),

@@ -17,7 +17,7 @@ from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.learning import trainer as train
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 TASKS = {"NarrowPassage": 10, "BncConnector": 6}  # and so many episodes
 REQUIRED_SHARE = 0.03
@@ -63,8 +63,13 @@ def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
 
 def measure() -> dict[str, Any]:
     """All of it, as a program may read it."""
+<<<<<<< HEAD
     results: dict[str, Any] = {task: saving_share(task, TASKS[task]) for task in told(TASKS, "saving")}
     shares = [results[task]["step_log_share"] + results[task]["checkpoint_share"] for task in TASKS]
+=======
+    results: dict[str, Any] = {task: saving_share(task, TASKS[task]) for task in with_progress(TASKS, "saving")}
+    shares = [results[task]["ledger_share"] + results[task]["checkpoint_share"] for task in TASKS]
+>>>>>>> bd4af1f (Command lines of benchmarks, action fuzzing and generators; campaigns in plain words)
     results["cheap_enough"] = max(shares) <= REQUIRED_SHARE
     return results
 

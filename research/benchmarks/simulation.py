@@ -34,7 +34,7 @@ from guiderail.systems.pose_wrench import PoseWrench
 from guiderail.systems.recorder import Recorder
 from guiderail.systems.support.last_valid_pose import LastValidPose
 from guiderail.systems.wrench_sensor import WrenchSensor
-from research.benchmarks import told
+from research.benchmarks import with_progress
 
 # Outermost callbacks only: one that is called within another would count twice.
 CALLBACKS: tuple[tuple[type, str], ...] = (
@@ -159,7 +159,7 @@ def measure() -> dict[str, Any]:
     """All of it, as a program may read it."""
     measurements: dict[str, Callable[[], Any]] = {name: partial(real_time_factor, name) for name in REQUIRED_FACTOR}
     measurements["env_seconds_per_400_steps"] = env_seconds
-    results: dict[str, Any] = {name: measurements[name]() for name in told(measurements, "simulation")}
+    results: dict[str, Any] = {name: measurements[name]() for name in with_progress(measurements, "simulation")}
     results["fast_enough"] = (
         all(results[name]["real_time_factor"] >= factor for name, (_, factor) in REQUIRED_FACTOR.items())
         and results["env_seconds_per_400_steps"] <= REQUIRED_SECONDS

@@ -21,7 +21,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.units import MM
 from guiderail.tools.visualization.style import new_figure, save_figure
-from research.benchmarks import told
+from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 
 HALVINGS = (0, 1, 2, 3, 4)  # of the control period; the last is what the others are compared with
@@ -50,7 +50,7 @@ def simulate(motion: str, time_step: float) -> tuple[dict[str, np.ndarray], floa
 def measure() -> dict[str, Any]:
     """All of it, as a program may read it: rows of each motion and time step, the finest first."""
     rows = []
-    for motion in told(MOTIONS, "time step"):
+    for motion in with_progress(MOTIONS, "time step"):
         finest: dict[str, np.ndarray] = {}
         for halvings in reversed(HALVINGS):
             time_step = CONTROL_PERIOD / 2**halvings

@@ -1,4 +1,4 @@
-"""`guiderail generate`: the files that the project ships, written anew."""
+"""Generators of the files that the package ships, `python -m research.generate NAME`."""
 
 from collections.abc import Callable
 from importlib import import_module
@@ -9,7 +9,7 @@ from guiderail.models.common.registry import did_you_mean
 
 
 def _main(module: str) -> Callable[..., None]:
-    return lambda *folder: import_module(f"guiderail.{module}").main(*folder)
+    return lambda *folder: import_module(module).main(*folder)
 
 
 def _passage(*folder: Path) -> None:
@@ -22,24 +22,28 @@ def _search(*folder: Path) -> None:
     recording.main(*(folder or (None,)), recording.SEARCH_SESSION)
 
 
-# Each is called with a folder, or with nothing for its own.
-GENERATED: dict[str, Callable[..., None]] = {
-    "connector-demonstrations": _main("tools.recording.generate.bnc_connector"),
+# Each takes a folder, or nothing for the folder of the package.
+GENERATORS: dict[str, Callable[..., None]] = {
+    "connector-demonstrations": _main("research.generate.bnc_connector"),
     "connector-search-demonstrations": _search,
     "passage-demonstrations": _passage,
-    "connector-objects": _main("models.objects.write_bnc"),
-    "clamp-objects": _main("models.objects.write_grid_clamp"),
+    "connector-objects": _main("guiderail.models.objects.bnc_connector.sdf"),
+    "clamp-objects": _main("guiderail.models.objects.grid_clamp.sdf"),
 }
 
 
-def generate(what: str, folder: Path | None = None) -> None:
-    """Writes one of `GENERATED` into a folder, its own unless given.
+def generate(name: str, folder: Path | None = None) -> None:
+    """Write the files of one generator.
+
+    Args:
+        name: One of `GENERATORS`.
+        folder: Folder to write into; that of the package by default.
 
     Raises:
-        InputError: for anything else, or a folder that isn't there.
+        InputError: For an unknown name, or a folder that does not exist.
     """
-    if what not in GENERATED:
-        raise InputError(f"there is nothing called {what!r} to generate: {did_you_mean(what, GENERATED)}")
+    if name not in GENERATORS:
+        raise InputError(f"there is nothing called {name!r} to generate: {did_you_mean(name, GENERATORS)}")
     if folder is not None and not folder.is_dir():
         raise InputError(f"there is no folder {folder}: make it first")
-    GENERATED[what](*([] if folder is None else [folder]))
+    GENERATORS[name](*([] if folder is None else [folder]))

@@ -1,0 +1,45 @@
+"""Command line of action fuzzing."""
+
+import json
+import sys
+from pathlib import Path
+
+from research.action_fuzzing import ALL, CAMPAIGNS
+from research.action_fuzzing.campaign import fuzz
+from research.command import Parser, environment_options, find_task, run_program
+
+
+def main(arguments: list[str]) -> int:
+    """Run the program; the exit code is 1 if a check failed."""
+    parser = Parser(
+        "action_fuzzing",
+        "Send random actions to a task and check the simulation, the commands and the task's limits. The exit code is "
+        "1 if the simulation failed, a number was NaN or infinite, a prediction failed, a command of constrained "
+        "guidance violated the constraints (recomputed from the commands), or a limit of the task was exceeded.",
+        "BncConnector --episodes 1000 --out fuzzing.csv",
+    )
+    parser.add_argument("task", metavar="TASK", help=f"{', '.join(CAMPAIGNS)}, {ALL}, or another task or task folder")
+    parser.add_argument("--episodes", type=int, help="number of episodes, of one task (default: 1000)")
+    parser.add_argument("--steps", type=int, help="number of control steps, instead of --episodes")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default: 0)")
+    parser.add_argument(
+        "--out", type=Path, help="table (.csv), of all tasks a folder; an interrupted campaign is resumed"
+    )
+    parser.add_environment()
+    parser.add_json()
+    given = parser.parse_args(arguments)
+    result = fuzz(
+        find_task(given.task, given.imports)[0],
+        episodes=given.episodes,
+        steps=given.steps,
+        seed=given.seed,
+        out=given.out,
+        environment=environment_options(given.env),
+        report=lambda line: print(line, file=sys.stderr, flush=True),
+    )
+    print(json.dumps(result, indent=None if given.json else 2))
+    return 1 if result["failures"] else 0
+
+
+if __name__ == "__main__":
+    run_program(main)

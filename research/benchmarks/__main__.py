@@ -1,0 +1,28 @@
+"""Command line of the benchmarks."""
+
+from pathlib import Path
+
+from research.benchmarks import BENCHMARKS, run_benchmark
+from research.command import Parser, environment_options, find_task, print_result, run_program
+
+
+def main(arguments: list[str]) -> None:
+    """Run the program."""
+    parser = Parser("benchmarks", "Measure the speed of a part on this machine.", "simulation --json")
+    parser.add_argument("name", metavar="NAME", help=f"one of {', '.join(BENCHMARKS)}")
+    parser.add_argument("task", metavar="TASK", nargs="?", help="task whose training is measured")
+    parser.add_argument("--picture", type=Path, help="file of a picture of the results, of time_step and engines")
+    parser.add_environment()
+    parser.add_json()
+    given = parser.parse_args(arguments)
+    task, modules = (None, ()) if given.task is None else find_task(given.task, given.imports)
+    options = {"task": task, "environment": environment_options(given.env), "imports": modules}
+    results, show = run_benchmark(given.name, picture=given.picture, **options)
+    if given.json:
+        print_result(results, as_json=True)
+    else:
+        show(results)
+
+
+if __name__ == "__main__":
+    run_program(main)
