@@ -42,8 +42,8 @@ newest:
 	.ci/newest python3.13
 
 bench: $(VENV)/.ready
-	$(BIN)/guiderail bench primitive
-	$(BIN)/guiderail bench simulation
+	$(BIN)/python -m research.benchmarks primitive
+	$(BIN)/python -m research.benchmarks simulation
 
 # The moving pictures are kept: they take minutes, as one of them learns.
 gallery: $(VENV)/.ready

@@ -59,7 +59,7 @@ LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 
 ImpedanceControl = Literal["joint", "cartesian"]
 # Of the plant [s], with a controller: its forces are held for a step, where the rails' own are solved with it. It is
-# then as near to the finest step as the rails' own are at `PLANT_PERIOD`: see `guiderail bench impedance`.
+# then as near to the finest step as the rails' own are at `PLANT_PERIOD`: see `python -m research.benchmarks impedance`.
 CARTESIAN_PLANT_PERIOD = PLANT_PERIOD / 2
 
 

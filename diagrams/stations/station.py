@@ -56,7 +56,7 @@ OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 
 POSE_SIZE = 6
 CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
-# `guiderail bench time_step` shows by how much a longer and a shorter one are wrong, and what they cost.
+# `python -m research.benchmarks time_step` shows by how much a longer and a shorter one are wrong, and what they cost.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
 MAX_HALVINGS = 7
 

@@ -109,7 +109,7 @@ class Penetration(EnvCallback):
         self._depths.append(interference(_D, X_JP.rotation().matrix(), X_JP.translation()))
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the largest depth of lug and barrel, and the largest that lasted for `STANDING_STEPS` control steps."""
+        """Return the largest depths of lug and barrel, and the largest that lasted for `STANDING_STEPS`."""
         depths = np.array(self._depths) / MM
         windows = np.lib.stride_tricks.sliding_window_view(depths.max(axis=1), min(STANDING_STEPS, len(depths)))
         return {
@@ -120,7 +120,7 @@ class Penetration(EnvCallback):
 
 
 def campaign() -> Campaign:
-    """Return the campaign: all combinations of guidance, fixture offset and action dims, with a new offset each time."""
+    """Return the campaign: every guidance, fixture offset and action dims, with a new offset in every episode."""
     kinds = itertools.product(("kgrl", "skgrl", "residual", "safe_residual"), ("per_run", "per_episode"), ACTION_DIMS)
     cases = [
         Case(

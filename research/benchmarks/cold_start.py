@@ -1,8 +1,8 @@
-"""From the start of the command to a learned policy: `guiderail bench cold_start`.
+"""Time from the start of the command to a trained policy: `python -m research.benchmarks cold_start`.
 
-Each run is `guiderail train` in a process of its own, timed from its start to its end, everything that it imports,
-saves and draws included; then its policy is judged in held-out episodes, which do not count. Both kinds of one seed run
-one after the other, so that their ratio is of one machine in one state. The seeds chose nothing.
+Each run is `guiderail train` in a new process, timed from its start to its end, including imports, saving and drawing.
+The evaluation of its policy is not timed. Both kinds of a seed run one after the other, so that their ratio belongs to
+one state of the machine. No setting was chosen with these seeds.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ENVIRONMENT: Mapping[str, Any] = {"guidance": "kgrl", "reward": "shaped", "fixtu
 EPISODES = 20  # seeds 30 to 34 have converged after at most 10
 SEEDS = range(400, 405)
 HELD_OUT = 100
-KINDS = {"one after the other": "false", "acting while it learns": "true"}  # the setting `pipelined`
+KINDS = {"alternating": "false", "pipelined": "true"}  # the setting `pipelined`
 REQUIRED_MEDIAN, REQUIRED_WORST = 60.0, 120.0  # [s]
 
 
@@ -42,18 +42,18 @@ def measure(
     seeds: range = SEEDS,
     held_out: int = HELD_OUT,
 ) -> dict[str, Any]:
-    """Seconds of each run, and how often its policy succeeds.
+    """Measure the duration of each run and the success rate of its policy.
 
     Args:
-        task: what is learned.
-        environment: its options; the connector's with a hidden offset per run unless any is given.
-        imports: modules or files that register the task, where nothing installed does.
-        episodes: how many are learned from.
-        seeds: of the runs.
-        held_out: how many episodes judge a policy.
+        task: Name of the task.
+        environment: Its options; by default those of the connector with a hidden offset per run.
+        imports: Modules or files that register the task.
+        episodes: Training episodes of a run.
+        seeds: Seeds of the runs.
+        held_out: Held-out episodes of an evaluation.
 
     Raises:
-        InputError: if a run fails.
+        InputError: If a run fails.
     """
     options = environment or (ENVIRONMENT if task in (None, TASK) else {})
     task = task or TASK
@@ -62,10 +62,8 @@ def measure(
         for seed, kind in with_progress([(seed, kind) for seed in seeds for kind in KINDS], "run"):
             out = Path(folder) / f"{seed}-{KINDS[kind]}"
             seconds = _train(task, options, episodes, seed, KINDS[kind], out, imports)
-            judged = evaluate_run(
-                RunFolder(out).config(), partial(check_compatible, Policy.load(out)), episodes=held_out
-            )
-            success = float((judged["termination"] == "success").mean())
+            rows = evaluate_run(RunFolder(out).config(), partial(check_compatible, Policy.load(out)), episodes=held_out)
+            success = float((rows["termination"] == "success").mean())
             runs.append({"kind": kind, "seed": seed, "seconds": seconds, "success_rate": success})
     return {"task": task, "environment": dict(options), "episodes": episodes, "held_out": held_out, "runs": runs}
 
@@ -73,27 +71,27 @@ def measure(
 def _train(
     task: str, options: Mapping[str, Any], episodes: int, seed: int, pipelined: str, out: Path, imports: Sequence[str]
 ) -> float:
-    words = [sys.executable, "-c", "from guiderail.tools.cli.main import main; main()", "train", task, "--json"]
-    words += ["--episodes", str(episodes), "--seed", str(seed), "--set", f"pipelined={pipelined}", "--out", str(out)]
+    command = [sys.executable, "-c", "from guiderail.tools.cli.main import main; main()", "train", task, "--json"]
+    command += ["--episodes", str(episodes), "--seed", str(seed), "--set", f"pipelined={pipelined}", "--out", str(out)]
     for name, value in options.items():
-        words += ["--env", f"{name}={value}"]
+        command += ["--env", f"{name}={value}"]
     for module in imports:
-        words += ["--import", module]
+        command += ["--import", module]
     start = time.perf_counter()
-    ended = subprocess.run(words, capture_output=True, text=True)
+    process = subprocess.run(command, capture_output=True, text=True)
     seconds = time.perf_counter() - start
-    if ended.returncode:
-        raise InputError(f"a run failed: {ended.stderr.strip().splitlines()[-1]}")
+    if process.returncode:
+        raise InputError(f"a run failed: {process.stderr.strip().splitlines()[-1]}")
     return seconds
 
 
 def show(result: dict[str, Any]) -> None:
-    """Prints each run, and the median and worst of each kind beside what was asked for."""
-    print(f"{result['task']}, {result['episodes']} episodes, from the command's start to its end")
+    """Print each run, the median and the worst of each kind, and the requirement."""
+    print(f"{result['task']}, {result['episodes']} episodes, from the start of the command to its end")
     for kind in KINDS:
         runs = [run for run in result["runs"] if run["kind"] == kind]
         seconds = [run["seconds"] for run in runs]
         print(f"{kind}: median {statistics.median(seconds):.1f} s, worst {max(seconds):.1f} s")
         for run in runs:
             print(f"  seed {run['seed']}: {run['seconds']:.1f} s, {run['success_rate']:.0%} of {result['held_out']}")
-    print(f"asked of the connector with a hidden offset: {REQUIRED_MEDIAN:.0f} s, {REQUIRED_WORST:.0f} s")
+    print(f"required for the connector with a hidden offset: {REQUIRED_MEDIAN:.0f} s, {REQUIRED_WORST:.0f} s")

@@ -1,4 +1,4 @@
-"""`guiderail bench engines`: the same scripted motions in Drake and in MuJoCo, and what a plug on the rim feels."""
+"""`python -m research.benchmarks engines`: scripted motions and contact of a plug on the rim, in Drake and MuJoCo."""
 
 from __future__ import annotations
 
@@ -27,14 +27,17 @@ from research.benchmarks.simulation import scripted_motion
 ENGINES = {"Drake": "gantry", "MuJoCo": "mujoco"}
 COLOURS = {"Drake": "#1f5fbf", "MuJoCo": "#c0504d"}
 TASKS = ("BncConnector", "GridClamp")
-OFFSETS = (0.8, 1.25, 2.0, 3.0)  # [mm], of a plug on the rim
-MODULI = (0.01, 0.1, 1.0, 10.0)  # times the contact's own, in Drake
+OFFSETS = (0.8, 1.25, 2.0, 3.0)  # offsets of a plug on the rim [mm]
+MODULI = (0.01, 0.1, 1.0, 10.0)  # factors of the contact modulus, in Drake
 PRESSED = 7.8 * MM  # commanded height: 2.7 mm below the rim, 4 N
-MIN_CONTACT_FORCE = 0.5  # [N] below which a lever says nothing
+MIN_CONTACT_FORCE = 0.5  # smallest force at which the center of pressure is used [N]
 NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
-IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that has dropped in, and an offset from which none does
-HALVINGS = 6  # of that offset
-AROUND, SPEEDS = 3.0 * MM, (0.003, 0.02, 0.04)  # circle about the jack on which a plug slides over the rim [m, m/s]
+IN, FARTHEST = 9.5 * MM, 0.4 * MM  # height of a plug that dropped in, offset that is too large [m]
+HALVINGS = 6  # bisection steps of the capture offset
+AROUND, SPEEDS = (
+    3.0 * MM,
+    (0.003, 0.02, 0.04),
+)  # circle on the rim [m], speeds [m/s]
 CAPTURES = {  # station, and whether Drake's polygons have their circles' areas
     "Drake": ("gantry", False),
     "Drake, equal areas": ("gantry", True),
@@ -49,7 +52,7 @@ CONTACTS = {  # station, step [s] and margin [m]
 
 
 def measure() -> dict[str, Any]:
-    """Force profiles and real-time factors of both engines, by one process's CPU time, and the rim's levers."""
+    """Measure force profiles, real-time factors (CPU time), centers of pressure, capture offsets and drag."""
     jobs = [(task, engine) for task in TASKS for engine in ENGINES]
     profiles = {f"{task} {engine}": _profile(task, ENGINES[engine]) for task, engine in with_progress(jobs, "motion")}
     pressed = [("Drake", modulus) for modulus in MODULI] + [("MuJoCo", 1.0)]
@@ -71,13 +74,13 @@ def measure() -> dict[str, Any]:
 
 
 def rigid_lever(d: BncDimensions, offset: float) -> float:
-    """From the plug's axis to where two rigid bodies that tilt meet: the chord of their overlap [m]."""
+    """Return the distance of two rigid bodies' contact points from the plug's axis, the chord of their overlap [m]."""
     mouth = d.bore_radius + d.mouth_chamfer
     return float((mouth**2 + offset**2 - d.barrel_radius**2) / (2.0 * offset))
 
 
 def even_lever(d: BncDimensions, offset: float) -> float:
-    """From the plug's axis to the middle of the area where mouth and barrel overlap [m]."""
+    """Return the distance between the plug's axis and the centroid of the overlap of mouth and barrel [m]."""
     x, y = np.meshgrid(*(np.linspace(-d.ring_radius, d.ring_radius, 1401),) * 2)
     inside = (np.hypot(x, y) > d.bore_radius + d.mouth_chamfer) & (np.hypot(x, y) < d.ring_radius)
     inside &= np.hypot(x - offset, y) < d.barrel_radius
@@ -104,13 +107,13 @@ def _profile(task: str, station: str) -> dict[str, Any]:
 
 
 def _lever(name: str, offset: float, modulus: float) -> float:
-    """From the plug's axis to where the rim pushes, at rest on it beside the barrel [m]."""
+    """Return the distance between the plug's axis and the center of pressure, at rest on the rim [m]."""
     recording = _pressed(name, BncWorkcell(), offset, modulus)
     return float(np.linalg.norm(center_of_pressure(recording["wrench"][-10:].mean(axis=0), MIN_CONTACT_FORCE)))
 
 
 def _capture(name: str, equal_area: bool = False) -> float:
-    """How far beside the jack a plug may be pressed on it that still drops in [m]."""
+    """Return the largest offset at which a plug that is pressed on the jack drops in [m]."""
     near, far = 0.0, FARTHEST
     for _ in range(HALVINGS):
         middle = 0.5 * (near + far)
@@ -121,7 +124,7 @@ def _capture(name: str, equal_area: bool = False) -> float:
 
 
 def drag(station: str, time_step: float, margin: float, speed: float) -> float:
-    """Drag over push of a plug that slides over a sharp rim: the friction that it feels."""
+    """Return the ratio of drag to normal force of a plug that slides over a sharp rim: the effective friction."""
     workcell = BncWorkcell(NARROW, margin=margin)
     down = poses(np.array([11.0 * MM, PRESSED]), np.pi / 2)
     times = np.concatenate([[0.0], np.linspace(0.6, 1.4, 81)])
@@ -135,7 +138,7 @@ def drag(station: str, time_step: float, margin: float, speed: float) -> float:
 
 
 def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1.0) -> Recording:
-    """A plug that is pressed on a jack that is this far beside it [m]."""
+    """Record a plug that is pressed on a jack with an offset [m]."""
     motion = poses(np.array([11.0 * MM, PRESSED, PRESSED]), np.pi / 2)
     station = STATIONS.get(name).build(workcell)
     times = np.array([0.0, 0.6, 1.4])
@@ -148,32 +151,34 @@ def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1
 
 
 def show(results: dict[str, Any]) -> None:
-    """Prints a line for each motion and each lever."""
+    """Print a line for each motion and each measurement."""
     for name, profile in results["profiles"].items():
         factor, peak = profile["real_time_factor"], profile["peak_force_n"]
-        print(f"{name}: {factor:.1f} times real time, {peak:.1f} N at most")
+        print(f"{name}: {factor:.1f} times real time, {peak:.1f} N peak force")
     print(
-        "lever of a plug on the rim [mm], at", ", ".join(f"{offset:g}" for offset in results["offsets_mm"]), "mm beside"
+        "center of pressure of a plug on the rim [mm], at",
+        ", ".join(f"{offset:g}" for offset in results["offsets_mm"]),
+        "mm offset",
     )
     for name, levers in results["levers_mm"].items():
         print(f"  {name}: {', '.join(f'{lever:.2f}' for lever in levers)}")
     print("a plug drops in from", ", ".join(f"{mm:.2f} mm ({name})" for name, mm in results["captures_mm"].items()))
     speeds = ", ".join(f"{1e3 * speed:g}" for speed in SPEEDS)
-    print(f"drag of a plug that slides over a sharp rim, of its push, at {speeds} mm/s; its friction is {FRICTION:g}")
+    print(f"drag over normal force on a sharp rim at {speeds} mm/s; the friction is {FRICTION:g}")
     for name, drags in results["drags"].items():
         print(f"  {name}: {', '.join(f'{share:.2f}' for share in drags)}")
 
 
 def draw(results: dict[str, Any], path: Path) -> Path:
-    """Writes the picture: height, push and torque of both engines, and the rim's lever."""
+    """Draw height, normal force and torque of both engines, and the centers of pressure on the rim."""
     figure, axes = new_figure(2, 3, (11.0, 5.6))
     for row, task in enumerate(TASKS):
         for engine in ENGINES:
             profile = results["profiles"][f"{task} {engine}"]
             for axis, key in zip(axes[row], ("height_mm", "push_n", "torque_nm"), strict=True):
                 axis.plot(profile["time"], profile[key], color=COLOURS[engine], label=engine)
-        for axis, words in zip(axes[row], ("height [mm]", "push [N]", "torque about z [Nm]"), strict=True):
-            axis.set_ylabel(words)
+        for axis, label in zip(axes[row], ("height [mm]", "normal force [N]", "torque about z [Nm]"), strict=True):
+            axis.set_ylabel(label)
             axis.set_xlabel(f"{task}: time [s]")
     legend(figure, axes[0, 0])
     lever = axes[1, 2]
@@ -184,5 +189,5 @@ def draw(results: dict[str, Any], path: Path) -> Path:
         lever.plot(results["offsets_mm"], levers, ".-", color=colour, alpha=1.0 if nominal else 0.5)
         lever.annotate(name, (results["offsets_mm"][-1], levers[-1]), fontsize=6)
     lever.set_xlabel("plug on the rim: offset [mm]")
-    lever.set_ylabel("lever of its force [mm]")
+    lever.set_ylabel("center of pressure [mm]")
     return save_figure(figure, path)

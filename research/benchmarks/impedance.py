@@ -1,9 +1,9 @@
-"""The rails' two impedances, side by side: `guiderail bench impedance`.
+"""Comparison of the gantry's two impedances: `python -m research.benchmarks impedance`.
 
-Springs and dampers of the rails themselves, which a plant solves with the contact, and a Cartesian impedance controller
-as an arm has it, whose forces are held for a step of the plant. They have the same stiffness, damping ratio and limits.
-A scripted insertion is compared with its finest time step; demonstrations alone and a rule written by hand act in the
-same held-out episodes of the connector under both.
+One consists of springs and dampers of the gantry's joints, which the plant solves with the contact. The other is a
+Cartesian impedance controller as on an arm, whose forces are constant during a plant step. They have the same
+stiffness, damping ratio and limits. A scripted insertion is compared with its finest time step. The demonstration alone
+and the scripted policy act in the same held-out episodes of the connector under both.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from guiderail.tools.evaluation.scripted import make_baseline
 from research.benchmarks import with_progress
 
 CONTROLS = ("joint", "cartesian")
-TIME_STEPS = {"joint": (1, 2, 4, 16), "cartesian": (4, 8, 16)}  # parts of a control period; the last is the finest
+TIME_STEPS = {"joint": (1, 2, 4, 16), "cartesian": (4, 8, 16)}  # plant steps per control period; the last is the finest
 DIFFICULTIES = ("standard", "hard")
-POLICIES = {"demonstrations": "zero", "scripted": "scripted"}
-EPISODES = 10  # of each
+POLICIES = {"demonstration": "zero", "scripted": "scripted"}
+EPISODES = 10  # of each policy
 RESPONSE = 15  # control periods
-STEP = np.array([4.0 * MM, -3.0 * MM, 5.0 * MM, 0.05, -0.04, 0.03])  # of the desired pose, in the air
-SHOWN = (
+STEP = np.array([4.0 * MM, -3.0 * MM, 5.0 * MM, 0.05, -0.04, 0.03])  # step of the desired pose in free space [m, rad]
+STATISTICS = (
     "success_rate",
     "success_low",
     "success_high",
@@ -45,17 +45,17 @@ SHOWN = (
 
 
 def measure() -> dict[str, Any]:
-    """All of it, as a program may read it: `motion`, `step` and `episodes`, rows each."""
+    """Run the benchmark; return lists of rows `motion`, `step` and `episodes`."""
     jobs = [(control, parts) for control in CONTROLS for parts in reversed(TIME_STEPS[control])]
     motions: list[dict[str, Any]] = []
     finest: dict[str, np.ndarray] = {}
     for control, parts in with_progress(jobs, "motion"):
         row, pose = insertion(control, CONTROL_PERIOD / parts)
         finest.setdefault(control, pose)
-        motions.append(row | _apart(pose, finest[control], "own"))
+        motions.append(row | _difference(pose, finest[control], "own"))
     for row, (control, parts) in zip(motions, jobs, strict=True):
         if parts == TIME_STEPS[control][-1]:
-            row |= _apart(finest[control], finest[CONTROLS[0]], "joint")
+            row |= _difference(finest[control], finest[CONTROLS[0]], "joint")
     acting = [(d, name, control) for d in DIFFICULTIES for name in POLICIES for control in CONTROLS]
     return {
         "motion": motions,
@@ -65,7 +65,7 @@ def measure() -> dict[str, Any]:
 
 
 def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarray]:
-    """What a scripted insertion comes to and costs with a time step [s], and where the plug was, (n, 6)."""
+    """Simulate a scripted insertion with a time step [s]; return its row and the plug's poses, (n, 6)."""
     workcell, (times, poses) = BncWorkcell(), insert_and_lock()
     station = GantryStation(workcell, time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
     driven = DrivenStation(station, along(times, poses), round(times[-1] / CONTROL_PERIOD))
@@ -83,7 +83,7 @@ def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarra
 
 
 def step_response(control: str, time_step: float | None = None) -> dict[str, Any]:
-    """How far the tool centre is at the control instants after a step of all six coordinates, in its parts, (n, 6)."""
+    """Return the response of the tool center to a step of all six coordinates, relative to the step, (n, 6)."""
     station = GantryStation(BncWorkcell(), time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
     start = np.array([0.0, 0.0, 50.0 * MM, 0.0, 0.0, 0.0])
     simulator = Simulator(station)
@@ -98,7 +98,7 @@ def step_response(control: str, time_step: float | None = None) -> dict[str, Any
     return {"control": control, "response": ((np.array(poses) - start) / STEP).tolist()}
 
 
-def _apart(poses: np.ndarray, others: np.ndarray, name: str) -> dict[str, float]:
+def _difference(poses: np.ndarray, others: np.ndarray, name: str) -> dict[str, float]:
     away = np.linalg.norm((poses - others)[:, :3], axis=1)
     turned = np.abs((poses - others)[:, 3:])
     return {f"{name}_position_rms": float(np.sqrt((away**2).mean())), f"{name}_angle_most": float(turned.max())}
@@ -113,30 +113,30 @@ def _episodes(difficulty: str, name: str, control: str) -> dict[str, Any]:
     spent = time.process_time() - begin
     env.close()
     of = {"difficulty": difficulty, "policy": name, "control": control, "episodes": EPISODES}
-    return of | summary(rows, SHOWN) | {"seconds_per_1000_steps": 1000.0 * spent / float(rows["steps"].sum())}
+    return of | summary(rows, STATISTICS) | {"seconds_per_1000_steps": 1000.0 * spent / float(rows["steps"].sum())}
 
 
 def show(results: dict[str, Any]) -> None:
-    """Prints what was measured."""
-    print("scripted insertion   step     CPU    peak    locks  RMS to its finest step")
+    """Print the results."""
+    print("scripted insertion   step     CPU    peak    locks  RMS error to the finest step")
     for row in results["motion"]:
         near = f"{row['own_position_rms'] / MM:6.3f} mm"
         if row.get("joint_position_rms"):
-            near += f", {row['joint_position_rms'] / MM:.3f} mm to that of the rails' own"
+            near += f", {row['joint_position_rms'] / MM:.3f} mm to the joint impedance"
         print(
             f"  {row['control']:<17}{1e3 * row['time_step']:6.2f} ms {row['seconds']:5.2f} s "
             f"{row['peak_force']:5.1f} N  {'yes' if row['locks'] else 'no':<5} {near}"
         )
-    print("step response, parts of the step after 1, 2, 3, 5, 10 control periods")
+    print("step response, relative to the step, after 1, 2, 3, 5, 10 control periods")
     for row in results["step"]:
-        told = np.array(row["response"])
-        for words, column in (("x, y, z", slice(0, 3)), ("angles", slice(3, POSE_SIZE))):
-            means = told[[0, 1, 2, 4, 9], column].mean(axis=1)
-            print(f"  {row['control']:<12}{words:<8}{'  '.join(f'{value:.3f}' for value in means)}")
+        response = np.array(row["response"])
+        for label, column in (("x, y, z", slice(0, 3)), ("angles", slice(3, POSE_SIZE))):
+            means = response[[0, 1, 2, 4, 9], column].mean(axis=1)
+            print(f"  {row['control']:<12}{label:<8}{'  '.join(f'{value:.3f}' for value in means)}")
     print("held-out episodes            success (95 %)       mean    peak    CPU of 1000 control steps")
     for row in results["episodes"]:
-        who = f"{row['difficulty']}, {row['policy']}, {row['control']}"
+        label = f"{row['difficulty']}, {row['policy']}, {row['control']}"
         print(
-            f"  {who:<37} {row['success_rate']:4.0%} ({row['success_low']:.0%}–{row['success_high']:.0%}) "
+            f"  {label:<37} {row['success_rate']:4.0%} ({row['success_low']:.0%}–{row['success_high']:.0%}) "
             f"{row['mean_force']:5.1f} N {row['peak_force']:5.1f} N {row['seconds_per_1000_steps']:6.1f} s"
         )

@@ -1,16 +1,16 @@
-"""Gradient steps of the learners here and of Stable-Baselines3, as ratios in one run: `guiderail bench learner`.
+"""Duration of gradient steps compared with Stable-Baselines3: `python -m research.benchmarks learner`.
 
-CPU time of one core; the two take turns training, and the ratio is the median of those turns. Batches are of 13
-observations and 2 actions, as the connector's are.
+CPU time of one core. The two learners alternate, and the ratio is the median over the turns. Batches have 13
+observations and 2 actions, as those of the connector.
 
-What made a step faster, and what did not, in parts of another step's time (TQC, `robust`: two critics of 128 by 128
-units and 25 quantiles, batches of 64). The critics as one in PyTorch's own autograd, with flat parameters and a fused
-optimizer: 0.39 of Stable-Baselines3's. With gradients written out: 0.20 to 0.25. In times of that step: quantiles
-sorted by PyTorch instead of NumPy 1.02 to 1.08, quantiles' errors in memory that is kept 0.96 to 1.05, their sums by a
-matrix product 1.05 to 1.08, two threads 40 where both cores are busy, as threads wait for each other, spinning.
+Variants of TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25 quantiles, batches of 64), relative
+to Stable-Baselines3: critics batched in PyTorch's autograd, with flat parameters and a fused optimizer 0.39;
+hand-written gradients 0.20 to 0.25. Relative to the latter: quantiles sorted by PyTorch instead of NumPy 1.02 to 1.08;
+preallocated memory for quantile errors 0.96 to 1.05; their sums as a matrix product 1.05 to 1.08; two threads on busy
+cores 40, because threads spin while waiting for each other.
 
-With large batches and layers it is the matrices that cost, and less is won: SAC with 256 by 256 units and batches of
-256 (`table_4_1_simulation`) takes 0.68 of Stable-Baselines3's time.
+With large batches and layers the matrix products dominate: SAC with 256 by 256 units and batches of 256
+(`table_4_1_simulation`) takes 0.68 of Stable-Baselines3's time.
 """
 
 import time
@@ -32,27 +32,27 @@ from research.benchmarks import with_progress
 
 @register_learner("plain_sac")
 class PlainSac(OffPolicyLearner):
-    """With Stable-Baselines3's own gradient step."""
+    """SAC with the gradient step of Stable-Baselines3."""
 
     algorithm = SAC
 
 
 @register_learner("plain_tqc")
 class PlainTqc(OffPolicyLearner):
-    """With sb3-contrib's own gradient step."""
+    """TQC with the gradient step of sb3-contrib."""
 
     algorithm = TQC
 
 
 PRESETS = ("tqc_contact", "sac_gridclamp", "tqc_fast", "table_4_1_simulation")
-REQUIRED_RATIO = 2.5  # of TQC at the connector's preset
-REQUIRED_OF = "tqc robust"
+REQUIRED_RATIO = 2.5  # smallest ratio of `REQUIRED_OF`
+REQUIRED_OF = "tqc tqc_contact"
 TURNS = 8
-_DECISIONS = 2000
+_TRANSITIONS = 2000
 
 
 class _Spaces(gymnasium.Env):
-    """The connector's."""
+    """Spaces of the connector."""
 
     observation_space = spaces.Box(-10.0, 10.0, (13,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -65,7 +65,7 @@ LEARNERS: dict[str, tuple[type[OffPolicyLearner], type[OffPolicyLearner]]] = {
 
 
 def measure(turns: int = TURNS) -> dict[str, Any]:
-    """Milliseconds of a gradient step by algorithm and preset, and how many times faster it is here."""
+    """Measure gradient steps [ms] by algorithm and preset, and the ratio to Stable-Baselines3."""
     torch.set_num_threads(1)
     results: dict[str, Any] = {}
     for algorithm, preset in with_progress(
@@ -77,7 +77,7 @@ def measure(turns: int = TURNS) -> dict[str, Any]:
 
 
 def _compare(algorithm: str, preset: str, turns: int) -> dict[str, float]:
-    plain, ours = (_experienced(kind, preset) for kind in LEARNERS[algorithm])
+    plain, ours = (_with_transitions(kind, preset) for kind in LEARNERS[algorithm])
     seconds = np.array([[_seconds(learner) for learner in (plain, ours)] for _ in range(1 + turns)])[1:]
     plain_ms, ours_ms = 1e3 * np.median(seconds, axis=0)
     ratio = float(np.median(seconds[:, 0] / seconds[:, 1]))
@@ -85,18 +85,18 @@ def _compare(algorithm: str, preset: str, turns: int) -> dict[str, float]:
 
 
 def _seconds(learner: OffPolicyLearner) -> float:
-    """Of one gradient step, in one training."""
+    """Return the CPU time of a gradient step [s]."""
     start = time.process_time()
     learner.model.train(learner.preset.gradient_steps, learner.preset.batch_size)
     return (time.process_time() - start) / learner.preset.gradient_steps
 
 
-def _experienced(kind: type[OffPolicyLearner], preset: str) -> OffPolicyLearner:
-    """A learner with something to remember."""
+def _with_transitions(kind: type[OffPolicyLearner], preset: str) -> OffPolicyLearner:
+    """Return a learner with a filled replay buffer."""
     settings = resolve_preset(preset, "tqc", {"symmetry": False})
-    learner = kind(settings, _Spaces(), action_repeat=10, seed=0, decisions=_DECISIONS)
+    learner = kind(settings, _Spaces(), action_repeat=10, seed=0, decisions=_TRANSITIONS)
     random = np.random.default_rng(0)
-    for index in range(_DECISIONS):
+    for index in range(_TRANSITIONS):
         seen, then = random.standard_normal((2, 13)).astype(np.float32)
         action = random.uniform(-1, 1, 2).astype(np.float32)
         learner.remember(Transition(seen, action, float(random.standard_normal()), then, index % 50 == 49, False, {}))
@@ -104,7 +104,7 @@ def _experienced(kind: type[OffPolicyLearner], preset: str) -> OffPolicyLearner:
 
 
 def show(results: dict[str, Any]) -> None:
-    """Prints what was measured."""
+    """Print the results."""
     for name, row in results.items():
         if isinstance(row, dict):
             needed = f" (at least {REQUIRED_RATIO})" if name == REQUIRED_OF else ""

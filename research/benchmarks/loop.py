@@ -1,8 +1,7 @@
-"""Whether the loop of a robot is in time on this machine: `guiderail bench loop`.
+"""Timing of the control loop of a robot: `python -m research.benchmarks loop`.
 
-The time that each part takes of its period, and how regularly a robot is heard over LCM on localhost: once with the
-machine as it is, and once with a process on every core that has nothing else to do. Wall clock, worst case included:
-what else runs here counts, as it would for the robot.
+Durations of each part and its period, and the jitter of messages over LCM on localhost, once with the machine as it is
+and once with a busy process on every core. Durations are wall-clock times, including the worst case.
 """
 
 from __future__ import annotations
@@ -31,22 +30,22 @@ from research.benchmarks import with_progress
 TASK, HOLD = "BncConnector", 10
 UNITS = 128
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
-SECONDS = 6.0  # of the robot's time, for each of the two loads
+SECONDS = 6.0  # robot time for each of the two loads [s]
 PERIOD = IIWA_DRIVER.period
 Row = dict[str, Any]
 
 
 def measure() -> dict[str, list[Row]]:
-    """Rows for the machine as it is, and for a busy one."""
-    found = {}
+    """Measure with the machine as it is, and with a busy one."""
+    results = {}
     for load in with_progress(("as it is", "busy"), "load"):
         with _busy(load == "busy"):
-            found[load] = [*_parts(), *_transport()]
-    return found
+            results[load] = [*_parts(), *_transport()]
+    return results
 
 
 def _row(part: str, period: float, seconds: np.ndarray) -> Row:
-    # An answer that never came took infinitely long, and between a number and infinity nothing is interpolated.
+    # A missing answer counts as infinite, and quantiles are not interpolated towards infinity.
     median, p99, worst = 1000.0 * np.quantile(seconds, (0.5, 0.99, 1.0), method="higher")
     return {
         "part": part,
@@ -65,7 +64,7 @@ def _timed(call: Callable[[int], object], number: int) -> np.ndarray:
         started = time.perf_counter()
         call(index)
         seconds[index] = time.perf_counter() - started
-    return seconds[number // 20 :]  # what is called for the first time is called before a robot moves
+    return seconds[number // 20 :]  # without the first calls, which happen before a robot moves
 
 
 def _policy(observations: int, actions: int) -> Policy:
@@ -93,12 +92,12 @@ def _parts() -> list[Row]:
     rows.append(_row("primitive", CONTROL_PERIOD, predictions))
     lcm = DrakeLcm("memq://")
     station = HardwareStation(BncWorkcell(), lcm)
-    rows.append(_row("station, with what guards it", PERIOD, _stepped(lcm, station, number)))
+    rows.append(_row("station with its monitors", PERIOD, _stepped(lcm, station, number)))
     return rows
 
 
 def _stepped(lcm: DrakeLcm, station: HardwareStation, number: int) -> np.ndarray:
-    """How long a station needs for each status of a robot in the same process."""
+    """Time a station's step for each status of a robot in the same process [s]."""
     robot = SimulatedIiwa(BncWorkcell(), lcm)
     simulator, other = Simulator(station), robot.simulator()
     robot.set_pose(other.get_mutable_context(), START)
@@ -115,84 +114,84 @@ def _stepped(lcm: DrakeLcm, station: HardwareStation, number: int) -> np.ndarray
 
 
 def _transport() -> list[Row]:
-    """A process that speaks as often as a robot does, and this one, which answers at once."""
+    """Time messages between a process that sends at a robot's rate and this one, which answers at once."""
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     os.environ.setdefault("DRAKE_ALLOW_NETWORK", "lcm")
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    speaker = context.Process(target=_speak, args=(there, url), daemon=True)
+    sender = context.Process(target=_send_statuses, args=(there, url), daemon=True)
     lcm = DrakeLcm(url)
-    heard: list[float] = []
+    received: list[float] = []
 
     def answer(message: bytes) -> None:
-        heard.append(time.perf_counter())
-        lcm.Publish("ANSWERED", message)
+        received.append(time.perf_counter())
+        lcm.Publish("ANSWER", message)
 
-    lcm.Subscribe("SPOKEN", answer)
-    speaker.start()
-    with _in_a_hurry():
+    lcm.Subscribe("STATUS", answer)
+    sender.start()
+    with _realtime_priority():
         while not here.poll():
             lcm.HandleSubscriptions(10)
     answered = here.recv()
-    speaker.join()
-    rows = [_row("from a status to the next", PERIOD, np.diff(heard)[20:])]
-    return [*rows, _row("there and back over LCM", PERIOD, np.array(answered)[20:])]
+    sender.join()
+    rows = [_row("from a status to the next", PERIOD, np.diff(received)[20:])]
+    return [*rows, _row("round trip over LCM", PERIOD, np.array(answered)[20:])]
 
 
 class _Answers:
-    """When each message was sent, and when its own answer came: one that is late is not the next message's."""
+    """Times of messages and of their answers, matched by number."""
 
     def __init__(self) -> None:
-        self._said: list[float] = []
-        self._came: dict[int, float] = {}
+        self._sent: list[float] = []
+        self._answered: dict[int, float] = {}
 
-    def say(self, now: float) -> bytes:
-        """The next message, which is sent now [s]."""
-        self._said.append(now)
-        return (len(self._said) - 1).to_bytes(8)
+    def send(self, now: float) -> bytes:
+        """Return the next message, sent at time `now` [s]."""
+        self._sent.append(now)
+        return (len(self._sent) - 1).to_bytes(8)
 
-    def hear(self, message: bytes, now: float) -> None:
-        """An answer, which came now [s]; one that comes twice counts once."""
-        self._came.setdefault(int.from_bytes(message), now)
+    def receive(self, message: bytes, now: float) -> None:
+        """Record an answer at time `now` [s]; a duplicate is ignored."""
+        self._answered.setdefault(int.from_bytes(message), now)
 
     def is_answered(self) -> bool:
-        """Whether the last message is."""
-        return len(self._said) - 1 in self._came
+        """Return True if the last message has been answered."""
+        return len(self._sent) - 1 in self._answered
 
     def seconds(self) -> list[float]:
-        """How long each answer took [s]; infinite where none came."""
-        return [self._came.get(number, np.inf) - said for number, said in enumerate(self._said)]
+        """Return the duration until each answer [s]; infinite without one."""
+        return [self._answered.get(number, np.inf) - sent for number, sent in enumerate(self._sent)]
 
 
-def _speak(pipe: Connection, url: str) -> None:
-    """The other process: how long each answer took."""
+def _send_statuses(pipe: Connection, url: str) -> None:
+    """Send messages from the other process and return the durations until their answers."""
     lcm, answers = DrakeLcm(url), _Answers()
-    lcm.Subscribe("ANSWERED", lambda message: answers.hear(message, time.perf_counter()))
-    with _in_a_hurry():
+    lcm.Subscribe("ANSWER", lambda message: answers.receive(message, time.perf_counter()))
+    with _realtime_priority():
         due = time.perf_counter() + 0.5
         for _ in range(round(SECONDS / PERIOD)):
             time.sleep(max(due - time.perf_counter(), 0.0))
             due += PERIOD
-            lcm.Publish("SPOKEN", answers.say(time.perf_counter()))
+            lcm.Publish("STATUS", answers.send(time.perf_counter()))
             while not answers.is_answered() and time.perf_counter() < due:
                 lcm.HandleSubscriptions(1)
     pipe.send(answers.seconds())
 
 
 @contextmanager
-def _in_a_hurry() -> Iterator[None]:
-    """As a process that a robot waits for, where the system allows it."""
-    is_served_first = set_realtime_priority()
+def _realtime_priority() -> Iterator[None]:
+    """Run with real-time priority where the system allows it."""
+    has_priority = set_realtime_priority()
     try:
         yield
     finally:
-        if is_served_first:
+        if has_priority:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 @contextmanager
 def _busy(is_busy: bool) -> Iterator[None]:
-    """A process on every core that has nothing else to do."""
+    """Run a busy process on every core."""
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=_work, daemon=True) for _ in range((os.cpu_count() or 1) * is_busy)]
     for other in others:
@@ -211,10 +210,10 @@ def _work() -> None:
         np.linalg.svd(matrix)
 
 
-def show(found: dict[str, list[Row]]) -> None:
-    """Prints a table for each load."""
+def show(results: dict[str, list[Row]]) -> None:
+    """Print a table for each load."""
     columns = ("period_ms", "median_ms", "p99_ms", "worst_ms")
-    for load, rows in found.items():
+    for load, rows in results.items():
         print(f"{'the machine ' + load:<34}{'period':>9}{'median':>9}{'99 %':>9}{'worst':>9} [ms]   over")
         for row in rows:
             numbers = "".join(f"{row[name]:>9.2f}" for name in columns)

@@ -1,9 +1,8 @@
-"""Environments that step at once, a process each: `guiderail bench many_envs`.
+"""Parallel environments, one process each: `python -m research.benchmarks many_envs`.
 
-Gymnasium's own vector environment (`gymnasium.make_vec`) waits for the slowest of its processes at every step, and what
-it does itself, sending actions and reading what came, it does one environment after the other: its own time an
-environment is the serial part. Where there are fewer cores than asked about, what is printed is that sum and not a
-measurement: n environments on as many cores take the time of one, and the serial part n − 1 times more.
+Gymnasium's vector environment (`gymnasium.make_vec`) waits for the slowest process at every step. It sends actions and
+reads results one environment after the other; this time per environment is the serial part. The rate for more cores
+than the machine has is extrapolated: n environments on n cores take the time of one and n − 1 times the serial part.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from research.benchmarks import with_progress
 
 ENVIRONMENT = "guiderail/BncConnector-v0"
 OPTIONS: dict[str, Any] = {"guidance": "kgrl", "fixture_offset": "per_episode", "action_repeat": 5}
-ASKED = 16  # cores
-STEPS = 300  # of the vector environment, in each measurement
+CORES = 16  # cores of the extrapolation
+STEPS = 300  # steps of the vector environment in each measurement
 
 
 def measure(*, steps: int = STEPS, counts: tuple[int, ...] | None = None) -> dict[str, Any]:
-    """Control steps a second by number of environments, measured and reckoned.
+    """Measure control steps per second by number of environments, and extrapolate.
 
     Args:
-        steps: of the vector environment.
-        counts: how many environments; one, and as many as there are cores, unless given.
+        steps: Steps of the vector environment.
+        counts: Numbers of environments; one and the number of cores by default.
     """
     cores = len(os.sched_getaffinity(0))
     counts = counts or tuple(sorted({1, cores}))
@@ -41,14 +40,14 @@ def measure(*, steps: int = STEPS, counts: tuple[int, ...] | None = None) -> dic
     return {
         "cores": cores,
         "control_steps_per_second": {count: action_repeat * count / row["seconds"] for count, row in measured.items()},
-        "serial_ms_an_environment": 1e3 * serial,
-        "reckoned_cores": ASKED,
-        "reckoned_control_steps_per_second": action_repeat * ASKED / (alone["seconds"] + (ASKED - 1) * serial),
+        "serial_ms_per_environment": 1e3 * serial,
+        "extrapolated_cores": CORES,
+        "extrapolated_control_steps_per_second": action_repeat * CORES / (alone["seconds"] + (CORES - 1) * serial),
     }
 
 
 def _measured(count: int, steps: int) -> dict[str, float]:
-    """Seconds of a step of the vector environment, and those that its own process worked."""
+    """Return the wall-clock time of a step of the vector environment and the CPU time of its own process [s]."""
     envs = gymnasium.make_vec(
         ENVIRONMENT,
         num_envs=count,
@@ -69,10 +68,11 @@ def _measured(count: int, steps: int) -> dict[str, float]:
 
 
 def show(result: dict[str, Any]) -> None:
-    """Prints what was measured, and what follows from it."""
+    """Print the measured and the extrapolated rates."""
     for count, rate in result["control_steps_per_second"].items():
-        print(f"{count:3d} environments  {rate:7.0f} control steps a second, measured on {result['cores']} cores")
+        print(f"{count:3d} environments  {rate:7.0f} control steps per second, measured on {result['cores']} cores")
+    rate, serial = result["extrapolated_control_steps_per_second"], result["serial_ms_per_environment"]
     print(
-        f"{result['reckoned_cores']:3d} environments  {result['reckoned_control_steps_per_second']:7.0f} on as many "
-        f"cores, reckoned from one and the serial part of {result['serial_ms_an_environment']:.2f} ms an environment"
+        f"{result['extrapolated_cores']:3d} environments  {rate:7.0f} on as many cores, extrapolated from one and a "
+        f"serial part of {serial:.2f} ms per environment"
     )

@@ -1,10 +1,10 @@
-"""`guiderail bench primitive`: what one control step of an LC-NS-KMP costs, as ratios in one run on one core.
+"""Duration of a control step of an LC-NS-KMP: `python -m research.benchmarks primitive`.
 
-Every row is a closed loop (history → next point, with uniform actions in ±1 at gains calibrated by authority), in three
-regimes: constraints slack, grazed now and then, and active at almost every step. The dense step is the thesis's own:
-K + ħΣ inverted, the dual of equation 4.20 assembled over the whole window and given to its solver, PIQP (to DAQP where
-PIQP is not installed). Difference is the largest one to that step, in scales of the outputs, and nearly all of it is
-the dense step's own error: the tests compare both with extended precision, where the history's covariance is small.
+Every row is a closed loop (history → next point, uniform actions in ±1, gains calibrated by authority) in three
+regimes: constraints slack, sometimes active, and active at almost every step. The dense step is that of the thesis:
+K + ħΣ is inverted, and the dual of equation 4.20 over the whole window is given to PIQP, or to DAQP if PIQP is not
+installed. The difference is the largest one to the dense step, relative to the outputs' scales. Most of it is the error
+of the dense step: the tests compare both with extended precision.
 """
 
 import gc
@@ -18,7 +18,7 @@ from guiderail.models.primitives.gains import authority_gains
 from guiderail.models.primitives.qp import SOLVERS
 from research.benchmarks import with_progress
 
-#: O, F, H, P: planar, connector, and something larger than either.
+# O, F, H, P: planar task, connector, and a larger problem.
 SIZES = ((2, 1, 40, 10), (6, 4, 40, 10), (6, 12, 100, 20))
 REGIMES = {"slack": 1.3, "grazing": 1.0, "active": 0.5}
 DENSE_SECONDS = 5.0
@@ -30,13 +30,13 @@ _MOTION = 400
 
 @dataclass
 class _Loop:
-    """One closed loop: a primitive, its actions, and how it remembers."""
+    """Closed loop of a primitive with a sequence of actions."""
 
     primitive: LcNsKmp
     actions: np.ndarray
 
     def run(self, predict, steps: int) -> tuple[np.ndarray, int, list]:
-        """Seconds per call (steps,), how many steps were constrained, and every 50th problem with its output."""
+        """Return durations [s], (steps,), the number of constrained steps, and every 50th problem with its output."""
         p, seconds, constrained, samples = self.primitive, np.empty(steps), 0, []
         for k in range(steps):
             n = k % _MOTION
@@ -54,7 +54,7 @@ class _Loop:
 
 
 def _reference(outputs: int) -> ReferenceTrajectory:
-    """A smooth motion with correlated deviations that widen and narrow, at the scales of a connector."""
+    """Return a smooth motion with correlated deviations of varying size, at the scales of a connector."""
     rng = np.random.default_rng(0)
     t = PERIOD * np.arange(_MOTION)
     s = t / t[-1]
@@ -66,7 +66,7 @@ def _reference(outputs: int) -> ReferenceTrajectory:
 
 
 def _primitive(size: tuple[int, int, int, int], share: float, solver: str = "daqp") -> LcNsKmp:
-    """Bounds at a share of where the mean goes: F/2 outputs in a box, or one of them from above."""
+    """Return a primitive with bounds at a share of the mean's range: F/2 outputs in a box, or one upper bound."""
     outputs, rows, horizon, history = size
     reference = _reference(outputs)
     reach = share * (np.abs(reference.means) + reference.standard_deviations * (share > 1) * 3).max(axis=0)
@@ -86,22 +86,22 @@ def _primitive(size: tuple[int, int, int, int], share: float, solver: str = "daq
 
 
 def _dense_step(p: LcNsKmp, step: int, action: np.ndarray, history: np.ndarray) -> np.ndarray:
-    """Equations 4.18-4.21 as they stand (errata mended): every matrix of the window, at every step."""
+    """Evaluate equations 4.18-4.21 (errata corrected) with all matrices of the window."""
     outputs, past, rows = p.num_outputs, p.history, p.constraints.num_constraints
-    held = np.minimum(np.arange(step, step + p.horizon + 1), p.num_steps - 1)
+    window = np.minimum(np.arange(step, step + p.horizon + 1), p.num_steps - 1)
     t = p.reference.inputs(np.arange(step - past, step + p.horizon + 1))
     points = len(t)
     K = np.kron(p.kernel(t, t), np.eye(outputs))
     sigma = np.zeros_like(K)
     known = np.tile(p.history_variance * np.eye(outputs), (past, 1, 1))
-    for i, block in enumerate(np.concatenate([known, p.reference.covariances[held]])):
+    for i, block in enumerate(np.concatenate([known, p.reference.covariances[window]])):
         sigma[i * outputs : (i + 1) * outputs, i * outputs : (i + 1) * outputs] = block
-    mu = np.concatenate([history, p.reference.means[held]]).ravel()
+    mu = np.concatenate([history, p.reference.means[window]]).ravel()
     hbar = p.lambda_ + p.beta
     A = np.linalg.inv(K + hbar * sigma)
     executed = slice(past * outputs, (past + 1) * outputs)
     G_bar = np.zeros((points * outputs, (p.horizon + 1) * rows))
-    G, c = p.constraints.window(held)
+    G, c = p.constraints.window(window)
     for i, block in enumerate(G):
         at = (past + i) * outputs
         G_bar[at : at + outputs, i * rows : (i + 1) * rows] = block.T
@@ -113,7 +113,7 @@ def _dense_step(p: LcNsKmp, step: int, action: np.ndarray, history: np.ndarray) 
 
 
 def _dual(H: np.ndarray, slack: np.ndarray) -> np.ndarray:
-    """min ½αᵀHα + slackᵀα over α ≥ 0 (equation 4.20)."""
+    """Solve min ½αᵀHα + slackᵀα over α ≥ 0 (equation 4.20)."""
     size = len(slack)
     H = (H + H.T) / 2 + 1e-12 * np.eye(size)
     try:
@@ -135,7 +135,7 @@ def _microseconds(seconds: np.ndarray) -> dict[str, float]:
 
 
 def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> tuple[dict, np.ndarray]:
-    """The row of one regime, and the seconds of each of its steps."""
+    """Return the row of one regime, and the durations of its steps [s]."""
     p = _primitive(size, share)
     rng = np.random.default_rng(1)
     actions = authority_gains(p) * rng.uniform(-1, 1, (997, p.num_outputs))
@@ -166,7 +166,7 @@ def _regime(size: tuple[int, int, int, int], share: float, steps: int) -> tuple[
 
 
 def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict]:
-    """A row a regime, and one of all of them together, as a robot would meet them in a day."""
+    """Return a row for each regime and one for all of them together."""
     rows, seconds = {}, []
     for regime, share in REGIMES.items():
         rows[regime], spent = _regime(size, share, steps)
@@ -179,12 +179,12 @@ def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict]:
 
 
 def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict]:
-    """The same constrained steps through each solver: median time and worst violation of the commanded output."""
+    """Return for each solver the median duration of the same constrained steps, and the difference to DAQP."""
     first = _primitive(size, REGIMES["active"])
     actions = authority_gains(first) * np.random.default_rng(2).uniform(-1, 1, (997, first.num_outputs))
     _, _, samples = _Loop(first, actions).run(first.predict, 4 * _MOTION)
     rows = {}
-    for name in SOLVERS if size != _LARGEST else ("daqp", "piqp"):  # OSQP needs a second a step at the largest size
+    for name in SOLVERS if size != _LARGEST else ("daqp", "piqp"):  # OSQP needs a second per step at the largest size
         p = _primitive(size, REGIMES["active"], name)
         seconds, failed, difference = [], 0, 0.0
         scale = np.abs(p.reference.means).max(axis=0)
@@ -204,7 +204,7 @@ def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict]:
 
 
 def _leaf_system(size: tuple[int, int, int, int], steps: int) -> dict[str, float]:
-    """The same prediction through `LcNsKmpSystem`'s output port, at a new action each time."""
+    """Time the prediction through the output port of `LcNsKmpSystem`, with a new action each time."""
     from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
     p = _primitive(size, REGIMES["grazing"])
@@ -224,7 +224,7 @@ def _leaf_system(size: tuple[int, int, int, int], steps: int) -> dict[str, float
 
 
 def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
-    """What a fresh primitive's first prediction takes, and what factoring costs in time and memory."""
+    """Return the duration of a first prediction, and the time and memory of factoring a step."""
     p = _primitive(size, REGIMES["grazing"])
     history = np.tile(p.reference.means[0], (p.history, 1))
     begin = time.perf_counter()
@@ -237,7 +237,7 @@ def _factoring(size: tuple[int, int, int, int]) -> dict[str, float]:
 
 
 def measure(steps: int = STEPS) -> dict:
-    """Everything the benchmark reports, by size."""
+    """Run the benchmark; return the results by size."""
     report = {}
     for size in with_progress(SIZES, "primitive, O F H P"):
         name = "O{} F{} H{} P{}".format(*size)
@@ -251,7 +251,7 @@ def measure(steps: int = STEPS) -> dict:
 
 
 def show(report: dict) -> None:
-    """Prints the tables."""
+    """Print the tables."""
     from rich.console import Console
     from rich.table import Table
 
@@ -273,7 +273,7 @@ def show(report: dict) -> None:
         leaf, factoring = parts["leaf_system"], parts["factoring"]
         console.print(
             f"through the LeafSystem: median {leaf['median_us']:.0f} µs, p99 {leaf['p99_us']:.0f} µs; first prediction "
-            f"{factoring['first_ms']:.1f} ms; factoring a step costs {factoring['step_ms']:.2f} ms and "
+            f"{factoring['first_ms']:.1f} ms; factoring a step takes {factoring['step_ms']:.2f} ms and "
             f"{factoring['step_kB']:.0f} kB"
         )
         for name, row in parts["solvers"].items():

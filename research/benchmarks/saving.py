@@ -1,7 +1,7 @@
-"""What it costs that nothing of a run is lost: `guiderail bench saving`.
+"""Cost of saving a run: `python -m research.benchmarks saving`.
 
-A short run is trained, and the time for its step log and its checkpoints is given as a part of the whole: in wall clock,
-as most of it is waiting for the disk.
+A short run is trained. The wall-clock time of its step log and its checkpoints, most of which is spent waiting for the
+disk, is given as a part of the whole.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
 from research.benchmarks import with_progress
 
-TASKS = {"NarrowPassage": 10, "BncConnector": 6}  # and so many episodes
+TASKS = {"NarrowPassage": 10, "BncConnector": 6}  # number of episodes
 REQUIRED_SHARE = 0.03
 
 
 @contextmanager
 def timed(owner: Any, name: str) -> Iterator[list[float]]:
-    """While it lasts, calls of a function are timed: yields the seconds of each."""
+    """Time the calls of a function; yield the list of their durations [s]."""
     original, spent = getattr(owner, name), []
 
     def call(*arguments: Any) -> Any:
@@ -43,7 +43,7 @@ def timed(owner: Any, name: str) -> Iterator[list[float]]:
 
 
 def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
-    """Trains a run of so many episodes in a temporary folder: what saving it took, as parts of the whole."""
+    """Train a run in a temporary folder and return the shares of wall-clock time that saving took."""
     config = configure(task, {}, **with_defaults(task, {"episodes": episodes, "seed": seed}))
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -62,20 +62,15 @@ def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
 
 
 def measure() -> dict[str, Any]:
-    """All of it, as a program may read it."""
-<<<<<<< HEAD
-    results: dict[str, Any] = {task: saving_share(task, TASKS[task]) for task in told(TASKS, "saving")}
-    shares = [results[task]["step_log_share"] + results[task]["checkpoint_share"] for task in TASKS]
-=======
+    """Run the benchmark."""
     results: dict[str, Any] = {task: saving_share(task, TASKS[task]) for task in with_progress(TASKS, "saving")}
-    shares = [results[task]["ledger_share"] + results[task]["checkpoint_share"] for task in TASKS]
->>>>>>> bd4af1f (Command lines of benchmarks, action fuzzing and generators; campaigns in plain words)
+    shares = [results[task]["step_log_share"] + results[task]["checkpoint_share"] for task in TASKS]
     results["cheap_enough"] = max(shares) <= REQUIRED_SHARE
     return results
 
 
 def show(results: dict[str, Any]) -> None:
-    """Prints what was measured."""
+    """Print the results."""
     for task, episodes in TASKS.items():
         row = results[task]
         print(

@@ -1,7 +1,7 @@
-"""How fast the simulations of contact are: `guiderail bench simulation`.
+"""Speed of contact simulation: `python -m research.benchmarks simulation`.
 
-CPU time of one core, not wall clock, and the best of some runs: what else a machine does changes that less. Python's
-share is the time in callbacks of systems written in Python, with what they call.
+Best CPU time of several runs on one core, which depends least on other processes. Python's share is the time in
+callbacks of systems that are written in Python.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from guiderail.systems.support.last_valid_pose import LastValidPose
 from guiderail.systems.wrench_sensor import WrenchSensor
 from research.benchmarks import with_progress
 
-# Outermost callbacks only: one that is called within another would count twice.
+# Outermost callbacks only: nested ones would count twice.
 CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
     (PoseWrench, "_calc_wrench"),
@@ -50,12 +50,12 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (ImpedanceMonitor, "_calc_saturation"),
     (Recorder, "_record"),
 )
-# From the plug's first touch to its release, locked [s].
+# From first contact of the plug to its release in the locked state [s].
 CONTACT = (3.8, 7.6)
-# The clamp is dragged over the table into its holes and pushed until it has snapped in: times [s], and x and z [m].
+# Motion of the clamp: dragged over the table into its holes and pushed until it snaps in. Times [s], x and z [m].
 CLAMP_TIMES, CLAMP_X, CLAMP_Z = (0.0, 0.4, 2.4, 4.0), (-0.003, -0.003, 0.0, 0.0), (0.014, 0.009, 0.009, -0.005)
 CLAMP_CONTACT = (0.4, 4.0)
-# The thermos is brought beside the mug, tilted on the way, and emptied: times [s], and poses of its tip in the target.
+# Motion of the thermos: moved to the mug, tilted and emptied. Times [s], poses of its tip in the target frame.
 POUR_TIMES = (0.0, 1.0, 2.0, 4.5, 5.0, 7.6)
 POUR_POSES = (
     (-0.063, -0.292, 0.169, -0.213, 0.0, 0.0),
@@ -65,21 +65,21 @@ POUR_POSES = (
     (0.013, -0.036, 0.072, 0.349, 0.0, -1.182),
     (0.013, -0.036, 0.075, 0.349, 0.0, -1.804),
 )
-POUR_CONTACT = (2.0, 7.6)  # the balls roll, and fall
-# What is driven along what, and how many times real time it is to be.
+POUR_CONTACT = (2.0, 7.6)  # the balls roll and fall
+# Task of each simulation and its required real-time factor.
 REQUIRED_FACTOR = {
     "gantry": ("BncConnector", 10.0),
     "arm": ("BncConnector", 6.0),
     "grid_clamp": ("GridClamp", 10.0),
     "pouring": ("Pouring", 10.0),
 }
-REQUIRED_SECONDS = 1.0
+REQUIRED_SECONDS = 1.0  # largest CPU time of 400 control steps of the environment [s]
 REPEATS = 3
 
 
 @contextmanager
 def timed_callbacks() -> Iterator[Callable[[], float]]:
-    """While it lasts, systems that are built count the seconds in their own callbacks; yields what reads the count."""
+    """Time the callbacks of systems built in the context; yield a function that returns the sum [s]."""
     spent = [0.0]
     depth = [0]
 
@@ -107,15 +107,15 @@ def timed_callbacks() -> Iterator[Callable[[], float]]:
 
 
 def real_time_factor(name: str) -> dict[str, float]:
-    """The best of `REPEATS` runs, which is the least disturbed one, of one of `REQUIRED_FACTOR`."""
+    """Return the best of `REPEATS` runs of one of `REQUIRED_FACTOR`."""
     return max((_one_run(name) for _ in range(REPEATS)), key=lambda run: run["real_time_factor"])
 
 
 def _one_run(name: str) -> dict[str, float]:
-    """Simulated seconds per second of CPU time while there is contact."""
-    world, times, poses, contact = scripted_motion(REQUIRED_FACTOR[name][0])
+    """Measure simulated time per CPU time while there is contact."""
+    workcell, times, poses, contact = scripted_motion(REQUIRED_FACTOR[name][0])
     with timed_callbacks() as spent:
-        station = STATIONS.get(name if name in STATIONS.names() else "gantry").build(world)
+        station = STATIONS.get(name if name in STATIONS.names() else "gantry").build(workcell)
         driven = DrivenStation(station, along(times, poses), num_samples=NUM_STEPS)
         driven.start(poses[0])
         first, last = (round(t / CONTROL_PERIOD) for t in contact)
@@ -129,7 +129,7 @@ def _one_run(name: str) -> dict[str, float]:
 
 
 def scripted_motion(task: str) -> tuple[Any, np.ndarray, np.ndarray, tuple[float, float]]:
-    """The world of a task's stations, what is commanded at which times, and from when to when there is contact."""
+    """Return the workcell of a task, times [s] and commanded poses, and the interval of contact [s]."""
     if task == "BncConnector":
         return BncWorkcell(), *insert_and_lock(), CONTACT
     if task == "Pouring":
@@ -140,7 +140,7 @@ def scripted_motion(task: str) -> tuple[Any, np.ndarray, np.ndarray, tuple[float
 
 
 def env_seconds(guidance: str = "kgrl") -> float:
-    """CPU seconds of 400 control steps of the environment on rails with random actions; the best of some episodes."""
+    """Return the best CPU time of 400 control steps on the gantry with random actions [s]."""
     env = make_env("BncConnector", guidance=guidance, fixture_offset="per_episode", action_repeat=5)
     rng = np.random.default_rng(0)
     best = np.inf
@@ -156,7 +156,7 @@ def env_seconds(guidance: str = "kgrl") -> float:
 
 
 def measure() -> dict[str, Any]:
-    """All of it, as a program may read it."""
+    """Run the benchmark."""
     measurements: dict[str, Callable[[], Any]] = {name: partial(real_time_factor, name) for name in REQUIRED_FACTOR}
     measurements["env_seconds_per_400_steps"] = env_seconds
     results: dict[str, Any] = {name: measurements[name]() for name in with_progress(measurements, "simulation")}
@@ -168,7 +168,7 @@ def measure() -> dict[str, Any]:
 
 
 def show(results: dict[str, Any]) -> None:
-    """Prints what was measured."""
+    """Print the results."""
     for name, (_, factor) in REQUIRED_FACTOR.items():
         row = results[name]
         print(

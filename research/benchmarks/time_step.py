@@ -1,9 +1,8 @@
-"""By how much a plant's time step is wrong, and what it costs: `guiderail bench time_step`.
+"""Error and duration of a plant's time step: `python -m research.benchmarks time_step`.
 
-Scripted motions are simulated on rails with coarser and coarser time steps and compared with the finest: a connector
-that locks, one that starts 1.2 mm beside the jack, sits on its rim and slips off, and a clamp that is dragged into its
-holes. The plants are of first order in time: errors are proportional to the time step, except where something slips
-and hits, whose peak force a coarse time step overstates.
+Scripted motions on the gantry are compared with the finest time step: a connector that locks, one that starts 1.2 mm
+off the jack's axis and slips off its rim, and a clamp that is dragged into its holes. Plants are of first order:
+errors are proportional to the time step, except that a coarse step overstates the peak force of an impact.
 """
 
 from __future__ import annotations
@@ -24,17 +23,17 @@ from guiderail.tools.visualization.style import new_figure, save_figure
 from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 
-HALVINGS = (0, 1, 2, 3, 4)  # of the control period; the last is what the others are compared with
+HALVINGS = (0, 1, 2, 3, 4)  # halvings of the control period; the last is the reference
 MOTIONS = {
-    "connector, known": ("BncConnector", (0.0, 0.0, 0.0)),
+    "connector, no offset": ("BncConnector", (0.0, 0.0, 0.0)),
     "connector, slips off the rim": ("BncConnector", (0.8 * MM, -0.9 * MM, 0.0)),
     "clamp": ("GridClamp", (0.0, 0.0, 0.0)),
 }
-"""Of each motion its task, and where the jack is instead of where it should be [m]."""
+"""Task and jack offset [m] of each motion."""
 
 
 def simulate(motion: str, time_step: float) -> tuple[dict[str, np.ndarray], float]:
-    """The recorded signals of a motion with that time step [s], and the CPU seconds that it took."""
+    """Simulate a motion with a time step [s]; return the recorded signals and the CPU time [s]."""
     task, offset = MOTIONS[motion]
     workcell, times, poses, _ = scripted_motion(task)
     station = GantryStation(workcell, time_step=time_step)
@@ -48,7 +47,7 @@ def simulate(motion: str, time_step: float) -> tuple[dict[str, np.ndarray], floa
 
 
 def measure() -> dict[str, Any]:
-    """All of it, as a program may read it: rows of each motion and time step, the finest first."""
+    """Run the benchmark; return rows of each motion and time step, the finest first."""
     rows = []
     for motion in with_progress(MOTIONS, "time step"):
         finest: dict[str, np.ndarray] = {}
@@ -57,18 +56,18 @@ def measure() -> dict[str, Any]:
             signals, seconds = simulate(motion, time_step)
             finest = finest or signals
             rows.append({"motion": motion, "time_step": time_step, "seconds": seconds, **_errors(signals, finest)})
-    return {"rows": rows, "chosen": PLANT_PERIOD}
+    return {"rows": rows, "default": PLANT_PERIOD}
 
 
 def _errors(signals: dict[str, np.ndarray], finest: dict[str, np.ndarray]) -> dict[str, float]:
-    apart = {name: signals[name] - finest[name] for name in ("pose", "wrench")}
+    difference = {name: signals[name] - finest[name] for name in ("pose", "wrench")}
     return {
-        "position_rms": _rms(apart["pose"][:, :3]),
-        "angle_rms": _rms(apart["pose"][:, 3:]),
-        "force_rms": _rms(apart["wrench"][:, :3]),
-        "torque_rms": _rms(apart["wrench"][:, 3:]),
+        "position_rms": _rms(difference["pose"][:, :3]),
+        "angle_rms": _rms(difference["pose"][:, 3:]),
+        "force_rms": _rms(difference["wrench"][:, :3]),
+        "torque_rms": _rms(difference["wrench"][:, 3:]),
         "peak_contact_force": float(signals["contact_force"].max()),
-        "end_apart": float(np.linalg.norm(apart["pose"][-1, :3])),
+        "end_distance": float(np.linalg.norm(difference["pose"][-1, :3])),
     }
 
 
@@ -77,7 +76,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def show(results: dict[str, Any]) -> None:
-    """Prints what was measured."""
+    """Print the results."""
     print("time step  CPU    position  angle    force   torque    peak    end")
     motion = None
     for row in results["rows"]:
@@ -87,25 +86,25 @@ def show(results: dict[str, Any]) -> None:
         print(
             f"{1e3 * row['time_step']:6.2f} ms  {row['seconds']:4.2f} s {1e3 * row['position_rms']:6.3f} mm "
             f"{np.rad2deg(row['angle_rms']):5.2f}°  {row['force_rms']:5.2f} N {1e3 * row['torque_rms']:5.1f} mNm "
-            f"{row['peak_contact_force']:5.1f} N {1e3 * row['end_apart']:5.3f} mm"
+            f"{row['peak_contact_force']:5.1f} N {1e3 * row['end_distance']:5.3f} mm"
         )
-    print(f"errors are RMS against the finest; a station takes {1e3 * results['chosen']:.0f} ms unless told otherwise")
+    print(f"errors are RMS against the finest; the default is {1e3 * results['default']:.0f} ms")
 
 
 def draw(results: dict[str, Any], path: Path) -> Path:
-    """Error and peak force against CPU time, one curve a motion, one dot a time step; the chosen one is filled."""
+    """Draw error and peak force over CPU time: a curve per motion, a dot per time step; the default one is filled."""
     figure, axes = new_figure(1, 2, (10.0, 4.0))
-    shown = (("force_rms", "force, RMS error [N]"), ("peak_contact_force", "peak contact force [N]"))
-    for axis, (column, label) in zip(axes.flat, shown, strict=True):
+    columns = (("force_rms", "force, RMS error [N]"), ("peak_contact_force", "peak contact force [N]"))
+    for axis, (column, label) in zip(axes.flat, columns, strict=True):
         for motion in MOTIONS:
             rows = [row for row in results["rows"] if row["motion"] == motion]
             (line,) = axis.plot(
                 [row["seconds"] for row in rows], [row[column] for row in rows], "o-", mfc="white", label=motion
             )
             for row in rows:
-                place, beside = (row["seconds"], row[column]), {"xytext": (3, 5), "textcoords": "offset points"}
-                axis.annotate(f"{1e3 * row['time_step']:g} ms", place, fontsize=7, **beside)
-                if row["time_step"] == results["chosen"]:
+                point, offset = (row["seconds"], row[column]), {"xytext": (3, 5), "textcoords": "offset points"}
+                axis.annotate(f"{1e3 * row['time_step']:g} ms", point, fontsize=7, **offset)
+                if row["time_step"] == results["default"]:
                     axis.plot(row["seconds"], row[column], "o", color=line.get_color())
         axis.set(xlabel="CPU time of the motion [s]", ylabel=label, xscale="log", xticks=[0.5, 1.0, 2.0, 5.0])
         axis.minorticks_off()

@@ -1,9 +1,8 @@
-"""Where the wall clock of a training run goes: `guiderail bench training TASK --env station=arm`.
+"""Profile of a training run: `python -m research.benchmarks training TASK --env station=arm`.
 
-One short run as `guiderail train` makes it, whose learner begins early. Time counts for the innermost part that is
-measured: a callback of a system does not count for the simulation that called it, nor what Drake computes because a
-port is read for who reads it. What Drake computes by itself (contact, the solver, kinematics) is one part, as nothing
-in Python sees inside of it.
+One short run as of `guiderail train`, whose learner starts early. Wall-clock time counts for the innermost measured
+part: time in a system's callback does not count for the simulation, nor time that Drake needs to evaluate a port for
+its reader. Drake's own computations (contact, solver, kinematics) are one part.
 """
 
 from __future__ import annotations
@@ -33,9 +32,9 @@ from guiderail.tools.learning.train import configure, with_defaults
 
 TASK = "BncConnector"
 EPISODES = 6
-LEARNING_STARTS = 40  # decisions, so that most of the run learns
+LEARNING_STARTS = 40  # transitions before the first gradient step
 
-# Parts by what is called; a function of a module is found there by whoever calls it.
+# Owner and name of each measured function, and its part.
 PARTS: tuple[tuple[Any, str, str], ...] = (
     (train, "make_environment", "building the environment"),
     (train, "rollout", "rollout"),
@@ -47,7 +46,7 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (OutputPort, "Eval", "Drake, as a port is read"),
     (off_policy.OffPolicyLearner, "__init__", "building the learner"),
     (off_policy.OffPolicyLearner, "act", "acting"),
-    (off_policy.OffPolicyLearner, "remember", "remembering"),
+    (off_policy.OffPolicyLearner, "remember", "replay buffer"),
     (off_policy.OffPolicyLearner, "learn", "gradient step"),
     (off_policy.NStepReplayBuffer, "sample", "replay"),
     (ensemble.Ensemble, "train", "gradient step"),
@@ -61,12 +60,12 @@ REST = "everything else"
 CALLBACK = "Python: "
 
 
-class Clock:
-    """Adds up wall-clock seconds by part, each instant for the innermost part that has begun.
+class Profiler:
+    """Wall-clock time by part, each instant for the innermost part.
 
     Attributes:
-        seconds: by part.
-        calls: by part, where it began within another.
+        seconds: Duration of each part [s].
+        calls: Number of calls of each part from another part.
     """
 
     def __init__(self) -> None:
@@ -76,7 +75,7 @@ class Clock:
         self._last = time.perf_counter()
 
     def timed(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        """The function, whose time counts for that part."""
+        """Return the function with its time counted for a part."""
         self.seconds.setdefault(part, 0.0)
         self.calls.setdefault(part, 0)
         inside, seconds, calls = self._inside, self.seconds, self.calls
@@ -98,30 +97,30 @@ class Clock:
         return call
 
     def stop(self) -> None:
-        """Counts the time until now."""
+        """Count the time until now."""
         now = time.perf_counter()
         self.seconds[self._inside[-1]] += now - self._last
         self._last = now
 
 
 @contextmanager
-def timed_parts() -> Iterator[Clock]:
-    """While it lasts, what is called and what is built counts its seconds."""
-    clock = Clock()
+def timed_parts() -> Iterator[Profiler]:
+    """Profile all calls in the context."""
+    profiler = Profiler()
     parts = [*PARTS, *((system, name, CALLBACK + system.__name__) for system, name in _callbacks())]
     originals = [(owner, name, inspect.getattr_static(owner, name)) for owner, name, _ in parts]
     for owner, name, part in parts:
-        setattr(owner, name, clock.timed(getattr(owner, name), part))
+        setattr(owner, name, profiler.timed(getattr(owner, name), part))
     try:
-        yield clock
+        yield profiler
     finally:
-        clock.stop()
+        profiler.stop()
         for owner, name, original in originals:
             setattr(owner, name, original)
 
 
 def _callbacks() -> Iterator[tuple[type, str]]:
-    """The private methods of every system, and of what several are made of: Drake calls nothing else."""
+    """Yield the methods of every system and of its support classes, which are all that Drake calls."""
     for found in pkgutil.walk_packages(guiderail.systems.__path__, "guiderail.systems."):
         module = import_module(found.name)
         for kind in vars(module).values():
@@ -134,24 +133,24 @@ def _callbacks() -> Iterator[tuple[type, str]]:
 def measure(
     task: str | None = None, environment: Mapping[str, Any] | None = None, episodes: int = EPISODES
 ) -> dict[str, Any]:
-    """The parts of one run with their seconds, the largest first, and what the run did.
+    """Profile one run; return its parts, the largest first.
 
     Args:
-        task: what is learned.
-        environment: its options.
-        episodes: how many.
+        task: Name of the task.
+        environment: Its options.
+        episodes: Number of training episodes.
     """
     task = task or TASK
-    how = with_defaults(task, {"settings": {"learning_starts": LEARNING_STARTS}})
-    config = configure(task, environment or {}, episodes=episodes, **how)
-    with tempfile.TemporaryDirectory() as folder, timed_parts() as clock:
+    settings = with_defaults(task, {"settings": {"learning_starts": LEARNING_STARTS}})
+    config = configure(task, environment or {}, episodes=episodes, **settings)
+    with tempfile.TemporaryDirectory() as folder, timed_parts() as profiler:
         start = time.perf_counter()
         rows = train.train(RunFolder(Path(folder) / "run"), config)
         wall = time.perf_counter() - start
     steps = sum(row["steps"] for row in rows)
     parts = [
-        {"part": part, "seconds": seconds, "share": seconds / wall, "calls": clock.calls[part]}
-        for part, seconds in sorted(clock.seconds.items(), key=lambda item: -item[1])
+        {"part": part, "seconds": seconds, "share": seconds / wall, "calls": profiler.calls[part]}
+        for part, seconds in sorted(profiler.seconds.items(), key=lambda item: -item[1])
         if seconds > 0.0
     ]
     return {
@@ -160,7 +159,7 @@ def measure(
         "episodes": episodes,
         "wall_s": wall,
         "control_steps": steps,
-        "python_share_of_simulation": _python_share(clock.seconds),
+        "python_share_of_simulation": _python_share(profiler.seconds),
         "parts": parts,
     }
 
@@ -171,7 +170,7 @@ def _python_share(seconds: Mapping[str, float]) -> float:
 
 
 def show(result: dict[str, Any]) -> None:
-    """Prints the table."""
+    """Print the table."""
     from rich.console import Console
     from rich.table import Table
 

@@ -22,7 +22,7 @@ from guiderail.tools.cli.catalog import describe_task_options
 from guiderail.tools.datasets.validate import validate_template
 from guiderail.tools.environments import import_modules
 from guiderail.tools.evaluation.evaluate import _counts_collisions, evaluation_scope
-from research.action_fuzzing.campaign import stress
+from research.action_fuzzing.campaign import fuzz
 
 NUM_STEPS = 10
 
@@ -264,8 +264,8 @@ def test_collisions_are_counted_only_where_a_task_says_what_they_are():
 
 def test_a_task_of_ones_own_is_stressed_through_every_guidance_that_it_has():
     declare()
-    found = stress("lab/Own", episodes=3)
-    assert found["wrong"] == []
+    found = fuzz("lab/Own", episodes=3)
+    assert found["failures"] == []
     assert found["cases"].keys() <= {"kgrl", "kmp", "residual", "skgrl"}
     assert found["all"]["episodes"] == 3
 

@@ -6,7 +6,7 @@ where the connector leaves no choice, and takes its time differently each time. 
 connector answers through the impedance. Both the commanded and the measured pose are kept. Under impedance control a
 primitive learns the commanded one: the push lives in the difference.
 
-`guiderail generate connector-demonstrations` records them again.
+`python -m research.generate connector-demonstrations` records them again.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 
 
 FRICTION = 0.2  # of metal on metal
 # Without it a step of 10 ms leaps as far into metal as the plug moves in it, and the next one throws the plug out. With
-# it, what slides fast is held back by more than friction (`guiderail bench engines`), the more the longer the step.
+# it, what slides fast is held back by more than friction (`python -m research.benchmarks engines`), the more the longer the step.
 MARGIN = 0.1 * MM
 # As stiff as brass. A softer barrel spreads a rim's load evenly, and a plug that stands beside the jack feels a torque
 # that no metal has (docs/experiments.md, "Where a plug on the rim feels its force").

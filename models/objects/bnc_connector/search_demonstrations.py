@@ -5,7 +5,7 @@ should be, each of the five times begun a fifth of a turn further, until it come
 the search the five lie evenly on a circle. Their mean is its centre, and their covariance is the same in every
 direction and at every moment until the plug drops in: what a policy may do is worth the same all the while.
 
-`guiderail generate connector-search-demonstrations` records them again.
+`python -m research.generate connector-search-demonstrations` records them again.
 """
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+"""Interference of the connector's rigid geometry."""
+
 import numpy as np
 import pytest
 from pydrake.math import RotationMatrix
@@ -10,12 +12,12 @@ D = BncDimensions()
 
 
 def depth(lug_angle, lug_depth, x=0.0, y=0.0):
-    """Interference [mm] of an upright plug with the lug `lug_angle` degrees along its slot, `lug_depth` mm deep."""
+    """Return the interference [mm] of an upright plug with a lug at an angle [degrees] and a depth [mm] in its slot."""
     R_JP = RotationMatrix.MakeZRotation(-np.deg2rad(lug_angle)).matrix()
     return max(interference(D, R_JP, np.array([x * MM, y * MM, D.lug_height - lug_depth * MM]))) / MM
 
 
-def test_nothing_is_in_the_way_of_the_lugs_own_path():
+def test_lug_path_is_free():
     for arc, lug_depth in slot_path(D):
         for turned in (0.0, 180.0):  # the two lugs are alike
             angle = np.rad2deg(arc / D.slot_radius) + turned
@@ -23,13 +25,13 @@ def test_nothing_is_in_the_way_of_the_lugs_own_path():
 
 
 @pytest.mark.parametrize("lug_angle", [30.0, 60.0, 120.0, 150.0])
-def test_the_mouths_face_stops_the_lugs_elsewhere(lug_angle):
+def test_mouth_face_stops_lugs_outside_the_slot(lug_angle):
     radius = D.lug_radius / MM
     assert depth(lug_angle, -radius - 0.01) == 0.0
     assert depth(lug_angle, -radius + 0.4) == pytest.approx(0.4)
 
 
-def test_the_slots_walls_stop_the_lugs():
+def test_slot_walls_stop_lugs():
     clearance = D.slot_clearance / MM
     # Deeper than the entry's bottom, short of the ramp, past the detent, and turned while in the straight entry.
     assert depth(0.0, 4.4) == pytest.approx(1.0 - clearance, abs=0.1)
@@ -38,7 +40,7 @@ def test_the_slots_walls_stop_the_lugs():
     assert depth(20.0, 1.5) > 1.0
 
 
-def test_lugs_and_barrel_are_told_apart():
+def test_lugs_and_barrel_have_separate_depths():
     upright = np.eye(3)
     lugs, barrel = interference(D, upright, np.array([0.0, 0.0, D.lug_height - 4.4 * MM]))
     assert lugs > 0.8 * MM
@@ -48,11 +50,11 @@ def test_lugs_and_barrel_are_told_apart():
     assert barrel == pytest.approx(0.2 * MM)
 
 
-def test_the_bore_stops_the_barrel():
+def test_bore_stops_the_barrel():
     deep = 3.0
     assert depth(0.0, deep, x=0.09) == 0.0
     assert depth(0.0, deep, x=1.1) == pytest.approx(1.0)
-    # On the rim the plug may be anywhere, and beside the jack too.
+    # The plug is free above the rim, and next to the jack.
     on_rim = (D.lug_height - D.barrel_height) / MM
     assert depth(0.0, on_rim, x=3.0) == 0.0
     assert depth(0.0, on_rim + 0.2, x=3.0) == pytest.approx(0.2)

@@ -1,3 +1,5 @@
+"""Campaigns of action fuzzing."""
+
 from types import SimpleNamespace
 
 import gymnasium
@@ -12,28 +14,37 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, rollout
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.tables import read_table
-from research.action_fuzzing import STRESSED, bnc_connector, narrow_passage
+from research.action_fuzzing import CAMPAIGNS, bnc_connector, narrow_passage
 from research.action_fuzzing import campaign as campaign_module
-from research.action_fuzzing.campaign import ACTIONS, Campaign, Case, Finite, complaints, outcome, run_campaign, stress
+from research.action_fuzzing.campaign import (
+    ACTIONS,
+    Campaign,
+    Case,
+    NonFiniteCounter,
+    find_failures,
+    fuzz,
+    outcome,
+    run_campaign,
+)
 from research.action_fuzzing.pouring import EarlyTilt
 from research.action_fuzzing.recompute import RecomputedViolation
 
 
-class Counter(Callback):
+class TransitionCounter(Callback):
     def __init__(self, env):
-        self.decisions = 0
+        self.transitions = 0
 
     def on_episode_start(self):
-        self.decisions = 0
+        self.transitions = 0
 
-    def on_step(self, decision):
-        self.decisions += 1
+    def on_step(self, transition):
+        self.transitions += 1
 
     def on_episode_end(self, row):
-        return {"decisions": self.decisions}
+        return {"transitions": self.transitions}
 
 
-BEAD = Campaign("Bead", [Case("bead", {}, constrained=True)], {}, witness=Counter)
+BEAD = Campaign("Bead", [Case("bead", {}, constrained=True)], {}, make_callback=TransitionCounter)
 
 
 def at_least(count):
@@ -41,7 +52,7 @@ def at_least(count):
 
 
 @pytest.mark.parametrize("name", ACTIONS)
-def test_actions_are_within_limits_and_follow_from_the_seed(name):
+def test_actions_are_within_limits_and_deterministic(name):
     observation = np.zeros(3)
     first, second = (
         np.array([act(observation) for _ in range(50)])
@@ -58,7 +69,7 @@ def test_actions_are_within_limits_and_follow_from_the_seed(name):
     }[name]
 
 
-def test_a_campaign_goes_on_where_it_was_stopped(tmp_path):
+def test_campaign_is_resumed_from_its_table(tmp_path):
     whole = run_campaign(BEAD, at_least(6), seed=3, out=tmp_path / "whole.csv")
     table = tmp_path / "parts.csv"
     run_campaign(BEAD, at_least(2), seed=3, out=table)
@@ -74,14 +85,14 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path):
     run_campaign(BEAD, at_least(7), seed=3, out=table, environment={"wall": 1.0})  # as it is anyway
 
 
-def test_a_witness_sees_every_decision_and_a_case_takes_further_options():
+def test_callback_receives_every_transition():
     for action_repeat in (1, 2):
         row = run_campaign(BEAD, at_least(1), environment={"action_repeat": action_repeat})[0]
-        assert row["decisions"] == -(-row["steps"] // action_repeat)
+        assert row["transitions"] == -(-row["steps"] // action_repeat)
 
 
-def _tilted_at(*steps, state=0):
-    """An episode of twenty control steps, two decisions of pouring, in which the command leans over in some."""
+def _tilted_env(*steps, state=0):
+    """Return an environment after twenty control steps, in some of which the command is tilted."""
     trace = EpisodeTrace(20, 6, 0.01, {"state": 1})
     for step in range(20):
         pose = transform_to_pose(RigidTransform(RollPitchYaw(0.3 * (step in steps), 0.0, 0.5), [0.1, 0.0, 0.2]))
@@ -91,33 +102,33 @@ def _tilted_at(*steps, state=0):
 
 @pytest.mark.parametrize(
     ("env", "tilt"),
-    [(_tilted_at(), 0.0), (_tilted_at(3), 0.3), (_tilted_at(9), 0.3), (_tilted_at(3, state=1), 0.0)],
+    [(_tilted_env(), 0.0), (_tilted_env(3), 0.3), (_tilted_env(9), 0.3), (_tilted_env(3, state=1), 0.0)],
 )
-def test_a_tilt_that_comes_too_early_is_seen_at_every_control_step(env, tilt):
-    witness = EarlyTilt(env)
-    witness.on_episode_start()
-    assert witness.on_episode_end({})["early_tilt"] == pytest.approx(tilt, abs=1e-9)
+def test_early_tilt_covers_every_control_step(env, tilt):
+    callback = EarlyTilt(env)
+    callback.on_episode_start()
+    assert callback.on_episode_end({})["early_tilt"] == pytest.approx(tilt, abs=1e-9)
 
 
-def test_numbers_that_are_none_are_counted():
+def test_nan_observations_are_counted():
     class Broken(gymnasium.Wrapper):
         def step(self, action):
             observation, *rest = super().step(action)
             return np.full_like(observation, np.nan), *rest
 
     env = make_environment("Bead", {})
-    for made, count in ((env, 0), (Broken(env), 3)):
-        row = rollout(made, lambda observation: np.zeros(2), Finite(made), seed=0)
+    for tested, count in ((env, 0), (Broken(env), 3)):
+        row = rollout(tested, lambda observation: np.zeros(2), NonFiniteCounter(tested), seed=0)
         assert row["not_finite"] == count * row["steps"]
 
 
-MISLED = "what was said of a command is not what it was"
-SOUND = {
+DISAGREES = "reported and recomputed violations differ"
+EPISODE = {
     "case": "one",
     "actions": "uniform_random",
     "seed": 0,
     "constrained": 1,
-    "waits": 0,
+    "may_wait": 0,
     "termination": "success",
     "steps": 3,
     "not_finite": 0,
@@ -135,78 +146,78 @@ SOUND = {
     [
         ({}, []),
         ({"termination": "simulation_failure"}, ["the simulation failed"]),
-        ({"not_finite": 2}, ["something was not finite"]),
+        ({"not_finite": 2}, ["a number was NaN or infinite"]),
         ({"fallback_steps": 1}, ["a prediction failed"]),
-        ({"fallback_steps": 1, "waits": 1}, []),
+        ({"fallback_steps": 1, "may_wait": 1}, []),
         ({"max_commanded_violation": 1e-6, "recomputed_violation": 1e-6}, ["a command violated the constraints"]),
-        ({"recomputed_violation": 1e-6}, ["a command violated the constraints", MISLED]),
-        ({"max_commanded_violation": float("nan")}, ["a command violated the constraints", MISLED]),
-        ({"recomputed_violation": -0.2}, [MISLED]),
+        ({"recomputed_violation": 1e-6}, ["a command violated the constraints", DISAGREES]),
+        ({"max_commanded_violation": float("nan")}, ["a command violated the constraints", DISAGREES]),
+        ({"recomputed_violation": -0.2}, [DISAGREES]),
         ({"max_commanded_violation": 1e-6, "constrained": 0}, []),
         ({"depth": 0.3}, ["depth beyond 0.2"]),
     ],
 )
-def test_what_must_not_be_is_complained_about(wrong, words):
-    assert complaints(outcome([SOUND, SOUND | wrong]), {"depth": 0.2}) == words
+def test_find_failures_has_a_sentence_per_failed_check(wrong, words):
+    assert find_failures(outcome([EPISODE, EPISODE | wrong]), {"depth": 0.2}) == words
 
 
-def test_the_connector_withstands_white_actions():
+def test_connector_passes_with_uniform_actions():
     campaign = bnc_connector.campaign()
-    (case,) = (case for case in campaign.cases if case.name == "skgrl, disc, x, y")
-    one = Campaign(campaign.task, [case], campaign.limits, witness=campaign.witness)
+    (case,) = (case for case in campaign.cases if case.name == "skgrl, per_episode, x, y")
+    one = Campaign(campaign.task, [case], campaign.limits, make_callback=campaign.make_callback)
     (row,) = run_campaign(one, at_least(1))
-    assert complaints(outcome([row]), campaign.limits) == []
-    # They did touch: the surfaces gave way a little.
+    assert find_failures(outcome([row]), campaign.limits) == []
+    # There was contact: the surfaces are compliant.
     assert max(row["lug_impact_mm"], row["barrel_impact_mm"]) > 0.05
     assert row["peak_force"] > 5.0
 
 
-def test_the_narrow_passage_withstands_actions_that_turn_and_actions_that_do_not():
-    found = stress("NarrowPassage", episodes=8, seed=5)
-    assert found["wrong"] == []
-    assert found["all"]["episodes"] == 8
-    assert set(found["cases"]) == {case.name for case in narrow_passage.campaign().cases}
+def test_narrow_passage_passes_with_every_kind_of_action():
+    result = fuzz("NarrowPassage", episodes=8, seed=5)
+    assert result["failures"] == []
+    assert result["all"]["episodes"] == 8
+    assert set(result["cases"]) == {case.name for case in narrow_passage.campaign().cases}
 
 
-@pytest.mark.parametrize("lie", [0.0, 1e-8])
-def test_a_violation_is_recomputed_from_what_was_commanded(lie):
-    """Commands that are beside what the environment says of them are seen."""
-    (case,) = (case for case in narrow_passage.campaign().cases if case.name == "skgrl, hold 5")
+@pytest.mark.parametrize("error", [0.0, 1e-8])
+def test_violation_is_recomputed_from_the_commands(error):
+    """A command that differs from the one that the environment reports is detected."""
+    (case,) = (case for case in narrow_passage.campaign().cases if case.name == "skgrl, action repeat 5")
     env = make_environment("NarrowPassage", case.environment)
     base, recorded = env.unwrapped, env.unwrapped.trace.append
-    base.trace.append = lambda commanded, *rest: recorded(commanded + [lie, 0.0], *rest)
+    base.trace.append = lambda commanded, *rest: recorded(commanded + [error, 0.0], *rest)
     row = rollout(env, lambda observation: np.ones(2), RecomputedViolation(env), seed=0)
-    assert row["max_commanded_violation"] > -1e-9, "it never came to the zone's edge"
-    assert row["recomputed_violation"] == pytest.approx(row["max_commanded_violation"] + lie, abs=1e-15)
+    assert row["max_commanded_violation"] > -1e-9, "the robot never reached the edge of the zone"
+    assert row["recomputed_violation"] == pytest.approx(row["max_commanded_violation"] + error, abs=1e-15)
 
 
-def test_all_tasks_are_stressed_in_one_folder_and_go_on_there(tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign_module, "STRESSED", {"NarrowPassage": "narrow_passage", "GridClamp": "grid_clamp"})
-    found = stress("all", steps=20, seed=5, out=tmp_path)
-    assert found["wrong"] == []
-    assert found["max_commanded_violation"] <= 1e-9
-    assert found["control_steps"] == sum(
+def test_fuzzing_all_tasks_is_resumed_from_its_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign_module, "CAMPAIGNS", {"NarrowPassage": "narrow_passage", "GridClamp": "grid_clamp"})
+    result = fuzz("all", steps=20, seed=5, out=tmp_path)
+    assert result["failures"] == []
+    assert result["max_commanded_violation"] <= 1e-9
+    assert result["control_steps"] == sum(
         len(read_step_log(tmp_path / "steps" / task)) for task in ("NarrowPassage", "GridClamp")
     )
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.csv")}
-    assert stress("all", steps=20, seed=5, out=tmp_path) == found
+    assert fuzz("all", steps=20, seed=5, out=tmp_path) == result
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*.csv")}
     with pytest.raises(InputError, match="give --steps"):
-        stress("all", episodes=3)
+        fuzz("all", episodes=3)
 
 
-def test_pouring_withstands_somebody_with_shaking_hands():
-    found = stress("Pouring", episodes=1)
-    assert found["wrong"] == []
-    assert 0.0 <= found["all"]["early_tilt"] <= 1e-9
+def test_pouring_passes_with_shaking_inputs():
+    result = fuzz("Pouring", episodes=1)
+    assert result["failures"] == []
+    assert 0.0 <= result["all"]["early_tilt"] <= 1e-9
 
 
 @pytest.mark.parametrize("wrong", [{"episodes": 0}, {"steps": 0}, {"seed": -1}])
-def test_nonsense_is_refused(wrong):
+def test_fuzz_refuses_numbers_out_of_range(wrong):
     with pytest.raises(InputError):
-        stress("NarrowPassage", **wrong)
+        fuzz("NarrowPassage", **wrong)
 
 
-def test_a_task_without_a_campaign_is_told_those_that_have_one():
-    with pytest.raises(InputError, match=", ".join(sorted(STRESSED))):
-        stress("Bead")
+def test_fuzz_names_the_tasks_when_the_task_is_unknown():
+    with pytest.raises(InputError, match=", ".join(sorted(CAMPAIGNS))):
+        fuzz("Bead")

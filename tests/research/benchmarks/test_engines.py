@@ -1,3 +1,5 @@
+"""The benchmark of physics engines."""
+
 import numpy as np
 import pytest
 
@@ -9,25 +11,25 @@ from research.benchmarks.engines import OFFSETS, draw, even_lever, rigid_lever
 D = BncDimensions()
 
 
-def test_two_points_are_nearer_to_the_axis_than_the_area_between_them():
+def test_rigid_lever_is_shorter_than_even_lever():
     for offset in np.array(OFFSETS) * MM:
         assert 0.0 < rigid_lever(D, offset) < even_lever(D, offset) < D.ring_radius
 
 
-def test_the_rims_lever_is_that_of_an_even_pressure_on_what_is_soft_and_falls_as_it_hardens():
+def test_lever_is_even_when_soft_and_shorter_when_hard():
     soft, nominal = (engines._lever("gantry", 2.0 * MM, modulus) for modulus in (0.01, 1.0))
     assert soft == pytest.approx(even_lever(D, 2.0 * MM), rel=0.1)
     assert rigid_lever(D, 2.0 * MM) < nominal < 0.8 * soft
 
 
-def test_as_hard_as_it_is_the_rim_bears_a_plug_nearly_where_the_other_engine_says():
+def test_lever_is_similar_in_mujoco():
     pytest.importorskip("mujoco")
     ours, theirs = (engines._lever(station, 2.0 * MM, 1.0) for station in ("gantry", "mujoco"))
     assert rigid_lever(D, 2.0 * MM) < theirs < ours == pytest.approx(theirs, rel=0.4)
 
 
-def test_a_plug_drops_in_from_about_as_far_beside_as_it_is_drawn():
-    """Drake's surfaces let it in from up to half as far again, at the plant's step: nothing may make that worse."""
+def test_capture_offset_is_close_to_the_geometry():
+    """At the plant's step, the capture offset in Drake is up to 1.5 times that of the geometry."""
     pytest.importorskip("mujoco")
     drawn = engines.NARROW.bore_clearance + engines.NARROW.mouth_chamfer
     ours, theirs = (engines._capture(station) for station in ("gantry", "mujoco"))
@@ -36,19 +38,19 @@ def test_a_plug_drops_in_from_about_as_far_beside_as_it_is_drawn():
     assert engines._capture("gantry", equal_area=True) == pytest.approx(drawn, abs=0.05 * MM)
 
 
-def test_a_plug_that_slides_fast_over_a_sharp_rim_is_held_back_by_friction_alone_where_steps_are_short():
-    """At the step and the margin that are taken it is held back four times as much: nothing may make that worse."""
+def test_drag_is_friction_when_steps_are_short():
+    """At the default step and margin the drag is up to 4.2 times the friction."""
     fine, taken = (engines.drag(*engines.CONTACTS[how], 0.02) for how in ("Drake, 2.5 ms, no margin", "Drake, 10 ms"))
     assert fine == pytest.approx(engines.FRICTION, rel=0.25)
     assert fine < taken < 4.2 * engines.FRICTION
 
 
-def test_a_plug_that_slides_over_the_other_engines_rim_is_held_back_by_friction_alone():
+def test_drag_is_friction_in_mujoco():
     pytest.importorskip("mujoco")
     assert engines.drag(*engines.CONTACTS["MuJoCo"], 0.02) == pytest.approx(engines.FRICTION, rel=0.05)
 
 
-def test_the_picture_is_drawn(tmp_path):
+def test_picture_is_drawn(tmp_path):
     names = ("time", "height_mm", "push_n", "torque_nm")
     profiles = {
         f"{task} {engine}": {name: [0.0, 1.0] for name in names} | {"real_time_factor": 1.0, "peak_force_n": 1.0}

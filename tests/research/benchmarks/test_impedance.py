@@ -1,4 +1,4 @@
-"""Both impedances of the rails, compared: what is told, with motions that nobody simulates here."""
+"""The benchmark of the gantry's impedances, without simulation."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ def results(monkeypatch):
     def insertion(control, time_step):
         pose = np.zeros((3, 6))
         pose[:, 0] = time_step + (0.001 if control == "cartesian" else 0.0)
-        known = {"control": control, "time_step": time_step, "seconds": 1.0, "locks": True, "peak_force": 12.0}
-        return known, pose
+        row = {"control": control, "time_step": time_step, "seconds": 1.0, "locks": True, "peak_force": 12.0}
+        return row, pose
 
     def episodes(difficulty, name, control):
-        known = {"difficulty": difficulty, "policy": name, "control": control, "seconds_per_1000_steps": 2.0}
-        return known | dict.fromkeys(impedance.SHOWN, 0.5)
+        row = {"difficulty": difficulty, "policy": name, "control": control, "seconds_per_1000_steps": 2.0}
+        return row | dict.fromkeys(impedance.STATISTICS, 0.5)
 
     monkeypatch.setattr(impedance, "insertion", insertion)
     monkeypatch.setattr(impedance, "_episodes", episodes)
@@ -25,7 +25,7 @@ def results(monkeypatch):
     return impedance.measure()
 
 
-def test_each_is_compared_with_its_own_finest_step_and_the_finest_with_each_other(results):
+def test_motions_are_compared_with_the_finest_step(results):
     rows = {(row["control"], round(1e5 * row["time_step"])): row for row in results["motion"]}
     assert rows["joint", 125]["own_position_rms"] == rows["cartesian", 125]["own_position_rms"] == 0.0
     assert rows["joint", 1000]["own_position_rms"] == pytest.approx(0.01 - 0.00125)
@@ -34,9 +34,9 @@ def test_each_is_compared_with_its_own_finest_step_and_the_finest_with_each_othe
     assert len(results["episodes"]) == 8
 
 
-def test_it_is_told_in_a_line_each(results, capsys):
+def test_results_have_a_line_each(results, capsys):
     impedance.show(results)
-    told = capsys.readouterr().out
-    assert told.count(" yes ") == 7
-    assert "1.000 mm to that of the rails' own" in told
-    assert "hard, rule, cartesian" in told
+    output = capsys.readouterr().out
+    assert output.count(" yes ") == 7
+    assert "1.000 mm to the joint impedance" in output
+    assert "hard, scripted, cartesian" in output

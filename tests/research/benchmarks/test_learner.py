@@ -1,12 +1,14 @@
+"""The benchmark of learners."""
+
 from guiderail.tools.learning.config import PRESETS
 from research.benchmarks import learner
 
 
-def test_reports_every_pair_and_what_is_asked_of_one(monkeypatch):
+def test_every_pair_is_measured(monkeypatch):
     assert set(learner.PRESETS) <= set(PRESETS)
     monkeypatch.setattr(learner, "PRESETS", ("tqc_contact",))
-    monkeypatch.setattr(learner, "_DECISIONS", 100)
+    monkeypatch.setattr(learner, "_TRANSITIONS", 100)
     result = learner.measure(turns=1)
-    assert set(result) == {"tqc robust", "sac robust", "fast_enough"}
-    for row in (result["tqc robust"], result["sac robust"]):
+    assert set(result) == {"tqc tqc_contact", "sac tqc_contact", "fast_enough"}
+    for row in (result["tqc tqc_contact"], result["sac tqc_contact"]):
         assert 0.0 < row["step_ms"] < row["stable_baselines3_ms"]

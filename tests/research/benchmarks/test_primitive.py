@@ -1,7 +1,9 @@
+"""The benchmark of the movement primitive."""
+
 from research.benchmarks.primitive import REGIMES, SIZES, measure
 
 
-def test_reports_what_it_measured_and_every_command_kept_its_bound(monkeypatch):
+def test_primitive_benchmark_satisfies_constraints(monkeypatch):
     for name, few in (("SIZES", SIZES[:1]), ("DENSE_SECONDS", 0.1), ("_MOTION", 100)):
         monkeypatch.setattr(f"research.benchmarks.primitive.{name}", few)
     (parts,) = measure(steps=400).values()

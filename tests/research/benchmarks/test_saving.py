@@ -1,8 +1,10 @@
+"""The benchmark of saving."""
+
 from research.benchmarks import saving
 from research.benchmarks.saving import saving_share, timed
 
 
-def test_only_what_saving_took_is_counted(monkeypatch, bead_config):
+def test_saving_share_counts_saving_only(monkeypatch, bead_config):
     monkeypatch.setattr(saving, "configure", lambda *_, **__: bead_config)
     monkeypatch.setattr(saving, "with_defaults", lambda task, given: given)
     found = saving_share("Bead", bead_config.episodes)
@@ -11,7 +13,7 @@ def test_only_what_saving_took_is_counted(monkeypatch, bead_config):
     assert 0 < found["step_log_ms_per_episode"] < 1e3 * found["seconds"]
 
 
-def test_a_timed_function_is_put_back():
+def test_timed_restores_the_function():
     class Owner:
         def method(self):
             return 3

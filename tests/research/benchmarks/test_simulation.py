@@ -1,3 +1,5 @@
+"""The benchmark of contact simulation."""
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from research.benchmarks import simulation as bench_simulation
 from research.benchmarks.simulation import CALLBACKS, real_time_factor, scripted_motion, timed_callbacks
 
 
-def test_systems_are_left_as_they_were():
+def test_timed_callbacks_restores_the_systems():
     before = [getattr(system, name) for system, name in CALLBACKS]
     with timed_callbacks():
         assert WrenchSensor._sample is not before[0]
@@ -19,7 +21,7 @@ def test_systems_are_left_as_they_were():
 @pytest.mark.parametrize(
     ("name", "contact"), [("gantry", "CONTACT"), ("grid_clamp", "CLAMP_CONTACT"), ("pouring", "POUR_CONTACT")]
 )
-def test_pythons_share_is_a_part_of_the_whole(monkeypatch, name, contact):
+def test_python_share_is_between_0_and_1(monkeypatch, name, contact):
     monkeypatch.setattr("research.benchmarks.simulation.REPEATS", 1)
     first, _ = getattr(bench_simulation, contact)
     monkeypatch.setattr(f"research.benchmarks.simulation.{contact}", (first, first + 0.8))
@@ -28,7 +30,7 @@ def test_pythons_share_is_a_part_of_the_whole(monkeypatch, name, contact):
     assert 0.0 < result["python_share"] < 1.0
 
 
-def test_the_pour_that_is_timed_empties_the_thermos():
+def test_scripted_pour_empties_the_thermos():
     config, times, poses, _ = scripted_motion("Pouring")
     station = PouringStation(config)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))

@@ -1,4 +1,4 @@
-"""Coarser time steps are cheaper, and farther from the finest."""
+"""The benchmark of the plant's time step."""
 
 import pytest
 
@@ -15,26 +15,26 @@ def results():
     patch.undo()
 
 
-def test_an_error_grows_with_the_time_step(results):
+def test_error_grows_with_the_time_step(results):
     rows = results["rows"]
     assert [row["time_step"] for row in rows] == sorted(row["time_step"] for row in rows)
     assert rows[0]["force_rms"] == 0.0 < rows[1]["force_rms"] < rows[2]["force_rms"]
-    assert results["chosen"] in [row["time_step"] for row in rows]
+    assert results["default"] in [row["time_step"] for row in rows]
 
 
-def test_it_is_shown_and_drawn(results, tmp_path, capsys, monkeypatch):
+def test_results_are_printed_and_drawn(results, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(time_step, "MOTIONS", {"clamp": time_step.MOTIONS["clamp"]})
     time_step.show(results)
     assert "clamp" in capsys.readouterr().out
     assert time_step.draw(results, tmp_path / "steps.png").stat().st_size > 10_000
 
 
-def test_what_is_printed_is_not_drawn(tmp_path):
+def test_picture_is_refused_when_benchmark_has_none(tmp_path):
     with pytest.raises(InputError, match="leave --picture out"):
         run_benchmark("learner", picture=tmp_path / "learner.png")
 
 
-def test_a_picture_that_cannot_be_drawn_is_refused_before_anything_is_measured(monkeypatch, tmp_path):
+def test_picture_is_refused_before_measuring(monkeypatch, tmp_path):
     monkeypatch.setattr(time_step, "measure", lambda: pytest.fail("it was measured"))
     with pytest.raises(InputError, match=r"\.txt"):
         run_benchmark("time_step", picture=tmp_path / "errors.txt")

@@ -1,24 +1,26 @@
+"""The profile of a training run."""
+
 import contextlib
 import inspect
 
 import pytest
 
 from guiderail.systems.wrench_sensor import WrenchSensor
-from research.benchmarks.training import PARTS, REST, Clock, measure, timed_parts
+from research.benchmarks.training import PARTS, REST, Profiler, measure, timed_parts
 
 
-def test_time_counts_for_the_innermost_part_alone(monkeypatch):
+def test_time_counts_for_the_innermost_part(monkeypatch):
     now = iter([0.0, 1.0, 3.0, 6.0, 10.0, 15.0])
     monkeypatch.setattr("time.perf_counter", lambda: next(now))
-    clock = Clock()
-    inner = clock.timed(lambda: None, "inner")
-    clock.timed(inner, "outer")()
-    clock.stop()
-    assert clock.seconds == {REST: 1.0 + 5.0, "outer": 2.0 + 4.0, "inner": 3.0}
-    assert clock.calls == {REST: 1, "outer": 1, "inner": 1}
+    profiler = Profiler()
+    inner = profiler.timed(lambda: None, "inner")
+    profiler.timed(inner, "outer")()
+    profiler.stop()
+    assert profiler.seconds == {REST: 1.0 + 5.0, "outer": 2.0 + 4.0, "inner": 3.0}
+    assert profiler.calls == {REST: 1, "outer": 1, "inner": 1}
 
 
-def test_everything_is_left_as_it_was():
+def test_timed_parts_restores_all_functions():
     before = [inspect.getattr_static(owner, name) for owner, name, _ in PARTS]
     sample = WrenchSensor._sample
     with contextlib.suppress(ZeroDivisionError), timed_parts():
@@ -28,7 +30,7 @@ def test_everything_is_left_as_it_was():
     assert [inspect.getattr_static(owner, name) for owner, name, _ in PARTS] == before
 
 
-def test_the_parts_of_a_run_are_the_whole_of_it():
+def test_parts_add_up_to_the_run():
     result = measure("Bead", {"wall": 0.75}, episodes=6)
     assert result["environment"]["wall"] == 0.75
     parts = {row["part"]: row for row in result["parts"]}

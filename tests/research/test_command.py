@@ -1,0 +1,97 @@
+"""Command lines of the research programs."""
+
+import json
+
+import pytest
+
+from research.action_fuzzing.__main__ import main as action_fuzzing
+from research.benchmarks import BENCHMARKS
+from research.benchmarks.__main__ import main as benchmarks
+from research.certificates import main as certificates
+from research.command import environment_options, print_result, run_program
+from research.figures.__main__ import main as figures
+from research.generate.__main__ import main as generate
+from research.results.__main__ import main as results
+from research.smoothness import main as smoothness
+
+PROGRAMS = (action_fuzzing, benchmarks, certificates, figures, generate, results, smoothness)
+
+
+def run(capsys, program, *arguments):
+    """Return exit code, standard output and standard error of a program."""
+    with pytest.raises(SystemExit) as ended:
+        run_program(program, [str(argument) for argument in arguments])
+    out, err = capsys.readouterr()
+    return ended.value.code, out, err
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_help_has_an_example(program, capsys):
+    with pytest.raises(SystemExit) as ended:
+        program(["--help"])
+    assert ended.value.code == 0
+    assert "Example: python -m research." in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "message"),
+    [
+        (figures, ["1.1"], "no figure '1.1'"),
+        (figures, ["5.66"], "did you mean 5.6?"),
+        (figures, ["5.6", "--seeds", "0"], "at least one seed"),
+        (figures, ["5.6", "--seeds", "two"], "--seeds"),
+        (figures, [], "FIGURE"),
+        (benchmarks, ["primitve"], "did you mean primitive?"),
+        (benchmarks, ["learner", "Pouring"], "has no task: leave task out"),
+        (benchmarks, ["learner", "--picture", "learner.png"], "leave --picture out"),
+        (benchmarks, ["training", "Puring"], "did you mean Pouring?"),
+        (benchmarks, ["training", "Bead", "--env", "wal=1"], "did you mean wall?"),
+        (benchmarks, ["training", "Bead", "--env", "wall"], "--env takes key=value"),
+        (benchmarks, ["training", "lab/Own", "--import", "none.py"], "there is none for 'none.py'"),
+        (action_fuzzing, ["BncConector"], "did you mean BncConnector?"),
+        (action_fuzzing, ["Pouring", "--episodes", "0"], "at least one episode"),
+        (action_fuzzing, ["all"], "give --steps"),
+        (generate, ["conector-objects"], "did you mean connector-objects?"),
+        (generate, ["connector-objects", "--out", "nowhere"], "make it first"),
+        (certificates, ["--out", "new", "--attack", "3"], "unrecognized arguments"),
+        (certificates, ["none.yaml", "--out", "new"], "there is no file none.yaml"),
+        (smoothness, ["--out", "new", "--episodes", "0"], "at least one episode"),
+        (results, ["nowhere"], "holds no table of a study"),
+    ],
+)
+def test_wrong_input_is_one_sentence_with_exit_code_2(program, arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(capsys, program, *arguments)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_generators_write_into_the_named_folder(tmp_path, capsys):
+    assert run(capsys, generate, "clamp-objects", "--out", tmp_path)[0] == 0
+    assert any(tmp_path.iterdir())
+
+
+def test_benchmark_prints_one_json_object(capsys, monkeypatch):
+    monkeypatch.setattr("research.benchmarks.simulation.measure", lambda: {"gantry": {"real_time_factor": 12.0}})
+    assert "simulation" in BENCHMARKS
+    code, out, _ = run(capsys, benchmarks, "simulation", "--json")
+    assert code == 0
+    assert json.loads(out) == {"gantry": {"real_time_factor": 12.0}}
+
+
+def test_environment_options_are_read_as_yaml():
+    assert environment_options(["station=arm", "action_dims=[0,1]"]) == {"station": "arm", "action_dims": (0, 1)}
+
+
+def test_non_finite_numbers_are_null_in_json(capsys):
+    print_result({"slack": float("-inf"), "rows": [float("nan"), 1.0]}, as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"slack": None, "rows": [None, 1.0]}
+
+
+def test_interrupted_program_exits_with_130(capsys):
+    def interrupted(arguments):
+        raise KeyboardInterrupt
+
+    assert run(capsys, interrupted)[::2] == (130, "research: interrupted\n")
