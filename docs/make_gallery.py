@@ -24,10 +24,9 @@ from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment, task_named
-from guiderail.tools.evaluation.baselines import BaselinePolicy, still, uniform_random
+from guiderail.tools.evaluation.baselines import BaselinePolicy, make_baseline, still, uniform_random
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
-from guiderail.tools.evaluation.scripted import make_baseline
 from guiderail.tools.learning.train import run
 from guiderail.tools.parts.create_task import create_task
 from guiderail.tools.visualization.camera import path_in_picture

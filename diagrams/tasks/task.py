@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -26,6 +26,10 @@ from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
+
+
+ScriptedPolicy = Callable[[np.ndarray], np.ndarray]
+"""Function from an observation to an action."""
 
 
 class EpisodeConstant:
@@ -211,6 +215,11 @@ class Task(ABC):
         task that has none.
         """
         return float(getattr(self.options, "start_offset_max", 0.0))
+
+    @classmethod
+    def scripted_policies(cls, difficulty: str = option_models.STANDARD) -> Mapping[str, ScriptedPolicy]:
+        """Return scripted policies by name; the first one is the default for `difficulty`."""
+        return {}
 
     # How it is drawn.
 

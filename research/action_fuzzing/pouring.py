@@ -10,11 +10,11 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_OFFSET
-from guiderail.diagrams.tasks.pouring.scripted import ADVERSARIES, Inputs
+from guiderail.diagrams.tasks.pouring.scripted import scripted_pour
 from guiderail.models.common.poses import pose_to_transform
-from guiderail.tools.evaluation.baselines import Choose, bang_bang
+from guiderail.tools.evaluation.baselines import Choose, bang_bang, uniform_random
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import EnvCallback
+from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn
 from research.action_fuzzing.campaign import Campaign, Case
 
 
@@ -34,7 +34,57 @@ def _tilt(pose: np.ndarray) -> float:
     return float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
 
 
-def _three_inputs(make: Callable[[np.random.Generator], Inputs]) -> Choose:
+PolicyMaker = Callable[[np.random.Generator], PolicyFn]
+"""Function from a random generator to a policy of the three inputs."""
+
+
+def noisy_pour(rng: np.random.Generator, spread: float = 1.5) -> PolicyFn:
+    """Return the scripted policy with noise that is larger than its inputs."""
+    return lambda observation: np.clip(scripted_pour(observation) + spread * rng.normal(size=3), -1.0, 1.0)
+
+
+def random_walk(rng: np.random.Generator) -> PolicyFn:
+    """Return full inputs that change now and then: they reach every corner of the workspace."""
+    action = np.sign(rng.normal(size=3))
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        nonlocal action
+        if rng.uniform() < 0.1:
+            action = np.sign(rng.normal(size=3))
+        return action
+
+    return act
+
+
+def rammer(rng: np.random.Generator) -> PolicyFn:
+    """Return noisy inputs towards the mug, from everywhere."""
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        towards = -observation[:3] / np.linalg.norm(observation[:3])
+        return np.clip(rng.uniform(0.5, 2.0) * towards + 0.6 * rng.normal(size=3), -1.0, 1.0)
+
+    return act
+
+
+def presser(rng: np.random.Generator) -> PolicyFn:
+    """Return inputs that press down on the table, and sideways."""
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        return np.array([*np.clip(rng.normal(size=2), -1.0, 1.0), -1.0])
+
+    return act
+
+
+ADVERSARIES: dict[str, PolicyMaker] = {
+    "noisy_pour": noisy_pour,
+    "random_walk": random_walk,
+    "rammer": rammer,
+    "presser": presser,
+    "uniform_random": lambda rng: uniform_random(rng, 3),
+}
+
+
+def _three_inputs(make: PolicyMaker) -> Choose:
     """Return an adversary of the template's three inputs; where there are six velocities, full deflection."""
     return lambda rng, size: make(rng) if size == 3 else bang_bang(rng, size)
 

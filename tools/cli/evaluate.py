@@ -78,7 +78,7 @@ def _evaluate_on_hardware(
     yes: bool,
     out: Path | None,
 ) -> Mapping[str, Any]:
-    from guiderail.tools.evaluation.scripted import make_baseline
+    from guiderail.tools.evaluation.baselines import make_baseline
     from guiderail.tools.hardware.connection import RobotConnection
     from guiderail.tools.hardware.evaluate import evaluate_on_robot
     from guiderail.tools.learning.run_folder import RunFolder
@@ -94,7 +94,7 @@ def _evaluate_on_hardware(
 def _select_baselines(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
     """Return baseline policies by name, comma-separated in `names`; the default set of the run's task for None."""
     from guiderail.tools.environments import changed_environment
-    from guiderail.tools.evaluation.scripted import SCRIPTED_POLICIES, make_baseline
+    from guiderail.tools.evaluation.baselines import make_baseline, scripted_policies
     from guiderail.tools.learning.run_folder import RunFolder
     from guiderail.tools.visualization.style import is_demonstrated
 
@@ -102,7 +102,7 @@ def _select_baselines(run: Path, environment: Mapping[str, Any], names: str | No
     environment = changed_environment(config.task, config.environment, environment)
     if names is None:
         zero = [] if is_demonstrated(environment.get("guidance")) else ["zero"]
-        has_scripted = config.task in SCRIPTED_POLICIES and environment.get("observation") != "image"
+        has_scripted = bool(scripted_policies(config.task)) and environment.get("observation") != "image"
         chosen = [*zero, "uniform_random", "constant", *(["scripted"] if has_scripted else [])]
     else:
         chosen = [] if names == "none" else [name.strip() for name in names.split(",")]

@@ -142,7 +142,7 @@ def _wait_for_supervisor() -> Any:
 
 def _scripted_policy(task: str) -> Any:
     """Return the scripted policy of a task, which demonstrates it to a learner."""
-    from guiderail.tools.evaluation.scripted import make_baseline
+    from guiderail.tools.evaluation.baselines import make_baseline
 
     return make_baseline(task, "scripted")
 

@@ -67,7 +67,7 @@ def _episode(
     if Path(subject).is_dir() or subject not in cli.CHOICES["tasks"]():
         return EpisodeSpec.of_run(Path(subject), environment, seed)
     from guiderail.tools.environments import check_environment
-    from guiderail.tools.evaluation.scripted import make_baseline
+    from guiderail.tools.evaluation.baselines import make_baseline
 
     arguments = check_environment(subject, environment)
     return EpisodeSpec(subject, arguments, make_baseline(subject, policy), policy, policy, seed=seed)

@@ -1,11 +1,16 @@
 """Policies that know nothing: what a learned one is compared with, and what guidance must withstand."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
 
+from guiderail.diagrams.envs.options import STANDARD
+from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn
 
 REPEATS = 10  # decisions that a held action lasts
@@ -94,3 +99,39 @@ still = partial(BaselinePolicy, zero)
 def always(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
     """The same action in every episode."""
     return BaselinePolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)
+
+
+def scripted_policies(task: str, difficulty: str = STANDARD) -> Mapping[str, PolicyFn]:
+    """Return a task's scripted policies by name, the default for `difficulty` first; none if it is not guiderail's."""
+    return TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
+
+
+def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> PolicyFn:
+    """Return a task's scripted policy by its name; "scripted" is the default for the difficulty.
+
+    Raises:
+        InputError: If there is none of that name.
+    """
+    policies = scripted_policies(task, difficulty)
+    if name == "scripted" and policies:
+        return next(iter(policies.values()))
+    if name not in policies:
+        raise InputError(f"{task} has no policy {name!r}: {did_you_mean(name, [*policies, *BASELINES])}")
+    return policies[name]
+
+
+def make_baseline(task: str, name: str, seed: int = 0) -> Callable[[gymnasium.Env], PolicyFn]:
+    """Return a function from an environment to a baseline policy or a task's scripted policy of that name.
+
+    Raises:
+        InputError: If there is none.
+    """
+    if name in BASELINES:
+        return lambda env: BaselinePolicy(BASELINES[name], env, seed)
+    find_scripted_policy(task, name)
+
+    def make_policy(env: gymnasium.Env) -> PolicyFn:
+        config = getattr(cast(Any, env.unwrapped).task.declaration, "config", None)
+        return find_scripted_policy(task, name, getattr(config, "difficulty", STANDARD))
+
+    return make_policy

@@ -30,11 +30,10 @@ from guiderail.tools.environments import (
     make_environment,
     task_content,
 )
-from guiderail.tools.evaluation.baselines import always
+from guiderail.tools.evaluation.baselines import always, make_baseline
 from guiderail.tools.evaluation.evaluate import cached, evaluate_run
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, rollout
-from guiderail.tools.evaluation.scripted import make_baseline
 from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Ratio, Study
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.experiments.progress import Board

@@ -26,11 +26,12 @@ from guiderail.diagrams.tasks.bnc_connector.rewards import (
     reward_terms,
     sides_of_the_rim,
 )
+from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure, scripted_torque_search
 from guiderail.diagrams.tasks.bnc_connector.workcell import HALF_TURN, BncWorkcell
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import in_ring, reference_of_file
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Threshold
+from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.objects.bnc_connector import demonstrations as inserting
@@ -163,6 +164,14 @@ class BncConnector(InsertionTask):
         if self.options.start_offset_max > 0.0:
             start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
         return self.constraints().nearest(start)
+
+    @classmethod
+    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
+        """Return the scripted policies by name; the first one is the default for `difficulty`."""
+        policies = (scripted_torque_search, scripted_center_of_pressure)
+        default = scripted_center_of_pressure if difficulty == "hard" else scripted_torque_search
+        ordered = sorted(policies, key=lambda policy: policy is not default)
+        return {policy.__name__: policy for policy in ordered}
 
     def camera(self) -> Camera:
         """Looks slightly down at the jack."""

@@ -17,11 +17,18 @@ from guiderail.diagrams.envs.options import STANDARD, Number, Numbers, Options
 from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
+from guiderail.diagrams.tasks.grid_clamp.scripted import (
+    CENTRE,
+    SCALE,
+    scripted_gentle_search,
+    scripted_search,
+    straight_descent,
+)
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import Threshold
+from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import MM
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
@@ -183,10 +190,6 @@ LEASH = 8.0 * MM
 
 START_BESIDE = 0.2 * MM  # along x and along y, where a clamp is handed over
 
-# What a policy sees, [position, force], is centred and scaled by these.
-CENTRE = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
-SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
-
 
 def make_template() -> SharedControlTemplate:
     """The template of section 3.4.2."""
@@ -259,6 +262,14 @@ class GridClamp(InsertionTask):
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
         start[:3] = *rng.uniform(-START_BESIDE, START_BESIDE, 2), rng.uniform(lowest, highest)
         return start
+
+    @classmethod
+    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
+        """Return the scripted policies by name; the first one is the default for `difficulty`."""
+        policies = (scripted_search, scripted_gentle_search, straight_descent)
+        default = scripted_gentle_search if difficulty == "hard" else scripted_search
+        ordered = sorted(policies, key=lambda policy: policy is not default)
+        return {policy.__name__: policy for policy in ordered}
 
     def camera(self) -> Camera:
         """Looks slightly down at the holes."""

@@ -21,7 +21,7 @@ from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import EpisodeConstant, Task
+from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task
 from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
@@ -303,6 +303,12 @@ class NarrowPassage(Task):
 
     def _start_deviation(self, held_out: bool) -> float:
         return self.options.start_deviation or (HELD_OUT_DEVIATION if held_out else 0.0)
+
+    @classmethod
+    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
+        """Return the scripted policies by name; the first one is the default for `difficulty`."""
+        policies = (scripted_slalom,)
+        return {policy.__name__: policy for policy in policies}
 
     def camera(self) -> Camera:
         """The plane from above."""

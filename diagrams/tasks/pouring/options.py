@@ -52,6 +52,7 @@ def frames_of(template: SharedControlTemplate, X_TMug: RigidTransform) -> dict[s
 
 
 MAX_MUG_OFFSET = 0.04  # [m] along x and y: farther off the arm would reach few of the starts
+POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in the observation
 MAX_MUG_ERROR = 0.06  # [m] as far as an aimed Pour leads from where the mug is believed
 
 HARD: Mapping[str, Any] = {

@@ -22,6 +22,7 @@ from guiderail.diagrams.tasks.pouring.options import (
     HARD,
     MAX_MUG_ERROR,
     MAX_MUG_OFFSET,
+    POSITION_SCALE,
     SPARSE_INPUT_SPEED,
     PouringOptions,
     PouringReset,
@@ -30,8 +31,9 @@ from guiderail.diagrams.tasks.pouring.options import (
     make_template,
 )
 from guiderail.diagrams.tasks.pouring.rewards import reward_terms
+from guiderail.diagrams.tasks.pouring.scripted import scripted_pour, scripted_pour_aimed, scripted_pour_blind
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import EpisodeConstant, Task, Threshold
+from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import transform_to_pose
 from guiderail.systems.episode_monitor import TerminationTerm
@@ -89,7 +91,6 @@ def conditions(config: PouringConfig, needed: int) -> list[TerminationTerm]:
 
 
 LEASH = 0.05  # [m] farther from its command than this the arm is waited for
-POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in the observation
 # Where the thermos starts, in the frame of the mug's tip: inside the template's own workspace.
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
@@ -212,6 +213,14 @@ class Pouring(Task):
         if self.options.aim:
             self.drawn["mug_error"].set(context, error)
         return {"start": p_MP, "mug_position": p_TMug} | ({"mug_error": error} if error.any() else {})
+
+    @classmethod
+    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
+        """Return the scripted policies by name; the first one is the default for `difficulty`."""
+        policies = (scripted_pour, scripted_pour_aimed, scripted_pour_blind)
+        default = scripted_pour_aimed if difficulty == "hard" else scripted_pour
+        ordered = sorted(policies, key=lambda policy: policy is not default)
+        return {policy.__name__: policy for policy in ordered}
 
     def camera(self) -> Camera:
         """From before the mug and a little above it."""

@@ -10,6 +10,7 @@ import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.rewards import ALIGNMENT_REWARD, DEPTH_REWARD
+from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_torque_search
 from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, reference_trajectory
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
@@ -17,7 +18,6 @@ from guiderail.models.common.units import MM
 from guiderail.models.objects.insertion import COLLISION_FORCE
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.scripted import scripted_torque_search
 
 NEW_RUN = {"new_run": True}  # every episode is a run of its own
 

@@ -5,10 +5,10 @@ import pytest
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.bnc_connector.options import LARGEST_GRASP_ANGLE, BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_torque_search
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.scripted import scripted_torque_search
 
 
 def drawn(uncertain, count, seed=0):

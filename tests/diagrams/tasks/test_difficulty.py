@@ -10,6 +10,7 @@ from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.scripted import scripted_center_of_pressure
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
 from guiderail.diagrams.tasks.grid_clamp import task as grid_clamp_options
+from guiderail.diagrams.tasks.grid_clamp.scripted import scripted_gentle_search, straight_descent
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
@@ -17,7 +18,6 @@ from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.tools.evaluation.baselines import still
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.scripted import scripted_gentle_search, straight_descent
 
 HARD = {"BncConnector": bnc_options.HARD, "GridClamp": grid_clamp_options.HARD}
 FRESH = {"options": {"new_run": True}, "seed": 300_000}

@@ -8,6 +8,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.grid_clamp.scripted import STIFFNESS, scripted_search, straight_descent
 from guiderail.diagrams.tasks.grid_clamp.task import (
     CENTRE,
     COLLISION_FORCE,
@@ -20,7 +21,6 @@ from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.scripted import STIFFNESS, scripted_search, straight_descent
 
 NEW_RUN = {"new_run": True}  # every episode is a run of its own
 
@@ -211,7 +211,7 @@ class TestUncertainty:
         {"guidance": "kmp"},
         {"reward": "dense"},
         {"observation": "image"},
-        {"fixture_offset": "none"},
+        {"fixture_offset": "anywhere"},
         {"station": "hardware"},
         {"action_repeat": 0},
     ],

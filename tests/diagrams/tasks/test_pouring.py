@@ -6,9 +6,10 @@ import pytest
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.scripted import ADVERSARIES, scripted_pour
+from guiderail.diagrams.tasks.pouring.scripted import scripted_pour
 from guiderail.diagrams.tasks.pouring.task import START_HEIGHT, START_RADIUS
 from guiderail.models.common.errors import InputError
+from research.action_fuzzing.pouring import ADVERSARIES
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,7 @@ def test_faster_inputs_are_as_safe():
     assert info["control_steps"] < 250
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     rng = np.random.default_rng(0)
-    info, _, _ = run(env, ADVERSARIES["noisy_person"](rng), seed=3, limit=15)
+    info, _, _ = run(env, ADVERSARIES["noisy_pour"](rng), seed=3, limit=15)
     assert info["termination"] not in ("collision", "spill")
 
 

@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.scripted import person
 from guiderail.models.policy import Policy
 from guiderail.tools.teleop.teleoperator import AXES, KEYS, drive
 
 
 @pytest.mark.filterwarnings("ignore:.*nothing to render")
 def test_whoever_drives_drives_the_same_diagram():
-    assert drive(make_env("Pouring", action_repeat=50), person, episodes=1) == ["success"]
+    assert drive(make_env("Pouring", action_repeat=50), scripted_pour, episodes=1) == ["success"]
     still = (np.zeros((3, 6), np.float32), np.zeros(3, np.float32))  # a network that always says zero
     shapes = {"observation_shape": [6], "action_low": [-1.0] * 3, "action_high": [1.0] * 3}
     policy = Policy([still], shapes | {"activation": "relu", "pool": 1})
