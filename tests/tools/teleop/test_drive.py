@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.tasks.pouring.scripted import scripted_pour
 from guiderail.models.policy import Policy
 from guiderail.tools.teleop.teleoperator import AXES, KEYS, drive
 
