@@ -27,7 +27,7 @@ from guiderail.tools.environments import make_environment, task_named
 from guiderail.tools.evaluation.baselines import BaselinePolicy, make_baseline, still, uniform_random
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
-from guiderail.tools.learning.train import run
+from guiderail.tools.learning.train import start_or_resume
 from guiderail.tools.parts.create_task import create_task
 from guiderail.tools.visualization.camera import path_in_picture
 from guiderail.tools.visualization.curves import draw_world
@@ -182,7 +182,7 @@ def _learned(env: Any) -> PolicyFn:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         given = {"guidance": "skgrl"}
-        run("NarrowPassage", out, environment=given, preset="steady", episodes=LEARNING_EPISODES, seed=0)
+        start_or_resume("NarrowPassage", out, environment=given, preset="tqc_cheap_correlated", episodes=LEARNING_EPISODES, seed=0)
         return Policy.load(out)
 
 

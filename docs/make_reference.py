@@ -576,7 +576,7 @@ def files() -> str:
     from guiderail.models.primitives.demonstrations import Demonstrations
     from guiderail.tools.evaluation.metrics import COLUMNS
     from guiderail.tools.evaluation.step_log import MEANINGS
-    from guiderail.tools.learning.config import PRESETS, LearnerConfig
+    from guiderail.tools.learning.config import PRESETS, OffPolicyConfig
     from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 
     page = (
@@ -590,9 +590,9 @@ def files() -> str:
         "| `learning_curve.png`, `replay.html` | to look at |\n\n"
     )
     page += "### config.yaml\n\n" + _fields(RunConfig)
-    page += f"### learner, in config.yaml\n\n{prose(inspect.getdoc(LearnerConfig) or '')} "
+    page += f"### learner, in config.yaml\n\n{prose(inspect.getdoc(OffPolicyConfig) or '')} "
     page += f"Presets are {', '.join(code(name) for name in PRESETS)}; `--set name=value` changes one setting.\n\n"
-    page += _fields(LearnerConfig)
+    page += _fields(OffPolicyConfig)
     page += (
         "### episodes.csv\n\nAnd `reward_…`, the sum of each of the reward's terms. `collisions` and `collision_steps` "
         "are of the signal that `Task.collision` names. An episode that a `TerminationTerm` ends as `collision` counts only "

@@ -16,7 +16,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.tools.learning.config import PRESETS, LearnerConfig, action_gamma
+from guiderail.tools.learning.config import PRESETS, OffPolicyConfig, action_gamma
 from guiderail.tools.learning.run_folder import RunConfig
 
 HISTORY = ("history", "history_variance", "history_source", "adaptive_history")
@@ -172,7 +172,7 @@ THESIS = {
 }  # fmt: skip
 
 # Settings of the learner that the thesis does not have: name, whether it is in use, description.
-_ADDITIONS: tuple[tuple[str, Callable[[LearnerConfig], bool], str], ...] = (
+_ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
     (
         "greedy_episode_fraction",
         lambda p: p.greedy_episode_fraction > 0,
@@ -273,6 +273,8 @@ def _learner_differences(config: RunConfig, setting: Setting) -> list[str]:
     if learner.algorithm not in setting.algorithms:
         algorithms = " or ".join(algorithm.upper() for algorithm in setting.algorithms)
         differences.append(f"{learner.algorithm.upper()} (thesis: {algorithms})")
+    if not isinstance(learner, OffPolicyConfig):
+        return differences
     names = _COMPARED + (_TABLE_3_2_ONLY if setting.preset.startswith("table_3_2") else ())
     ours, theirs = asdict(learner), asdict(table)
     for name in names:

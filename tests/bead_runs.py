@@ -24,9 +24,9 @@ def bead_config():
 @pytest.fixture(scope="session")
 def _bead_run(bead_config, tmp_path_factory):
     from guiderail.tools.learning.run_folder import RunFolder
-    from guiderail.tools.learning.trainer import train
+    from guiderail.tools.learning.trainer import run_training
 
-    train(RunFolder(folder := tmp_path_factory.mktemp("bead") / "run"), bead_config)
+    run_training(RunFolder(folder := tmp_path_factory.mktemp("bead") / "run"), bead_config)
     return folder
 
 

@@ -87,19 +87,19 @@ def _compare(algorithm: str, preset: str, turns: int) -> dict[str, float]:
 def _seconds(learner: OffPolicyLearner) -> float:
     """Return the CPU time of a gradient step [s]."""
     start = time.process_time()
-    learner.model.train(learner.preset.gradient_steps, learner.preset.batch_size)
-    return (time.process_time() - start) / learner.preset.gradient_steps
+    learner.model.train(learner.config.gradient_steps, learner.config.batch_size)
+    return (time.process_time() - start) / learner.config.gradient_steps
 
 
 def _with_transitions(kind: type[OffPolicyLearner], preset: str) -> OffPolicyLearner:
     """Return a learner with a filled replay buffer."""
-    settings = resolve_preset(preset, "tqc", {"symmetry": False})
-    learner = kind(settings, _Spaces(), action_repeat=10, seed=0, decisions=_TRANSITIONS)
+    settings: Any = resolve_preset(preset, "tqc", {"symmetry": False})
+    learner = kind(settings, _Spaces(), action_repeat=10, seed=0, max_transitions=_TRANSITIONS)
     random = np.random.default_rng(0)
     for index in range(_TRANSITIONS):
         seen, then = random.standard_normal((2, 13)).astype(np.float32)
         action = random.uniform(-1, 1, 2).astype(np.float32)
-        learner.remember(Transition(seen, action, float(random.standard_normal()), then, index % 50 == 49, False, {}))
+        learner.store(Transition(seen, action, float(random.standard_normal()), then, index % 50 == 49, False, {}))
     return learner
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from guiderail.tools.evaluation.step_log import StepLog
-from guiderail.tools.learning import trainer as train
+from guiderail.tools.learning import trainer
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
 from research.benchmarks import with_progress
@@ -48,9 +48,9 @@ def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     with (
         tempfile.TemporaryDirectory() as folder,
         timed(StepLog, "on_episode_end") as step_log,
-        timed(train, "_save") as checkpoints,
+        timed(trainer, "_save") as checkpoints,
     ):
-        rows = train.train(RunFolder(Path(folder) / "run"), config)
+        rows = trainer.run_training(RunFolder(Path(folder) / "run"), config)
     seconds = sum(row["wall_time"] for row in rows) + sum(checkpoints)
     return {
         "seconds": seconds,

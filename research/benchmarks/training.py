@@ -23,10 +23,8 @@ from pydrake.systems.framework import InputPort, OutputPort
 
 import guiderail.systems
 from guiderail.diagrams.envs.env import GuidedEnv
-from guiderail.tools.learning import checkpoint, off_policy
-from guiderail.tools.learning import trainer as train
-from guiderail.tools.learning.fast_sb3 import batched_mlp as perceptrons
-from guiderail.tools.learning.fast_sb3 import ensemble, flat_adam
+from guiderail.tools.learning import checkpoint, off_policy, trainer
+from guiderail.tools.learning.fast_sb3 import batched_mlp, flat_adam, training_step
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, with_defaults
 
@@ -36,9 +34,9 @@ LEARNING_STARTS = 40  # transitions before the first gradient step
 
 # Owner and name of each measured function, and its part.
 PARTS: tuple[tuple[Any, str, str], ...] = (
-    (train, "make_environment", "building the environment"),
-    (train, "rollout", "rollout"),
-    (train, "_save", "checkpoint"),
+    (trainer, "make_environment", "building the environment"),
+    (trainer, "rollout", "rollout"),
+    (trainer, "_save", "checkpoint"),
     (GuidedEnv, "reset", "reset"),
     (GuidedEnv, "step", "environment"),
     (Simulator, "AdvanceTo", "Drake"),
@@ -46,13 +44,13 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (OutputPort, "Eval", "Drake, as a port is read"),
     (off_policy.OffPolicyLearner, "__init__", "building the learner"),
     (off_policy.OffPolicyLearner, "act", "acting"),
-    (off_policy.OffPolicyLearner, "remember", "replay buffer"),
+    (off_policy.OffPolicyLearner, "store", "replay buffer"),
     (off_policy.OffPolicyLearner, "learn", "gradient step"),
     (off_policy.NStepReplayBuffer, "sample", "replay"),
-    (ensemble.Ensemble, "train", "gradient step"),
-    (perceptrons.BatchedMLP, "forward", "forward"),
-    (perceptrons.BatchedMLP, "backward", "backward"),
-    (perceptrons.BatchedMLP, "input_gradient", "backward"),
+    (training_step.FastTrainingStep, "train", "gradient step"),
+    (batched_mlp.BatchedMLP, "forward", "forward"),
+    (batched_mlp.BatchedMLP, "backward", "backward"),
+    (batched_mlp.BatchedMLP, "input_gradient", "backward"),
     (flat_adam.FlatAdam, "step", "optimizer"),
     (checkpoint, "save_checkpoint", "checkpoint"),
 )
@@ -145,7 +143,7 @@ def measure(
     config = configure(task, environment or {}, episodes=episodes, **settings)
     with tempfile.TemporaryDirectory() as folder, timed_parts() as profiler:
         start = time.perf_counter()
-        rows = train.train(RunFolder(Path(folder) / "run"), config)
+        rows = trainer.run_training(RunFolder(Path(folder) / "run"), config)
         wall = time.perf_counter() - start
     steps = sum(row["steps"] for row in rows)
     parts = [

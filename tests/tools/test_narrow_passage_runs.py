@@ -17,7 +17,7 @@ from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import reset_held_out
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.visualization import camera
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.replay import default_page, tube, write_page
@@ -33,7 +33,7 @@ def config():
 @pytest.fixture(scope="module")
 def trained(config, tmp_path_factory):
     folder = RunFolder(tmp_path_factory.mktemp("run") / "run")
-    train(folder, config)
+    run_training(folder, config)
     return folder
 
 
@@ -51,8 +51,8 @@ def test_a_rows_terms_add_up_to_its_return(trained):
 
 def test_a_resumed_simulation_goes_on_bit_for_bit(trained, config, tmp_path):
     resumed = RunFolder(tmp_path / "run")
-    train(resumed, replace(config, episodes=2))
-    train(resumed, config, resume=True)
+    run_training(resumed, replace(config, episodes=2))
+    run_training(resumed, config, resume=True)
     first, second = (folder.episodes().drop(columns="wall_time") for folder in (trained, resumed))
     pd.testing.assert_frame_equal(first, second)
     a, b = (load_file(folder.path / "policy.safetensors") for folder in (trained, resumed))

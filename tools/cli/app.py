@@ -52,6 +52,7 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
     "observations": _declared_by_tasks("observations"),
     "templates": _names("models.templates.schema", "shipped_templates"),
     "engines": _names("tools.experiments.engines.engine", "ENGINES"),
+    "log_formats": _names("tools.learning.learning_log", "FORMATS"),
     "pictures": _names("tools.files", "PICTURES"),
     "videos": _names("tools.files", "VIDEOS"),
     "baselines": _names("tools.evaluation.baselines", "BASELINES"),

@@ -17,7 +17,7 @@ from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import run
+from guiderail.tools.learning.train import start_or_resume
 from guiderail.tools.visualization.curves import draw_world
 from guiderail.tools.visualization.style import colour, new_figure, save_figure
 
@@ -46,7 +46,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     )
     _clear(out)
     write_atomically(out / MARK, b"")
-    summary = run(
+    run = start_or_resume(
         "NarrowPassage",
         out,
         environment={"guidance": "skgrl"},
@@ -74,7 +74,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     console.print("\nFiles:")
     for path, content in (
         (picture, "paths before and after learning, and the return over the episodes"),
-        (summary["replay"], "animation in three dimensions: open it in a browser"),
+        (run.pictures["replay"], "animation in three dimensions: open it in a browser"),
         (out / "episodes.csv", "every training episode: return, success, violations, forces, jerk"),
         (out / "learning_curve.png", "plots of these"),
     ):

@@ -1,5 +1,6 @@
 """Entry point of the `guiderail` command: it turns errors into one sentence and an exit code."""
 
+import logging
 import os
 import sys
 from importlib import import_module
@@ -44,6 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     # Matrices are small here: threads cost more in synchronization than they save, and several runs share a machine.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
+    _show_messages()
     try:
         code = app(args=arguments, prog_name="guiderail", standalone_mode=False)
     except InputError as error:
@@ -64,6 +66,23 @@ def main(arguments: list[str] | None = None) -> None:
         print_message(_usage_sentence(error))
         code = 2
     sys.exit(code if isinstance(code, int) else 0)
+
+
+class _MessageHandler(logging.Handler):
+    """Handler that prints messages of the library on standard error."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print the message of a record."""
+        print_message(record.getMessage())
+
+
+def _show_messages() -> None:
+    """Print the library's messages, from level INFO on."""
+    logger = logging.getLogger("guiderail")
+    logger.setLevel(logging.INFO)
+    if not any(isinstance(handler, _MessageHandler) for handler in logger.handlers):
+        logger.addHandler(_MessageHandler())
+        logger.propagate = False
 
 
 def _resume_hint(arguments: list[str]) -> str:

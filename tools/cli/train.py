@@ -43,6 +43,10 @@ def train(
         bool | None,
         option("Write every control step into the run's steps/.  [default: yes]", "--step-log/--no-step-log"),
     ] = None,
+    log: Annotated[
+        list[str] | None,
+        option("Write a learning log into the run's logs/: {log_formats}; repeatable.", choices="log_formats"),
+    ] = None,
     human_in_the_loop: Annotated[
         bool,
         option("A supervisor watches in the browser, corrects, stops and labels successes.", "--human-in-the-loop"),
@@ -111,9 +115,9 @@ def train(
         print_result(result, as_json)
         return
     cli.refuse_hardware_options(sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes)
-    from guiderail.tools.learning.train import run
+    from guiderail.tools.learning.train import start_or_resume
 
-    summary = run(
+    run = start_or_resume(
         task,
         out,
         environment=environment,
@@ -125,10 +129,11 @@ def train(
         resume=resume,
         imports=modules,
         step_log=step_log,
-        person=_wait_for_supervisor if human_in_the_loop else None,
-        demonstrator=_scripted_policy,
+        log=log or (),
+        make_supervisor=_wait_for_supervisor if human_in_the_loop else None,
+        find_demonstrator=_scripted_policy,
     )
-    print_result(summary, as_json)
+    print_result(run.summary, as_json)
 
 
 def _wait_for_supervisor() -> Any:

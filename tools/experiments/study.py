@@ -343,11 +343,11 @@ def _train(job: Job, mark: int) -> pd.DataFrame:
         return pd.DataFrame()
     folder, copy = job.folder, _policy_folder(job, mark)
     if _is_to_train(job, mark):
-        from guiderail.tools.learning.trainer import train
+        from guiderail.tools.learning.trainer import run_training
 
         config = job.config(mark)
         shows = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
-        train(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=shows)
+        run_training(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=shows)
     rows = folder.episodes()
     if len(rows) == mark and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):

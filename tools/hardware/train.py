@@ -21,7 +21,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import Say, robot_session
-from guiderail.tools.learning.learner import LEARNERS, arguments_of
+from guiderail.tools.learning.learner import LEARNERS, learner_arguments
 from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, with_defaults
@@ -87,13 +87,13 @@ def _learn(
     report: Callable[[dict[str, Any]], None],
 ) -> list[dict[str, Any]]:
     """All episodes; whatever is raised, the arm is brought to rest, and what was recorded and learned is kept."""
-    named = arguments_of(config, env.task)
+    named = learner_arguments(config, env.task)
     acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **named)
     student = PipelinedLearner(
         acting,
         ((config.learner, SpacesOnlyEnv(env)), named),
         waits=waits,
-        leaves_out=UNSOUND,
+        excluded=UNSOUND,
         niceness=NICENESS,
         imports=config.imports,
     )

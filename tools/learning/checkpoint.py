@@ -1,4 +1,4 @@
-"""All that a run needs to go on as if it had never stopped, in one file that holds no code."""
+"""Checkpoints: everything that a run needs to continue bit for bit, in one file without code; and actor selection."""
 
 import json
 from collections.abc import Mapping
@@ -21,41 +21,48 @@ Actor = dict[str, torch.Tensor]
 
 @dataclass
 class Candidate:
-    """An actor, and how many greedy episodes in a row succeeded before it and, itself included, since."""
+    """Actor with the number of consecutive greedy successes around it.
+
+    Attributes:
+        actor: Parameters by name.
+        before: Consecutive greedy successes before its episode.
+        since: Consecutive greedy successes from its own episode on.
+    """
 
     actor: Actor
     before: int
     since: int = 0
 
     def score(self) -> int:
-        """Successes on both sides: what acts well by luck, or only just learned to, has few on one of them."""
+        """Return the successes on the weaker side: an actor that succeeds by luck has few on one of them."""
         return min(self.before, self.since)
 
 
 class CheckpointSelection:
-    """Selects the latest actor in the midst of the longest row of greedy episodes that succeeded.
+    """Selection of the latest actor in the middle of the longest streak of successful greedy episodes.
 
-    Learning on the edge of contact swings: a policy that succeeds for twenty episodes can fail for two and recover. The
-    last one of a run is therefore a poor choice, and choosing by held-out conditions would be no choice at all. Nor is
-    it enough that the next few episodes succeeded: the actors that did so were its successors, and were better.
+    Learning at the edge of contact oscillates: a policy that succeeds for twenty episodes can fail for two and recover,
+    so the last actor of a run is a poor choice. Held-out conditions must not choose. Successes of the next few episodes
+    are no proof either, because the actors that achieved them were its successors.
     """
 
     def __init__(self, window: int):
-        """
+        """Construct the selection.
+
         Args:
-            window: successes before and after an actor, beyond which more count for nothing and the later one is taken.
+            window: Successes before and after an actor beyond which more do not count; then the latest actor is taken.
         """
         self.window = window
         self._selected: Candidate | None = None
-        self._open: list[Candidate] = []  # whose row goes on
+        self._open: list[Candidate] = []  # candidates of the current streak
 
     def begin(self, actor: torch.nn.Module, before: int) -> None:
-        """A greedy episode begins, acted by this actor; so many in a row succeeded before it."""
+        """Start a greedy episode of `actor` after `before` consecutive greedy successes."""
         copy = {key: value.detach().clone() for key, value in actor.state_dict().items()}
         self._open.append(Candidate(copy, min(before, self.window)))
 
     def finish(self, success: bool) -> None:
-        """It is over."""
+        """End the greedy episode."""
         if not success:
             self._selected, self._open = self._best(), []
             return
@@ -64,12 +71,12 @@ class CheckpointSelection:
         while self._open and self._open[0].since >= self.window:
             self._selected = self._better(self._selected, self._open.pop(0))
 
-    def leave_out(self) -> None:
-        """It is over, and says nothing of the actor."""
+    def exclude(self) -> None:
+        """End the greedy episode without counting it."""
         self._open.pop()
 
     def result(self) -> Actor | None:
-        """The best actor so far; None where none has successes on both sides."""
+        """Return the best actor so far; None if no actor has successes on both sides."""
         best = self._best()
         return None if best is None else best.actor
 
@@ -78,43 +85,43 @@ class CheckpointSelection:
 
     @staticmethod
     def _better(best: Candidate | None, candidate: Candidate) -> Candidate | None:
-        least = 1 if best is None else best.score()
-        return candidate if candidate.score() >= least else best
+        required = 1 if best is None else best.score()
+        return candidate if candidate.score() >= required else best
 
     def state(self) -> tuple[Actor, dict[str, Any]]:
-        """Between episodes: tensors by name, and what JSON can hold."""
-        known = {str(index): candidate for index, candidate in enumerate(self._open)}
+        """Return the state between episodes: tensors by name, and values that JSON can hold."""
+        candidates = {str(index): candidate for index, candidate in enumerate(self._open)}
         if self._selected is not None:
-            known["selected"] = self._selected
-        tensors = {f"{name}/{key}": value for name, one in known.items() for key, value in one.actor.items()}
-        return tensors, {"rows": {name: [one.before, one.since] for name, one in known.items()}}
+            candidates["selected"] = self._selected
+        tensors = {f"{name}/{key}": value for name, one in candidates.items() for key, value in one.actor.items()}
+        return tensors, {"rows": {name: [one.before, one.since] for name, one in candidates.items()}}
 
     def restore(self, tensors: Mapping[str, torch.Tensor], values: Mapping[str, Any]) -> None:
-        """Becomes what it was when `state` was called."""
+        """Set the state to what `state` returned."""
         actors: dict[str, Actor] = {name: {} for name in values["rows"]}
         for name, value in tensors.items():
             actor, key = name.split("/", 1)
             actors[actor][key] = value
-        known = {name: Candidate(actors[name], *rows) for name, rows in values["rows"].items()}
-        self._selected = known.pop("selected", None)
-        self._open = [known[name] for name in sorted(known, key=int)]
+        candidates = {name: Candidate(actors[name], *rows) for name, rows in values["rows"].items()}
+        self._selected = candidates.pop("selected", None)
+        self._open = [candidates[name] for name in sorted(candidates, key=int)]
 
 
 def save_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-    """Writes arrays and JSON values with a digest of both; a run killed while writing keeps its last checkpoint."""
+    """Write arrays and JSON values with a digest; if killed while writing, the last checkpoint stays."""
     arrays = {key: np.ascontiguousarray(value) for key, value in arrays.items()}
     text = json.dumps(values)
     write_atomically(path, save(arrays, {"values": text, "digest": digest(arrays, text)}))
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """What `save_checkpoint` wrote.
+    """Read the arrays and values that `save_checkpoint` wrote.
 
     Raises:
-        InputError: if the file is missing, truncated or changed.
+        InputError: If the file is missing, truncated or changed.
     """
     if not path.is_file():
-        raise InputError(f"there is no checkpoint {path}: start the run anew in another folder")
+        raise InputError(f"there is no checkpoint {path}: train again in another folder")
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata()
@@ -125,5 +132,5 @@ def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         return arrays, json.loads(text)
     except (SafetensorError, ValueError, KeyError, TypeError, OSError, RecursionError) as error:
         raise InputError(
-            f"the checkpoint {path} is damaged: restore a copy, or start anew in another folder"
+            f"the checkpoint {path} is damaged: restore a copy, or train again in another folder"
         ) from error

@@ -1,92 +1,98 @@
-"""How a learner learns: named settings, the thesis's and our own, and single ones replaced."""
+"""Configuration of learners: the settings, named presets, and their validation.
+
+A learner names its configuration class as `Learner.Config`, a pydantic dataclass derived from `LearnerConfig`. A setting
+of the command, `--set name=value`, is validated against that class.
+"""
 
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.learner import (
+    LEARNERS,
+    DeferredLearner,
+    LearnerConfig,
+    NonNegative,
+    Positive,
+    register_learner,
+    reject_bool,
+)
+
+DEFAULT_PRESET = "tqc_contact"
 
 
-def _usable_entropy(ent_coef: str) -> str:
+def _check_ent_coef(ent_coef: str) -> str:
     initial = ent_coef.removeprefix("auto").removeprefix("_")
     if ent_coef != "auto" and not 0 < float(initial) < math.inf:
         raise ValueError("it is auto, auto_<initial value> or a positive number")
     return ent_coef
 
 
-def _no_truth(value: Any) -> Any:
-    """True is no number."""
-    if isinstance(value, bool):
-        raise ValueError("it is a number")
-    return value
-
-
-# What takes memory or time is bounded by what no machine has.
-Count = Annotated[int, Field(ge=1, le=10**9), BeforeValidator(_no_truth)]
-Batch = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(_no_truth)]
-Width = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(_no_truth)]
-Least = Annotated[int, Field(ge=0, le=10**9), BeforeValidator(_no_truth)]
-Share = Annotated[float, Field(ge=0, le=1), BeforeValidator(_no_truth)]
-Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(_no_truth)]
-Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(_no_truth)]
-Entropy = Annotated[str, BeforeValidator(str), AfterValidator(_usable_entropy)]
+# Upper bounds exclude values that would exhaust memory or never finish.
+BatchSize = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(reject_bool)]
+NumUnits = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(reject_bool)]
+Fraction = Annotated[float, Field(ge=0, le=1), BeforeValidator(reject_bool)]
+Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(reject_bool)]
+Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
+EntCoef = Annotated[str, BeforeValidator(str), AfterValidator(_check_ent_coef)]
 NetArch = Annotated[
-    tuple[Width, ...],
+    tuple[NumUnits, ...],
     Field(min_length=1, max_length=20),
     BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v),
 ]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class LearnerConfig:
-    """How a learner learns. A decision is one action of the policy; it lasts `action_repeat` control steps."""
+class OffPolicyConfig(LearnerConfig):
+    """Settings of an off-policy learner, by the names of Stable-Baselines3 where it has them.
 
-    algorithm: str = "tqc"  # a learner's name
-    learning_rate: Rate = 3e-4  # of actor, critics and entropy
-    gamma: Factor = 0.995  # of one control step, so that it means the same whatever the hold, or of one decision
-    gamma_per: Literal["control_step", "decision"] = "control_step"  # what the discount is of
-    tau: Factor = 0.02  # how far the target critics follow at each gradient step
-    train_freq: Count = 8  # decisions between two trainings
-    gradient_steps: Count = 24  # in one training
-    batch_size: Batch = 64  # decisions
-    n_steps: Annotated[Count, Field(le=1000)] = 1  # decisions after which a return is guessed, and until which known
-    buffer_size: Count = 1_000_000  # decisions that are remembered
-    learning_starts: Count = 100  # decisions, uniformly random, before the first training
-    ent_coef: Entropy = "auto_0.1"  # "auto", "auto_<initial value>", or a number
-    net_arch: NetArch = (256, 256)  # of the hidden layers
-    demonstration_episodes: Least = 0  # the first ones, in which a demonstrator acts; what it did is replayed, too
-    constant_episodes: Least = 0  # the next ones, in each of which one uniform action is repeated all the time
-    ez_greedy: Share = 0.0  # how likely an exploring decision begins a temporally extended action (εz-greedy)
-    ez_greedy_longest: Count = 8  # decisions that such an action lasts at most
-    ez_greedy_until: Least = 0  # greedy successes in a row after which there are no more; 0 for never
-    greedy_episode_fraction: Share = 0.0  # part of the episodes, evenly spread, that do not explore
-    layer_norm: bool = False  # of the hidden layers, before their activation
-    # Remember what was seen as seen from the other sides too, where the task has any; "near": from those, too, from
-    # which only most of an episode is the same.
-    symmetry: bool | Literal["near"] = False
-    selection_window: Least = 0  # greedy successes before and after an actor that select it; 0 takes the last actor
-    # Learn in a process of its own while the next episode is simulated, and so an episode later: deterministic too.
-    pipelined: bool = False
-    actor_ema: Share = 0.003  # how far the averaged actor follows at each gradient step; 0 for no averaged actor
+    An action of the policy lasts `action_repeat` control steps and makes one transition.
+    """
+
+    algorithm: str = "tqc"  # registered name of the learner
+    training_step: Literal["fast", "sb3"] = "fast"  # the equivalent fast step, if there is one, or Stable-Baselines3's
+    learning_rate: Rate = 3e-4  # of actor, critics and entropy coefficient
+    gamma: Factor = 0.995  # discount factor per `gamma_per`
+    gamma_per: Literal["control_step", "action"] = "control_step"  # a control step is independent of action_repeat
+    tau: Factor = 0.02  # Polyak factor of the target critics per gradient step
+    train_freq: Positive = 8  # transitions between two trainings
+    gradient_steps: Positive = 24  # per training
+    batch_size: BatchSize = 64  # transitions
+    n_steps: Annotated[Positive, Field(le=1000)] = 1  # transitions of an n-step return
+    buffer_size: Positive = 1_000_000  # transitions in the replay buffer
+    learning_starts: Positive = 100  # transitions with uniformly random actions before the first training
+    ent_coef: EntCoef = "auto_0.1"  # "auto", "auto_<initial value>", or a number
+    net_arch: NetArch = (256, 256)  # units of the hidden layers
+    constant_episodes: NonNegative = 0  # first episodes after the demonstrated ones; each repeats one uniform action
+    ez_greedy: Fraction = 0.0  # probability that an exploring action starts a temporally extended action (εz-greedy)
+    ez_greedy_longest: Positive = 8  # maximum number of actions that an extended action lasts
+    ez_greedy_until: NonNegative = 0  # consecutive greedy successes that end extended actions; 0 for never
+    greedy_episode_fraction: Fraction = 0.0  # fraction of the episodes, evenly spread, that do not explore
+    layer_norm: bool = False  # normalize hidden layers before their activation
+    selection_window: NonNegative = 0  # greedy successes before and after an actor that select it; 0 for the last actor
+    actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
 
 
-_TABLE_4_1 = LearnerConfig(
+register_learner("sac", DeferredLearner("guiderail.tools.learning.off_policy", "SacLearner", OffPolicyConfig))
+register_learner("tqc", DeferredLearner("guiderail.tools.learning.off_policy", "TqcLearner", OffPolicyConfig))
+
+_TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
-)  # batch and buffer of table 3.2, as table 4.1 has none
-_TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, gamma=0.95, gamma_per="decision", learning_starts=1000)
-_QUICK = LearnerConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_coef="auto")
+)  # table 4.1 has no batch and buffer size: those of table 3.2
+_TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, gamma=0.95, gamma_per="action", learning_starts=1000)
+_FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_coef="auto")
 
-# What each was measured with is in docs/experiments.md.
+# The measurements behind each preset are in docs/experiments.md.
 PRESETS = {
-    # For contact, where learning swings: small batches, a moderate learning rate and normalized layers keep the swings
-    # small, greedy episodes tell the critic what the mean is worth, and checkpoint selection takes an actor that lasts.
-    "tqc_contact": LearnerConfig(
+    # Contact makes learning oscillate. Small batches, a moderate learning rate and normalized layers reduce that, greedy
+    # episodes tell the critic the value of the mean action, and checkpoint selection takes an actor that lasts.
+    "tqc_contact": OffPolicyConfig(
         learning_rate=3e-4,
         train_freq=4,
         gradient_steps=16,
@@ -98,13 +104,13 @@ PRESETS = {
         selection_window=8,
         actor_ema=0.003,
     ),
-    # For a cost of force, which is known long before a success is: a large entropy and temporally extended actions lead
-    # back to contact, and end once greedy episodes succeed, as they are what pushes hardest.
-    "sac_gridclamp": LearnerConfig(
+    # The force cost is observed long before the first success. A large entropy and temporally extended actions lead back
+    # to contact; they end once greedy episodes succeed, because they push hardest.
+    "sac_gridclamp": OffPolicyConfig(
         algorithm="sac",
         learning_rate=7e-4,
         gamma=0.99,
-        gamma_per="decision",
+        gamma_per="action",
         train_freq=4,
         gradient_steps=48,
         learning_starts=200,
@@ -116,43 +122,82 @@ PRESETS = {
         greedy_episode_fraction=0.75,
         actor_ema=0.002,
     ),
-    # Cheap enough to watch: the narrow passage within a minute.
-    "tqc_fast": _QUICK,
-    # sKGRL reacts slowly: actions sampled anew at every decision seldom lead it around an obstacle.
-    "tqc_cheap_correlated": replace(_QUICK, constant_episodes=10),
+    # Learns the narrow passage within a minute.
+    "tqc_fast": _FAST,
+    # sKGRL is a low-pass filter: actions resampled at every transition seldom lead it around an obstacle.
+    "tqc_cheap_correlated": replace(_FAST, constant_episodes=10),
     "table_4_1_simulation": _TABLE_4_1,
     "table_4_1_robot": replace(_TABLE_4_1, tau=0.01, gamma=0.995, ent_coef="auto_0.1"),
     "table_3_2_iiwa": _TABLE_3_2,
-    # An episode of pouring has at most 150 decisions.
+    # An episode of pouring has at most 150 transitions.
     "pouring": replace(_TABLE_3_2, learning_starts=300),
     "table_3_2_sara": replace(_TABLE_3_2, algorithm="sac", learning_rate=1e-3, gamma=0.98),
 }
 
 
-def action_gamma(preset: LearnerConfig, action_repeat: int) -> float:
-    """The discount of one decision that lasts `action_repeat` control steps."""
-    return preset.gamma**action_repeat if preset.gamma_per == "control_step" else preset.gamma
+def action_gamma(config: OffPolicyConfig, action_repeat: int) -> float:
+    """Return the discount factor of an action that lasts `action_repeat` control steps."""
+    return config.gamma**action_repeat if config.gamma_per == "control_step" else config.gamma
 
 
-def resolve_preset(name: str, algorithm: str, settings: Mapping[str, Any] | None = None) -> LearnerConfig:
-    """The preset of that name for an algorithm, with single settings replaced.
+def resolve_preset(
+    preset: str | None, algorithm: str | None = None, settings: Mapping[str, Any] | None = None
+) -> LearnerConfig:
+    """Return the configuration of a learner: a preset with single settings replaced.
+
+    Args:
+        preset: Name of the preset; None for `default_preset` of the algorithm.
+        algorithm: Registered name of the learner; None for the preset's.
+        settings: Values by name, as numbers or as text.
 
     Raises:
-        InputError: for an unknown preset, algorithm or setting, or a value out of range.
+        InputError: If a name is unknown, the preset is of another kind of learner, or a value is out of range.
     """
-    if name not in PRESETS:
-        raise InputError(f"there is no preset {brief(name)}: {did_you_mean(name, PRESETS)}")
-    LEARNERS.get(algorithm)
-    known = {field.name for field in fields(LearnerConfig)} - {"algorithm"}
-    values = asdict(PRESETS[name]) | {"algorithm": algorithm}
-    for key, value in (settings or {}).items():
-        if key not in known:
-            raise InputError(f"a learner has no setting {brief(key)}: {did_you_mean(key, known)}")
-        values[key] = value
+    if preset is not None and preset not in PRESETS:
+        raise InputError(f"there is no preset {brief(preset)}: {did_you_mean(preset, PRESETS)}")
+    algorithm = algorithm or PRESETS[preset or DEFAULT_PRESET].algorithm
+    kind = LEARNERS.get(algorithm).Config
+    if preset is None:
+        preset = default_preset(algorithm)
+    elif not issubclass(kind, OffPolicyConfig):
+        raise InputError(f"the preset {preset} has settings that {algorithm} does not have: leave --preset out")
+    base = {} if preset is None else asdict(PRESETS[preset])
+    return make_config(algorithm, base | dict(settings or {}))
+
+
+def default_preset(algorithm: str) -> str | None:
+    """Return the preset used if none is chosen; None for a learner with settings of another kind."""
+    return DEFAULT_PRESET if issubclass(LEARNERS.get(algorithm).Config, OffPolicyConfig) else None
+
+
+def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
+    """Validate settings against the configuration class of a learner.
+
+    Args:
+        algorithm: Registered name of the learner.
+        settings: Values by name; the class's defaults stand for those that are missing.
+
+    Raises:
+        InputError: If there is no such learner or setting, or a value is out of range.
+    """
+    kind = LEARNERS.get(algorithm).Config
+    names = {field.name for field in fields(kind)}
+    values = {**settings, "algorithm": algorithm}
+    for name in values:
+        if name not in names:
+            known = names - {"algorithm"}
+            raise InputError(f"the learner {algorithm} has no setting {brief(name)}: {did_you_mean(name, known)}")
     try:
-        return LearnerConfig(**values)
+        return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
-        wrong = error.errors()[0]
-        key, example = str(wrong["loc"][0]), getattr(PRESETS[name], str(wrong["loc"][0]))
-        said = f"the learner's {key} cannot be {brief(values[key])} ({wrong['msg'].lower()})"
-        raise InputError(f"{said}: give a value such as {example!r}") from None
+        first = error.errors()[0]
+        name = str(first["loc"][0]) if first["loc"] else "configuration"
+        example = next((f" such as {field.default!r}" for field in fields(kind) if field.name == name), "")
+        raise InputError(
+            f"the learner's {name} cannot be {brief(values.get(name))} ({first['msg'].lower()}): give a value{example}"
+        ) from None
+
+
+def config_values(config: LearnerConfig) -> dict[str, Any]:
+    """Return a configuration as values that YAML can hold."""
+    return TypeAdapter(type(config)).dump_python(config, mode="json")

@@ -1,9 +1,8 @@
-"""A person who watches a run learn: pushes, stops, and says what was a success.
+"""Human-in-the-loop training: a supervisor corrects the policy, stops episodes and labels them.
 
-What a person does is recorded with the run. A push replaces the policy's action, as far as actions reach, so that it is
-remembered as a transition like any other; and it becomes via-points where the tool should have been, through which the
-demonstrations pass from the next episode on. Both go through guidance: a command that a person led to keeps the
-constraints as every other does.
+Interventions are recorded with the run. A correction replaces the policy's action, up to the action's limits, and is
+stored as a transition like any other. It also becomes via-points through which the demonstrations pass from the next
+episode on. Both go through guidance: a command that a supervisor causes satisfies the constraints as every other does.
 """
 
 from __future__ import annotations
@@ -23,215 +22,217 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.learning.run_folder import RunConfig
 
-WORTH = {"success": 50.0, "failure": -50.0}  # of what a person says, added to the reward
-APART = 5  # control steps between two via-points of a push
+LABEL_REWARDS = {"success": 50.0, "failure": -50.0}  # added to the reward when the supervisor labels an episode
+VIA_POINT_SPACING = 5  # control steps between two via-points of a correction
 
 
 class Supervisor:
-    """Who watches; this one does nothing."""
+    """Interface of a supervisor; this one does not intervene."""
 
-    def begin(self, env: gymnasium.Env) -> None:
-        """An episode begins."""
+    def on_episode_start(self, env: gymnasium.Env) -> None:
+        """Start an episode of `env`."""
 
-    def push(self, observation: np.ndarray) -> np.ndarray | None:
-        """How far beside the demonstrations the tool should be, (A,), in what a full action reaches; None for as it is.
+    def correction(self, observation: np.ndarray) -> np.ndarray | None:
+        """Return the wanted offset from the demonstrations, (A,), in units of a full action; None for no correction.
 
-        Beyond ±1 an action can't lead in this episode; the next one starts from there.
+        An action cannot reach beyond ±1 in this episode. The demonstrations of the next one pass through the offset.
         """
         return None
 
-    def says(self) -> str | None:
-        """What was said since it was last asked: "success", "failure" or "stop"."""
+    def label(self) -> str | None:
+        """Return the label given since the last call: "success", "failure" or "stop"; None if there is none."""
         return None
 
 
 class SupervisedEnv(gymnasium.Wrapper):
-    """An environment whose episodes a person may end."""
+    """Environment whose episodes a supervisor can end."""
 
-    def __init__(self, env: gymnasium.Env, person: Supervisor):
-        """
+    def __init__(self, env: gymnasium.Env, supervisor: Supervisor):
+        """Wrap an environment.
+
         Args:
-            env: the environment.
-            person: who watches.
+            env: Environment.
+            supervisor: Supervisor whose labels end an episode.
         """
         super().__init__(env)
-        self._person = person
+        self._supervisor = supervisor
 
     def step(self, action: Any) -> Any:
-        """One decision; an episode of which a person says how it went ends there."""
+        """Step the environment; a label of the supervisor ends the episode."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        said = None if terminated or truncated else self._person.says()
-        if said is None:
+        label = None if terminated or truncated else self._supervisor.label()
+        if label is None:
             return observation, reward, terminated, truncated, info
-        info = {**info, "is_success": said == "success", "termination": said}
-        worth = WORTH.get(said, 0.0)
-        return observation, float(reward) + worth, said in WORTH, said not in WORTH, info
+        info = {**info, "is_success": label == "success", "termination": label}
+        reward = float(reward) + LABEL_REWARDS.get(label, 0.0)
+        return observation, reward, label in LABEL_REWARDS, label not in LABEL_REWARDS, info
 
 
 class InterventionPolicy(Callback):
-    """Acts as the policy does, but where a person pushes; afterwards it knows the via-points of that.
+    """Policy that a supervisor's corrections override, and the via-points that result.
 
     Attributes:
-        interventions: how often the person began to push in this episode.
-        via_points: of all episodes, as the option of that name: a step and an output each, one after another.
+        interventions: Number of corrections that began in this episode.
     """
 
-    def __init__(self, env: gymnasium.Env, person: Supervisor, act: PolicyFn, known: ViaPointCorrections):
-        """
+    def __init__(self, env: gymnasium.Env, supervisor: Supervisor, act: PolicyFn, corrections: ViaPointCorrections):
+        """Construct the policy.
+
         Args:
-            env: the environment.
-            person: who pushes.
-            act: what acts otherwise.
-            known: of the environment, with what was corrected before.
+            env: Environment.
+            supervisor: Supervisor whose corrections override the policy.
+            act: Policy.
+            corrections: Via-points of the environment so far.
         """
-        self._env, self._person, self._act, self._known = env, person, act, known
-        self._pushed: dict[int, np.ndarray] = {}
-        self._push: np.ndarray | None = None
+        self._env, self._supervisor, self._act, self._corrections = env, supervisor, act, corrections
+        self._offsets: dict[int, np.ndarray] = {}
+        self._offset: np.ndarray | None = None
         self.interventions = 0
 
     @property
     def via_points(self) -> tuple[float, ...]:
-        """With those of this episode."""
-        return self._known.with_pushes(self._pushed, still_pushing=self._push is not None)
+        """Via-points including those of this episode, as the option `via_points`: (step, output) one after another."""
+        return self._corrections.with_offsets(self._offsets, is_held=self._offset is not None)
 
     def on_episode_start(self) -> None:
-        """An episode begins."""
-        self._pushed, self._push, self.interventions = {}, None, 0
-        self._person.begin(self._env)
+        """Start an episode without corrections."""
+        self._offsets, self._offset, self.interventions = {}, None, 0
+        self._supervisor.on_episode_start(self._env)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """The policy's action, or as much of the push as an action reaches."""
-        push = self._person.push(observation)
-        if push is not None and self._push is None:
+        """Return the policy's action (A,), or the correction clipped to the action's limits."""
+        offset = self._supervisor.correction(observation)
+        if offset is not None and self._offset is None:
             self.interventions += 1
-        self._push = push
-        return self._act(observation) if push is None else np.clip(push, -1.0, 1.0).astype(np.float32)
+        self._offset = offset
+        return self._act(observation) if offset is None else np.clip(offset, -1.0, 1.0).astype(np.float32)
 
-    def on_step(self, decision: Transition) -> None:
-        """Remembers where the tool should have been by then."""
-        if self._push is not None:
-            self._pushed[int(decision.info["control_steps"]) - 1] = self._push
+    def on_step(self, transition: Transition) -> None:
+        """Store the correction at the control step that has been reached."""
+        if self._offset is not None:
+            self._offsets[int(transition.info["control_steps"]) - 1] = self._offset
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """How often the person intervened."""
+        """Return the column `interventions`."""
         return {"interventions": self.interventions}
 
 
 class ViaPointCorrections:
-    """Where pushes lead in an environment's demonstrations.
+    """Via-points in the demonstrations of an environment, made of a supervisor's corrections.
 
     Attributes:
-        points: via-points so far.
+        points: Via-points so far, as the option `via_points`.
+        reach: Mean displacement of a full action, (A,), in units of the output.
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any]):
-        """
+        """Construct the corrections.
+
         Args:
-            task: its name.
-            environment: its options.
+            task: Name of the task.
+            environment: Options of the environment.
 
         Raises:
-            InputError: for guidance that has no demonstrations to correct.
+            InputError: If the guidance has no demonstrations to correct.
         """
         config = EnvConfig.resolve(task, environment)
         declared, kind = config.make_task(), config.guidance_kind
         if "demonstrations" not in {one for needed in kind.needs for one in needed}:
             raise InputError(
-                f"a person corrects demonstrations, which guidance {kind.name!r} does without: choose another, such as "
+                f"corrections need demonstrations, which guidance {kind.name!r} does not use: choose another, such as "
                 "kgrl"
             )
         values = config.options
         self.points = tuple(values["via_points"])
-        shown = declared.reference()
-        self._reference = pass_through(shown, self.points, kernel_from_options(values))
+        reference = declared.reference()
+        self._reference = pass_through(reference, self.points, kernel_from_options(values))
         action_dims = values["action_dims"]
-        self._explored = list(range(shown.num_outputs)) if action_dims is None else list(action_dims)
-        spread = np.sqrt(np.mean(shown.standard_deviations**2, axis=0))
-        self.reach = np.sqrt(3.0) * values["action_scale"] * spread[self._explored]
-        """(A,): how far a full action leads on average [output]."""
+        self._action_dims = list(range(reference.num_outputs)) if action_dims is None else list(action_dims)
+        deviation = np.sqrt(np.mean(reference.standard_deviations**2, axis=0))
+        self.reach = np.sqrt(3.0) * values["action_scale"] * deviation[self._action_dims]
         self._constraints = declared.constraints()
 
-    def with_pushes(self, pushes: Mapping[int, np.ndarray], *, still_pushing: bool = False) -> tuple[float, ...]:
-        """The via-points with those of an episode's pushes; a newer one replaces older ones beside it.
+    def with_offsets(self, offsets: Mapping[int, np.ndarray], *, is_held: bool = False) -> tuple[float, ...]:
+        """Return the via-points including an episode's corrections; new ones replace old ones nearby.
 
         Args:
-            pushes: by control step, (A,) in what a full action reaches.
-            still_pushing: whether the person had not let go when the episode ended: then the last push is meant for the
-                rest of the motion, too.
+            offsets: Offsets (A,) by control step, in units of a full action.
+            is_held: Whether a correction lasted when the episode ended; it then applies to the rest of the motion.
         """
-        if not pushes:
+        if not offsets:
             return self.points
-        steps, last = sorted(pushes), self._reference.num_steps - 1
-        meant = {min(step, last): pushes[step] for step in steps}
-        if still_pushing:
-            meant |= dict.fromkeys([*range(steps[-1], last, APART), last], pushes[steps[-1]])
-        kept: dict[int, np.ndarray] = {}
-        for step in sorted(meant):
-            if not kept or step - max(kept) >= APART or step == max(meant):
-                kept[step] = self._led_to(step, meant[step])
+        steps, last = sorted(offsets), self._reference.num_steps - 1
+        wanted = {min(step, last): offsets[step] for step in steps}
+        if is_held:
+            wanted |= dict.fromkeys([*range(steps[-1], last, VIA_POINT_SPACING), last], offsets[steps[-1]])
+        new: dict[int, np.ndarray] = {}
+        for step in sorted(wanted):
+            if not new or step - max(new) >= VIA_POINT_SPACING or step == max(wanted):
+                new[step] = self._displaced(step, wanted[step])
         size = 1 + self._reference.num_outputs
-        older = {int(row[0]): row[1:] for row in np.reshape(self.points, (-1, size))}
-        first, end = min(kept) - APART, max(kept) + APART
-        merged = {step: point for step, point in older.items() if not first < step < end} | kept
+        old = {int(row[0]): row[1:] for row in np.reshape(self.points, (-1, size))}
+        first, end = min(new) - VIA_POINT_SPACING, max(new) + VIA_POINT_SPACING
+        merged = {step: point for step, point in old.items() if not first < step < end} | new
         return tuple(float(number) for step in sorted(merged) for number in (step, *merged[step]))
 
-    def _led_to(self, step: int, push: np.ndarray) -> np.ndarray:
-        """The allowed output (O,) nearest to where a push leads."""
+    def _displaced(self, step: int, offset: np.ndarray) -> np.ndarray:
+        """Return the admissible output (O,) nearest to the displaced demonstration."""
         output = self._reference.means[step].copy()
-        output[self._explored] += push * self.reach
+        output[self._action_dims] += offset * self.reach
         return output if self._constraints is None else self._constraints.nearest(output, step)
 
 
 class SupervisedTraining:
-    """A run's episodes with a person beside them: each in an environment that knows what was corrected before it.
+    """Episodes of a run with a supervisor, each in an environment with the via-points of the episodes before.
 
     Attributes:
-        env: the present environment.
+        env: The current environment.
     """
 
-    def __init__(self, config: RunConfig, person: Supervisor, state: Mapping[str, Any]):
-        """
+    def __init__(self, config: RunConfig, supervisor: Supervisor, state: Mapping[str, Any]):
+        """Construct the environment of the first episode.
+
         Args:
-            config: of the run.
-            person: who watches.
-            state: of the checkpoint from which the run goes on; empty where it begins.
+            config: Configuration of the run.
+            supervisor: Supervisor of the run.
+            state: Values of the checkpoint from which the run resumes; empty for a new run.
 
         Raises:
-            InputError: for guidance that has no demonstrations to correct.
+            InputError: If the guidance has no demonstrations to correct.
         """
-        self._config, self._person = config, person
-        self._enter(tuple(state.get("via_points", config.environment.get("via_points", ()))))
+        self._config, self._supervisor = config, supervisor
+        self._build(tuple(state.get("via_points", config.environment.get("via_points", ()))))
 
     @property
     def points(self) -> tuple[float, ...]:
-        """Via-points so far."""
+        """Via-points so far, as the option `via_points`."""
         return self._corrections.points
 
     @property
     def config(self) -> RunConfig:
-        """The run's configuration, with what was corrected so far: in its environment whoever judges it acts, too."""
+        """Configuration of the run with the via-points so far, for evaluation in the corrected environment."""
         return replace(self._config, environment={**self._config.environment, "via_points": self.points})
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint has to know."""
+        """Return the values for a checkpoint."""
         return {"via_points": list(self.points)}
 
-    def rollout(self, act: PolicyFn, *observers: Callback, index: int) -> dict[str, Any]:
-        """One episode; its row says how often the person intervened, and the next one knows the via-points of that."""
-        corrected = InterventionPolicy(self.env, self._person, act, self._corrections)
-        row = rollout(SupervisedEnv(self.env, self._person), corrected, *observers, index=index)
-        if corrected.via_points != self.points:
-            drawn = self.env.unwrapped.np_random.bit_generator.state
+    def rollout(self, act: PolicyFn, *callbacks: Callback, index: int) -> dict[str, Any]:
+        """Run one episode and return its row with the column `interventions`; build the next environment."""
+        policy = InterventionPolicy(self.env, self._supervisor, act, self._corrections)
+        row = rollout(SupervisedEnv(self.env, self._supervisor), policy, *callbacks, index=index)
+        if policy.via_points != self.points:
+            random_state = self.env.unwrapped.np_random.bit_generator.state
             self.env.close()
-            self._enter(corrected.via_points)
-            self.env.unwrapped.np_random.bit_generator.state = drawn
-            for observer in observers:
-                if isinstance(observer, EnvCallback):
-                    observer.env, observer.base = self.env, self.env.unwrapped
+            self._build(policy.via_points)
+            self.env.unwrapped.np_random.bit_generator.state = random_state
+            for callback in callbacks:
+                if isinstance(callback, EnvCallback):
+                    callback.env, callback.base = self.env, self.env.unwrapped
         return row
 
-    def _enter(self, points: tuple[float, ...]) -> None:
+    def _build(self, points: tuple[float, ...]) -> None:
         environment = {**self._config.environment, "via_points": points}
         self._corrections = ViaPointCorrections(self._config.task, environment)
         self.env: Any = make_environment(self._config.task, environment)
-        self.env.reset(seed=self._config.seed)  # what is hidden and constant in a run is sampled here, as in training
+        self.env.reset(seed=self._config.seed)  # samples the hidden offset of the run, as in training

@@ -1,10 +1,20 @@
-"""What training needs of a learner, and the learners by name."""
+"""Interface of a learner, and the registry of learners.
+
+A learner is one file: a subclass of `Learner` (or of `guiderail.tools.learning.off_policy.OffPolicyLearner`, for an
+algorithm of Stable-Baselines3) that is registered by `register_learner` or by an entry point of the group
+`guiderail.learners`.
+"""
+
+from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
@@ -12,80 +22,160 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Callback
 
 
+def reject_bool(value: Any) -> Any:
+    """Raise a ValueError if a number is given as a truth value."""
+    if isinstance(value, bool):
+        raise ValueError("it is a number")
+    return value
+
+
+Positive = Annotated[int, Field(ge=1, le=10**9), BeforeValidator(reject_bool)]
+NonNegative = Annotated[int, Field(ge=0, le=10**9), BeforeValidator(reject_bool)]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class LearnerConfig:
+    """Base class of the learners' configurations: the settings that the training loop reads.
+
+    A learner adds settings of its own by a derived pydantic dataclass, named as its `Config`.
+
+    Attributes:
+        algorithm: Registered name of the learner.
+        demonstration_episodes: Number of first episodes in which a demonstrator acts; their transitions are learned from.
+        symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
+        pipelined: Learn in a second process while the next episode is simulated, with weights that are one episode
+            older. Deterministic as well.
+    """
+
+    algorithm: str
+    demonstration_episodes: NonNegative = 0
+    symmetry: bool | Literal["near"] = False
+    pipelined: bool = False
+
+
 class Learner(Callback, ABC):
-    """Acts in training episodes, and learns from what it sees of them as their observer."""
+    """Base class of learners: acts in training episodes and learns from their transitions.
+
+    The training loop constructs it as `Learner(config, env, action_repeat=…, seed=…, max_transitions=…, symmetry=…)`:
+    the configuration, the environment (for its spaces), the control steps that an action lasts, the seed, the largest
+    number of transitions of the run, and the task's `Symmetry` or None. It is a callback of every training episode:
+    `on_episode_start`, then `act` and `on_step` for every transition, then `on_episode_end`, then `submit_episode`.
+
+    Attributes:
+        Config: Configuration class, a pydantic dataclass derived from `LearnerConfig`.
+        records_metrics: Whether `metrics` will be read; set by the training loop.
+    """
+
+    Config: ClassVar[type[LearnerConfig]] = LearnerConfig
+    records_metrics: bool = False
 
     @abstractmethod
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """The action for an observation, in the units of the action space."""
+        """Return the action for an observation.
+
+        Args:
+            observation: Observation, of the shape of the observation space.
+
+        Returns:
+            Action of the shape and in the units of the action space.
+        """
 
     def submit_episode(self) -> None:
-        """Called between episodes, when the last one's checkpoint, if it has one, is written."""
+        """Continue after an episode whose checkpoint, if it has one, has been written."""
 
     def finish(self) -> None:
-        """Called after the last episode: everything is learned when it returns."""
+        """Block until everything is learned; called after the last episode."""
 
     def close(self) -> None:
-        """Ends what it began, such as other processes, whatever they do."""
+        """Release resources such as processes; called even if training fails."""
+
+    def metrics(self) -> Mapping[str, float]:
+        """Return scalars since the last call, such as losses, by their names in a log."""
+        return {}
 
     @abstractmethod
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """What a run leaves, as NumPy evaluates it; `description` is what else is known of it."""
+        """Return the learned policy.
+
+        Args:
+            description: Further entries of the policy's description, such as the observation's shape.
+        """
 
     @abstractmethod
     def has_diverged(self) -> bool:
-        """Whether anything that it learned is not a finite number."""
+        """Return True if a learned parameter is NaN or infinite."""
 
     @abstractmethod
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Between episodes: everything that the rest of a run depends on, as arrays by name and as what JSON holds."""
+        """Return everything that the rest of the run depends on, between two episodes.
+
+        Returns:
+            Arrays of any shape by name, and values that JSON can hold.
+        """
 
     @abstractmethod
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Becomes what it was when `state` was called. KeyError, ValueError or RuntimeError where it does not fit."""
+        """Set the state to what `state` returned.
+
+        Args:
+            arrays: Arrays by name, of the shapes that `state` returned.
+            values: Values by name.
+
+        Raises:
+            KeyError: If an entry is missing. ValueError and RuntimeError likewise mean that the state does not fit.
+        """
 
 
-# An entry is called with a preset and an environment, and by name with `action_repeat`, `seed`, `decisions` and `symmetry`.
-LEARNERS: Registry[Callable[..., Learner]] = Registry("algorithm", entry_points="guiderail.learners")
+class DeferredLearner(NamedTuple):
+    """Registry entry of a learner whose module is imported when the learner is constructed.
+
+    PyTorch takes seconds to import; configurations and lists of names do not need it.
+
+    Attributes:
+        module: Import name of the module.
+        name: Name of the class.
+        Config: Configuration class.
+    """
+
+    module: str
+    name: str
+    Config: type[LearnerConfig]
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Learner:
+        """Import the module and construct the learner."""
+        return getattr(import_module(self.module), self.name)(*args, **kwargs)
+
+
+# An entry is a class derived from `Learner`, or a callable with its arguments and a `Config`.
+LEARNERS: Registry[Any] = Registry(
+    "algorithm",
+    package="guiderail.tools.learning",
+    decorator="register_learner",
+    entry_points="guiderail.learners",
+)
 register_learner = LEARNERS.register
 learner_names = LEARNERS.names
 
 
-def diverged() -> InputError:
-    """What a person is told of a learner that `has_diverged`."""
-    return InputError("learning diverged: train anew with a smaller --set learning_rate=...")
+def divergence_error() -> InputError:
+    """Return the error for a learner that `has_diverged`."""
+    return InputError("learning diverged: train again with a smaller --set learning_rate=...")
 
 
-def arguments_of(config: Any, task: Any) -> dict[str, Any]:
-    """What a learner is called with by name: `action_repeat`, `seed`, `decisions` (the most that the run can take), `symmetry`.
+def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
+    """Return the keyword arguments that a learner is constructed with.
 
-    What a person pushed, demonstrations no longer have on their other sides: then there is no symmetry to learn from.
+    There is no symmetry if the demonstrations have been corrected by via-points: they are not symmetric then.
 
     Args:
-        config: the run's `RunConfig`.
-        task: its task.
+        config: `RunConfig` of the run.
+        task: Task of the run.
     """
-    decisions = config.episodes * -(-task.num_steps // config.action_repeat)
     symmetry = task.near_symmetry if config.learner.symmetry == "near" else task.symmetry
-    pushed = config.with_person or bool(config.environment.get("via_points"))
+    is_corrected = config.human_in_the_loop or bool(config.environment.get("via_points"))
     return {
         "action_repeat": config.action_repeat,
         "seed": config.seed,
-        "decisions": decisions,
-        "symmetry": None if pushed else symmetry,
+        "max_transitions": config.episodes * -(-task.num_steps // config.action_repeat),
+        "symmetry": None if is_corrected else symmetry,
     }
-
-
-# These import PyTorch, which takes seconds, when one is made.
-@register_learner("sac")
-def _sac(*given: Any, **named: Any) -> Learner:
-    from guiderail.tools.learning.off_policy import SacLearner
-
-    return SacLearner(*given, **named)
-
-
-@register_learner("tqc")
-def _tqc(*given: Any, **named: Any) -> Learner:
-    from guiderail.tools.learning.off_policy import TqcLearner
-
-    return TqcLearner(*given, **named)

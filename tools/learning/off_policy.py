@@ -1,9 +1,10 @@
-"""Off-policy learners: any algorithm with Stable-Baselines3's interface, told when to act, remember and learn.
+"""Off-policy learners: any algorithm with the interface of Stable-Baselines3.
 
-Only the networks, the replay buffer and the gradient step are Stable-Baselines3's. Acting and deciding when to train
-are here, so that everything that a run depends on has a name and can be written to a checkpoint. An algorithm more is
-one file: a subclass of `OffPolicyLearner` that names it, registered by `register_learner` or by an entry point of the
-group `guiderail.learners`.
+Stable-Baselines3 supplies the networks, the replay buffer and the training step. Acting, exploring and the schedule of
+trainings are here, so that all state that a run depends on can be written to a checkpoint. Another algorithm is one
+file: a subclass of `OffPolicyLearner` that names the algorithm's class and is registered by `register_learner`. It is
+trained by Stable-Baselines3's own step; SAC and TQC have an equivalent fast one (`guiderail.tools.learning.fast_sb3`),
+which the setting `training_step` switches off.
 """
 
 import copy
@@ -11,12 +12,14 @@ import inspect
 import json
 import random
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.preprocessing import is_image_space
@@ -28,50 +31,55 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.checkpoint import CheckpointSelection
-from guiderail.tools.learning.config import LearnerConfig, action_gamma
-from guiderail.tools.learning.fast_sb3.ensemble import EnsembleSac, EnsembleTqc
-from guiderail.tools.learning.learner import Learner, diverged
+from guiderail.tools.learning.config import OffPolicyConfig, action_gamma
+from guiderail.tools.learning.fast_sb3.training_step import FastSac, FastTqc
+from guiderail.tools.learning.learner import Learner, divergence_error
 
-IMAGE_POOL = 5  # pixels; 110×144×3 becomes 22×28×3
+IMAGE_POOL = 5  # side of the averaged squares [pixels]; 110×144×3 becomes 22×28×3
 
 
-class PooledImage(BaseFeaturesExtractor):
-    """An image as one vector (thesis, 4.4.1), after actor_ema squares of pixels.
+class AveragePooledImage(BaseFeaturesExtractor):
+    """Features of an image: the averages of squares of pixels, as one vector (thesis, 4.4.1).
 
-    Flattened as it is, 110×144×3 makes a first layer of twelve million weights a network, and a gradient step of most
-    of a second on one core; what the task needs to see is larger than a pixel.
+    Without pooling, an image of 110×144×3 makes a first layer of twelve million weights per network and a gradient step
+    of most of a second on one core. What the task needs to see is larger than a pixel.
     """
 
     def __init__(self, observation_space: spaces.Box, pool: int):
-        """
+        """Construct the extractor.
+
         Args:
-            observation_space: channels first.
-            pool: the side of the squares, in pixels.
+            observation_space: Space of images (channels, height, width).
+            pool: Side of the squares [pixels].
         """
         channels, height, width = observation_space.shape
         super().__init__(observation_space, channels * (height // pool) * (width // pool))
         self.pool = pool
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """(batch, channels, height, width) in [0, 1] to (batch, features)."""
+        """Map images (batch, channels, height, width) in [0, 1] to features (batch, features)."""
         return torch.nn.functional.avg_pool2d(observations, self.pool).flatten(1)
 
 
 class NormalizedReLU(torch.nn.Module):
-    """A layer's outputs, normalized without learned parameters, and rectified."""
+    """Layer normalization without learned parameters, followed by a rectifier."""
 
     kind = "normalized_relu"
 
     def forward(self, features: torch.Tensor) -> torch.Tensor:
-        """(…, units) to the same shape."""
+        """Map features (…, units) to the same shape."""
         return torch.relu(torch.nn.functional.layer_norm(features, features.shape[-1:]))
 
 
-def policy_of(actor: Any, description: Mapping[str, Any]) -> Policy:
-    """The policy of a Stable-Baselines3 actor: linear layers, what rectifies between them, and a tanh at the end.
+def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
+    """Return the policy of a Stable-Baselines3 actor: linear layers with rectifiers between them, and a final tanh.
+
+    Args:
+        actor: The actor network.
+        description: Further entries of the policy's description, such as the observation's shape.
 
     Raises:
-        InputError: for an actor with other layers.
+        InputError: If the actor has other layers.
     """
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
     linear, between = layers[::2], layers[1::2]
@@ -97,206 +105,225 @@ def policy_of(actor: Any, description: Mapping[str, Any]) -> Policy:
 
 
 class OffPolicyLearner(Learner):
-    """An off-policy algorithm of Stable-Baselines3 that is told when to act, to remember and to learn.
+    """Learner of an off-policy algorithm with the interface of Stable-Baselines3.
 
     Attributes:
-        algorithm: the class; a subclass names it.
+        algorithm: Class of Stable-Baselines3; a subclass names it.
+        fast_algorithm: The same algorithm with a faster training step, or None; used unless `training_step` is "sb3".
+        config: The settings.
+        model: Instance of the algorithm.
+        averaged: Exponential moving average of the actor; None if `actor_ema` is 0.
+        transitions: Number of transitions so far.
+        episodes: Number of episodes so far.
+        random: Generator of exploration.
     """
 
-    algorithm: type
+    Config = OffPolicyConfig
+    algorithm: ClassVar[type]
+    fast_algorithm: ClassVar[type | None] = None
 
     def __init__(
         self,
-        preset: LearnerConfig,
+        config: OffPolicyConfig,
         env: gymnasium.Env,
         *,
         action_repeat: int,
         seed: int,
-        decisions: int,
+        max_transitions: int,
         symmetry: Symmetry | None = None,
     ):
-        """
+        """Construct the learner.
+
         Args:
-            preset: how to learn.
-            env: for its spaces only.
-            hold: control steps that an action lasts.
-            seed: of the networks, and of everything random in training.
-            decisions: the most that this run can take, so that the replay buffer asks for no more memory than it uses.
-            symmetry: of the task, where it has one; used if the preset says so.
+            config: Settings.
+            env: Environment; only its spaces are used.
+            action_repeat: Control steps that an action lasts.
+            seed: Seed of the networks and of everything random in training.
+            max_transitions: Largest number of transitions of the run, which bounds the replay buffer's memory.
+            symmetry: Symmetry of the task; used if the settings say so.
         """
-        self.symmetry = symmetry if preset.symmetry else None
-        self._sides = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)
-        networks: dict[str, Any] = {"net_arch": list(preset.net_arch), "optimizer_kwargs": {"fused": True}}
-        if preset.layer_norm:
+        self.symmetry = symmetry if config.symmetry else None
+        self._copies = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)  # of a transition in the buffer
+        networks: dict[str, Any] = {"net_arch": list(config.net_arch), "optimizer_kwargs": {"fused": True}}
+        if config.layer_norm:
             networks["activation_fn"] = NormalizedReLU
         if is_image_space(env.observation_space):
-            networks |= {"features_extractor_class": PooledImage, "features_extractor_kwargs": {"pool": IMAGE_POOL}}
-        self.preset = preset
-        self.decisions = 0
+            pooling = {"features_extractor_kwargs": {"pool": IMAGE_POOL}}
+            networks |= {"features_extractor_class": AveragePooledImage, **pooling}
+        self.config = config
+        self.transitions = 0
         arguments = {
-            "learning_rate": preset.learning_rate,
-            "buffer_size": min(preset.buffer_size, decisions + 1),
-            "batch_size": preset.batch_size,
-            "tau": preset.tau,
-            "gamma": action_gamma(preset, action_repeat),
-            "ent_coef": preset.ent_coef if preset.ent_coef.startswith("auto") else float(preset.ent_coef),
+            "learning_rate": config.learning_rate,
+            "buffer_size": min(config.buffer_size, max_transitions + 1),
+            "batch_size": config.batch_size,
+            "tau": config.tau,
+            "gamma": action_gamma(config, action_repeat),
+            "ent_coef": config.ent_coef if config.ent_coef.startswith("auto") else float(config.ent_coef),
             "policy_kwargs": networks,
             "seed": seed,
             "device": "cpu",
         }
-        taken = inspect.signature(self.algorithm).parameters  # not every algorithm has an entropy
-        self.model = self.algorithm("MlpPolicy", env, **{k: v for k, v in arguments.items() if k in taken})
+        is_fast = config.training_step == "fast" and self.fast_algorithm is not None
+        algorithm: Any = self.fast_algorithm if is_fast else self.algorithm
+        accepted = inspect.signature(algorithm).parameters  # not every algorithm has an entropy coefficient
+        self.model = algorithm("MlpPolicy", env, **{k: v for k, v in arguments.items() if k in accepted})
         self.model.replay_buffer = NStepReplayBuffer(
-            self._sides * self.model.buffer_size,
+            self._copies * self.model.buffer_size,
             self.model.observation_space,
             self.model.action_space,
             device="cpu",
-            n_envs=self._sides,
-            n_steps=preset.n_steps,
+            n_envs=self._copies,
+            n_steps=config.n_steps,
             gamma=self.model.gamma,
         )
         self.model.set_logger(Logger(folder=None, output_formats=[]))
         self.random = np.random.default_rng(seed)
-        self.averaged = copy.deepcopy(self.model.actor) if preset.actor_ema else None
-        self.selection = CheckpointSelection(preset.selection_window) if preset.selection_window else None
+        self.averaged = copy.deepcopy(self.model.actor) if config.actor_ema else None
+        self.selection = CheckpointSelection(config.selection_window) if config.selection_window else None
         self.episodes = 0
-        self._greedy = False  # whether this episode does not explore
-        self._decided = False  # whether this episode has a decision that is remembered
-        self._greedy_successes = 0  # in a row
-        self._constant: np.ndarray | None = None  # the action of this episode, where it has only one
-        self._repeats = 0  # decisions for which an extended action still goes on
-        self._extended: np.ndarray | None = None
+        self._is_greedy = False  # this episode does not explore
+        self._has_transition = False  # this episode has a transition in the replay buffer
+        self._greedy_successes = 0  # consecutive
+        self._constant_action: np.ndarray | None = None  # the action of a constant episode
+        self._extended_action: np.ndarray | None = None
+        self._extended_steps = 0  # actions for which the extended action still lasts
 
-    def has_begun(self) -> bool:
-        """Whether enough is known to learn from; until then actions are uniformly random."""
-        return self.decisions >= self.preset.learning_starts
+    def is_learning(self) -> bool:
+        """Return True once there are enough transitions to learn from; until then actions are uniformly random."""
+        return self.transitions >= self.config.learning_starts
 
     def on_episode_start(self) -> None:
-        """Begins an episode, and decides how it explores."""
+        """Start an episode and choose how it explores."""
         self.episodes += 1
-        self._decided = False
-        share = self.preset.greedy_episode_fraction
-        own = self.episodes - self.preset.demonstration_episodes  # in those before, somebody else acts
-        self._constant = self._uniform() if 0 < own <= self.preset.constant_episodes else None
-        due = int(self.episodes * share) > int((self.episodes - 1) * share)
-        self._greedy = due and own > 0 and self._constant is None and self.has_begun()
-        self._repeats = 0
-        if self.selection is not None and self._greedy:
+        self._has_transition = False
+        fraction = self.config.greedy_episode_fraction
+        own = self.episodes - self.config.demonstration_episodes  # a demonstrator acts in the episodes before
+        self._constant_action = self._uniform() if 0 < own <= self.config.constant_episodes else None
+        is_due = int(self.episodes * fraction) > int((self.episodes - 1) * fraction)
+        self._is_greedy = is_due and own > 0 and self._constant_action is None and self.is_learning()
+        self._extended_steps = 0
+        if self.selection is not None and self._is_greedy:
             self.selection.begin(self.actor(), self._greedy_successes)
 
-    def on_step(self, decision: Transition) -> None:
-        """Remembers a decision, and learns if it is time to. Where the simulation failed nothing followed: what came
-        before is then the episode's last, as at a time limit.
-        """
-        if "simulation_failure" in decision.info:
-            self._cut_short()
-            return
-        self.remember(decision)
-        self.learn()
-        self._decided = True
+    def on_step(self, transition: Transition) -> None:
+        """Store a transition and train if it is due.
 
-    def _cut_short(self) -> None:
-        if self._decided:
-            buffer = self.model.replay_buffer
-            buffer.dones[buffer.pos - 1] = buffer.timeouts[buffer.pos - 1] = 1.0
+        A transition in which the simulation failed has no next observation and is not stored. The one before becomes the
+        episode's last, as at a time limit.
+        """
+        if "simulation_failure" in transition.info:
+            if self._has_transition:
+                buffer = self.model.replay_buffer
+                buffer.dones[buffer.pos - 1] = buffer.timeouts[buffer.pos - 1] = 1.0
+            return
+        self.store(transition)
+        self.learn()
+        self._has_transition = True
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Ends an episode. One in which a person pushed says nothing of the policy."""
+        """End an episode; one with interventions of a supervisor does not count for the checkpoint selection."""
         if row.get("interventions"):
-            self.leave_out()
-        elif self._greedy:
+            self.exclude_episode()
+        elif self._is_greedy:
             self._greedy_successes = self._greedy_successes + 1 if row["success"] else 0
             if self.selection is not None:
                 self.selection.finish(bool(row["success"]))
         return {}
 
-    def leave_out(self) -> None:
-        """Ends an episode that does not count for the selection, as if it had not been greedy."""
-        if self._greedy and self.selection is not None:
-            self.selection.leave_out()
+    def exclude_episode(self) -> None:
+        """End an episode that does not count for the checkpoint selection, as if it had not been greedy."""
+        if self._is_greedy and self.selection is not None:
+            self.selection.exclude()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Uniform until learning starts; then sampled from the policy, or in a greedy episode its mean."""
-        if self._constant is not None:
-            return self._constant
-        if not self.has_begun():
+        """Return the action: uniform before learning starts, then sampled, or the mean in a greedy episode."""
+        if self._constant_action is not None:
+            return self._constant_action
+        if not self.is_learning():
             return self._uniform()
-        if not self._greedy:
+        if not self._is_greedy:
             extended = self._temporally_extended()
             return self.explore(observation) if extended is None else extended
         with torch.no_grad():
             return self.actor()._predict(self.model.policy.obs_to_tensor(observation)[0], deterministic=True)[0].numpy()
 
     def explore(self, observation: np.ndarray) -> np.ndarray:
-        """An exploring action of the policy; one that is deterministic needs noise from its subclass."""
+        """Return a sampled action; a subclass with a deterministic policy adds noise."""
         return self.model.predict(observation, deterministic=False)[0]
 
     def _temporally_extended(self) -> np.ndarray | None:
-        """Now and then one uniform action for several decisions; None in between.
+        """Return a uniform action that lasts for several transitions; None while there is none.
 
-        The εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations: it leaves where a
-        policy has settled, such as above all contact, and it says what going on in one direction is worth.
+        The εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves states in
+        which a policy has settled, such as above all contact, and tells the value of moving on in one direction.
         """
-        if self._repeats == 0:
-            known = 0 < self.preset.ez_greedy_until <= self._greedy_successes
-            if known or not self.preset.ez_greedy or self.random.random() >= self.preset.ez_greedy:
+        if self._extended_steps == 0:
+            is_over = 0 < self.config.ez_greedy_until <= self._greedy_successes
+            if is_over or not self.config.ez_greedy or self.random.random() >= self.config.ez_greedy:
                 return None
-            self._repeats = int(self.random.integers(1, self.preset.ez_greedy_longest + 1))
-            self._extended = self._uniform()
-        self._repeats -= 1
-        return self._extended
+            self._extended_steps = int(self.random.integers(1, self.config.ez_greedy_longest + 1))
+            self._extended_action = self._uniform()
+        self._extended_steps -= 1
+        return self._extended_action
 
     def _uniform(self) -> np.ndarray:
         space = self.model.action_space
         assert isinstance(space, spaces.Box)
         return self.random.uniform(space.low, space.high).astype(space.dtype)
 
-    def remember(self, one: Transition) -> None:
-        """Takes a decision into the replay buffer.
+    def store(self, transition: Transition) -> None:
+        """Add a transition, and its symmetric copies, to the replay buffer.
 
-        A time limit is not an end of the task: its last decision is bootstrapped (partial-episode bootstrapping, Pardo
-        et al., 2018), as whoever is near the goal then is worth what one is worth who is there earlier. The clock that
-        is observed is for telling the phases of a skill apart, and not for what is left of the time.
+        A time limit does not terminate the task: its last transition is bootstrapped (partial-episode bootstrapping,
+        Pardo et al., 2018), because the value of a state must not depend on the time left. The observed clock tells the
+        phases of a skill apart; it is not the time left.
         """
-        infos = [{"TimeLimit.truncated": one.truncated and not one.terminated}]
-        observation, following = one.observation, one.following
-        action = self.model.policy.scale_action(np.asarray(one.action)[None])
-        if np.ndim(observation) == 3:  # an image; Stable-Baselines3 keeps channels first
+        infos = [{"TimeLimit.truncated": transition.truncated and not transition.terminated}]
+        observation, following = transition.observation, transition.following
+        action = self.model.policy.scale_action(np.asarray(transition.action)[None])[0]
+        if np.ndim(observation) == 3:  # an image; Stable-Baselines3 expects channels first
             observation, following = np.moveaxis(observation, -1, 0), np.moveaxis(following, -1, 0)
-        seen, did, then = [observation], [action[0]], [following]
+        observations, actions, next_observations = [observation], [action], [following]
         if self.symmetry is not None:
-            seen.extend(self.symmetry.observations @ observation)
-            did.extend(self.symmetry.actions @ action[0])
-            then.extend(self.symmetry.observations @ following)
+            observations.extend(self.symmetry.observations @ observation)
+            actions.extend(self.symmetry.actions @ action)
+            next_observations.extend(self.symmetry.observations @ following)
         self.model.replay_buffer.add(
-            np.array(seen),
-            np.array(then),
-            np.array(did),
-            np.full(self._sides, one.reward),
-            np.full(self._sides, one.is_last),
-            infos * self._sides,
+            np.array(observations),
+            np.array(next_observations),
+            np.array(actions),
+            np.full(self._copies, transition.reward),
+            np.full(self._copies, transition.is_last),
+            infos * self._copies,
         )
-        self.decisions += 1
+        self.transitions += 1
 
     def learn(self) -> None:
-        """Trains if it is time to: every `train_freq` decisions of the whole run, whatever the episodes' lengths."""
-        if not self.has_begun() or self.decisions % self.preset.train_freq:
+        """Train if it is due: every `train_freq` transitions of the run, independent of the episodes' lengths."""
+        if not self.is_learning() or self.transitions % self.config.train_freq:
             return
-        self.model.train(self.preset.gradient_steps, self.preset.batch_size)
+        self.model.records_metrics = self.records_metrics
+        self.model.train(self.config.gradient_steps, self.config.batch_size)
         if self.has_diverged():
-            raise diverged()
+            raise divergence_error()
         if self.averaged is not None:
-            follow = 1.0 - (1.0 - self.preset.actor_ema) ** self.preset.gradient_steps
+            weight = 1.0 - (1.0 - self.config.actor_ema) ** self.config.gradient_steps
             with torch.no_grad():
                 for mean, value in zip(self.averaged.parameters(), self.model.actor.parameters(), strict=True):
-                    mean.lerp_(value, follow)
+                    mean.lerp_(value, weight)
+
+    def metrics(self) -> Mapping[str, float]:
+        """Return what the last training recorded in Stable-Baselines3's logger, such as `train/critic_loss`."""
+        found = dict(self.model.logger.name_to_value)
+        self.model.logger.dump()
+        return found
 
     def actor(self) -> Any:
-        """The network whose mean is the greedy action: the averaged one where there is one."""
+        """Return the network whose mean is the greedy action: the averaged actor if there is one."""
         return self.model.actor if self.averaged is None else self.averaged
 
     def result(self) -> Any:
-        """What a run leaves: the selected actor, or the last one where none was."""
+        """Return the actor that the run leaves: the selected one, or the last one if none is selected."""
         weights = None if self.selection is None else self.selection.result()
         if weights is None:
             return self.actor()
@@ -305,11 +332,11 @@ class OffPolicyLearner(Learner):
         return selected
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """What a run leaves, as NumPy evaluates it; `description` is what else is known of it."""
-        return policy_of(self.result(), description)
+        """Return the policy of `result`; `description` holds further entries of its description."""
+        return export_policy(self.result(), description)
 
     def has_diverged(self) -> bool:
-        """Whether the actor holds anything that is not a finite number."""
+        """Return True if a parameter of the actor is NaN or infinite."""
         return not bool(torch.isfinite(parameters_to_vector(self.model.actor.parameters())).all())
 
     def _modules(self) -> dict[str, Any]:
@@ -322,26 +349,26 @@ class OffPolicyLearner(Learner):
         return optimizers if entropy is None else optimizers | {"entropy": entropy}
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Everything that the rest of a run depends on: arrays by name, and what JSON can hold."""
+        """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
         arrays = {
             f"{m}/{k}": v.numpy() for m, module in self._modules().items() for k, v in module.state_dict().items()
         }
         for name, optimizer in self._optimizers().items():
             for index, moments in optimizer.state_dict()["state"].items():
                 arrays |= {f"optimizer/{name}/{index}/{key}": value.numpy() for key, value in moments.items()}
-        if self._entropy() is not None:
-            arrays["log_ent_coef"] = self._entropy().detach().numpy()
+        if self._log_ent_coef() is not None:
+            arrays["log_ent_coef"] = self._log_ent_coef().detach().numpy()
         selection: dict[str, Any] = {}
         if self.selection is not None:
             actors, selection = self.selection.state()
             arrays |= {f"selection/{key}": value.numpy() for key, value in actors.items()}
         buffer = self.model.replay_buffer
-        arrays |= {f"buffer/{k}": getattr(buffer, k)[: buffer.size()] for k in self._buffer_names()}
+        arrays |= {f"buffer/{k}": getattr(buffer, k)[: buffer.size()] for k in _BUFFER_ARRAYS}
         arrays["random/torch"] = torch.get_rng_state().numpy()
         kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
         arrays["random/numpy"] = np.asarray(keys)
         return arrays, {
-            "decisions": self.decisions,
+            "transitions": self.transitions,
             "episodes": self.episodes,
             "greedy_successes": self._greedy_successes,
             "selection": selection,
@@ -349,11 +376,11 @@ class OffPolicyLearner(Learner):
             "buffer": [buffer.pos, buffer.full],
             "numpy": [kind, *rest],
             "python": random.getstate(),
-            "own": self.random.bit_generator.state,
+            "exploration": self.random.bit_generator.state,
         }
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Becomes what it was when `state` was called; raises something, a ValueError at last, where that can't be."""
+        """Set the state to what `state` returned; raise KeyError, ValueError or RuntimeError if it does not fit."""
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
         for name, module in self._modules().items():
             module.load_state_dict({k[len(name) + 1 :]: v for k, v in tensors.items() if k.startswith(name + "/")})
@@ -364,15 +391,15 @@ class OffPolicyLearner(Learner):
                     _, _, index, moment = key.split("/")
                     moments.setdefault(int(index), {})[moment] = value
             optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
-        if self._entropy() is not None:
+        if self._log_ent_coef() is not None:
             with torch.no_grad():
-                self._entropy().copy_(tensors["log_ent_coef"])
+                self._log_ent_coef().copy_(tensors["log_ent_coef"])
         buffer = self.model.replay_buffer
-        for key in self._buffer_names():
+        for key in _BUFFER_ARRAYS:
             stored = getattr(buffer, key)
             stored[: len(arrays[f"buffer/{key}"])] = arrays[f"buffer/{key}"]
         buffer.pos, buffer.full = values["buffer"]
-        self.decisions, self.model._n_updates = values["decisions"], values["updates"]
+        self.transitions, self.model._n_updates = values["transitions"], values["updates"]
         self.episodes = values["episodes"]
         self._greedy_successes = values["greedy_successes"]
         if self.selection is not None:
@@ -383,37 +410,40 @@ class OffPolicyLearner(Learner):
         np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002
         version, state, gauss = values["python"]
         random.setstate((version, tuple(state), gauss))
-        self.random.bit_generator.state = values["own"]
+        self.random.bit_generator.state = values["exploration"]
         self._check_restored(arrays, values)
 
     def _check_restored(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Raises a ValueError if it is not what it should have become: some of that has no place here, or no sense."""
-        found, known = self.state()
-        different = {key for key in {*found, *arrays} if _bits(found.get(key)) != _bits(arrays.get(key))}
-        if different or json.dumps(known, sort_keys=True) != json.dumps(values, sort_keys=True):
+        """Raise a ValueError if `state` differs from what was restored, such as for entries of another learner."""
+        own_arrays, own_values = self.state()
+        different = {
+            key for key in {*own_arrays, *arrays} if _array_key(own_arrays.get(key)) != _array_key(arrays.get(key))
+        }
+        if different or json.dumps(own_values, sort_keys=True) != json.dumps(values, sort_keys=True):
             raise ValueError(f"this learner has another {', '.join(sorted(different)) or 'state'}")
 
-    def _entropy(self) -> Any:
-        """The logarithm of the entropy's coefficient where it is learned."""
+    def _log_ent_coef(self) -> Any:
+        """Return the logarithm of the entropy coefficient; None if it is not learned."""
         return getattr(self.model, "log_ent_coef", None)
 
-    @staticmethod
-    def _buffer_names() -> tuple[str, ...]:
-        return ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+_BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-def _bits(array: np.ndarray | None) -> tuple[Any, ...]:
-    """What two arrays have in common that are the same; files know no number without a dimension."""
+def _array_key(array: np.ndarray | None) -> tuple[Any, ...]:
+    """Return the comparison key of an array; 0-d arrays count as 1-d, as safetensors stores them."""
     return () if array is None else (np.atleast_1d(array).shape, array.dtype, array.tobytes())
 
 
 class SacLearner(OffPolicyLearner):
-    """Soft actor-critic (Haarnoja et al., 2018)."""
+    """Learner of soft actor-critic (SAC; Haarnoja et al., 2018)."""
 
-    algorithm = EnsembleSac
+    algorithm = SAC
+    fast_algorithm = FastSac
 
 
 class TqcLearner(OffPolicyLearner):
-    """Truncated quantile critics (Kuznetsov et al., 2020)."""
+    """Learner of truncated quantile critics (TQC; Kuznetsov et al., 2020)."""
 
-    algorithm = EnsembleTqc
+    algorithm = TQC
+    fast_algorithm = FastTqc

@@ -1,4 +1,4 @@
-"""Learning beside acting: gradient steps in a process of their own, while the next episode goes on in this one."""
+"""Pipelined learning: gradient steps in a second process while the next episode runs in this one."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ Weights = dict[str, dict[str, np.ndarray]]
 
 
 class PipelinedLearner(Learner):
-    """Acts, and hands over each episode to another process, which learns from it during the next one.
+    """Learner that acts in this process and trains in a second one, on each episode during the next.
 
-    In episode k it acts with what was learned from the episodes before k − 1: then the learning of one episode has the
-    time of a whole one. With `waits` that is exactly so, whatever takes how long, so that the same seed gives the same
-    run. Without, nobody is waited for: where learning is late, an episode begins with what there is.
+    Episode k is acted with the weights learned from the episodes before k − 1, so training on an episode may take as
+    long as an episode. With `waits` that is always so, independent of durations, and the same seed gives the same run.
+    Without, an episode never waits: it starts with the newest weights there are.
 
-    What explores, and which actor is selected, is decided here; the other process only learns.
+    Exploration and checkpoint selection stay in this process; the second one only trains.
 
     Attributes:
-        known: how many episodes the present policy was learned from.
-        given: how many were handed over.
-        late: how often an episode began before what it should have known was learned.
+        known: Number of episodes that the current weights were learned from.
+        submitted: Number of episodes submitted to the training process.
+        late: Number of episodes that began before their weights were learned.
     """
 
     def __init__(
@@ -50,147 +50,154 @@ class PipelinedLearner(Learner):
         arguments: tuple[tuple[Any, ...], dict[str, Any]],
         *,
         waits: bool,
-        leaves_out: tuple[str, ...] = (),
+        excluded: tuple[str, ...] = (),
         niceness: int = 0,
         imports: Sequence[str] = (),
     ):
-        """
+        """Start the training process.
+
         Args:
-            acting: who acts; its networks are replaced as they are learned.
-            arguments: of another one of its kind, positional and by name, that learns; the first is its preset.
-            waits: whether an episode begins only when what it should know was learned.
-            leaves_out: terminations of episodes that are not learned from.
-            niceness: of the other process.
-            imports: modules or files (.py) that register what is not installed, such as the learner.
+            acting: Learner that acts; its weights are replaced as they are learned.
+            arguments: Positional and keyword arguments of the learner in the training process, configuration first.
+            waits: Start an episode only when the weights that it should have are learned.
+            excluded: Terminations of episodes that are not learned from.
+            niceness: Niceness of the training process.
+            imports: Modules or files (.py) that register what is not installed, such as the learner.
 
         Raises:
-            InputError: if the learner is of another kind.
+            InputError: If the learner is not an `OffPolicyLearner`.
         """
         if not isinstance(acting, OffPolicyLearner):
-            raise InputError("only an off-policy learner can learn in a process of its own: choose sac or tqc")
-        self._acting, self._waits, self._leaves_out = acting, waits, leaves_out
-        self._decisions: list[Transition] = []
-        self._pending: list[Transition] | None = None  # of an episode that is over and not handed over yet
-        self.known = self.given = self.late = 0
+            raise InputError("only an off-policy learner can be pipelined: choose sac or tqc, or --set pipelined=false")
+        self._acting, self._waits, self._excluded = acting, waits, excluded
+        self._transitions: list[Transition] = []
+        self._pending: list[Transition] | None = None  # a finished episode that is not submitted yet
+        self._metrics: dict[str, float] = {}
+        self.known = self.submitted = self.late = 0
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([__name__])  # a study imports once, not for every run
-        self._pipe, other = context.Pipe()
-        told = (other, niceness, tuple(imports), *arguments)
-        self._process = context.Process(target=_learn, args=told, daemon=True)
+        self._pipe, child_pipe = context.Pipe()
+        child_arguments = (child_pipe, niceness, tuple(imports), *arguments)
+        self._process = context.Process(target=_serve, args=child_arguments, daemon=True)
         self._process.start()
-        other.close()
+        child_pipe.close()
 
     def warm_up(self) -> None:
-        """Whatever is called for the first time takes longer than a robot waits."""
+        """Run every code path of acting once: first calls would miss the control deadline of a robot."""
         space = self._acting.model.observation_space
-        nothing = np.zeros(space.shape, space.dtype)
+        observation = np.zeros(space.shape, space.dtype)
         for _ in range(3):
-            self._acting.explore(nothing)
-            tensor = self._acting.model.policy.obs_to_tensor(nothing)[0]
+            self._acting.explore(observation)
+            tensor = self._acting.model.policy.obs_to_tensor(observation)[0]
             self._acting.actor()._predict(tensor, deterministic=True)
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """As the learner acts."""
+        """Return the action (A,) of the acting learner."""
         return self._acting.act(observation)
 
     def on_episode_start(self) -> None:
-        """Begins an episode with what was learned until now."""
-        behind = self.given - 1
-        while self.known < behind and self._waits:
-            self._take(self._receive())
+        """Start an episode with the weights learned so far."""
+        required = self.submitted - 1
+        while self.known < required and self._waits:
+            self._receive_weights()
         while not self._waits and self._pipe.poll():
-            self._take(self._receive())
-        self.late += self.known < behind
-        self._decisions = []
-        self._drawn = self._acting.random.bit_generator.state
+            self._receive_weights()
+        self.late += self.known < required
+        self._transitions = []
+        self._exploration_state = self._acting.random.bit_generator.state
         self._acting.on_episode_start()
 
-    def on_step(self, decision: Transition) -> None:
-        """Keeps a decision until it is known whether the episode is learned from.
+    def on_step(self, transition: Transition) -> None:
+        """Keep a transition until the end of the episode, when it is known whether the episode is learned from.
 
-        Where the simulation failed nothing followed: what came before is then the episode's last, as at a time limit.
+        After a failed simulation the transition before becomes the episode's last, as at a time limit.
         """
-        if "simulation_failure" in decision.info:
-            if self._decisions:
-                self._decisions[-1] = replace(self._decisions[-1], truncated=True)
+        if "simulation_failure" in transition.info:
+            if self._transitions:
+                self._transitions[-1] = replace(self._transitions[-1], truncated=True)
             return
-        self._decisions.append(replace(decision, info={}))
-        self._acting.decisions += 1
+        self._transitions.append(replace(transition, info={}))
+        self._acting.transitions += 1
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Ends an episode. One that is left out leaves no trace in what explores."""
-        if row["termination"] in self._leaves_out:
-            self._acting.decisions -= len(self._decisions)
+        """End an episode; an excluded episode does not advance the exploration state."""
+        if row["termination"] in self._excluded:
+            self._acting.transitions -= len(self._transitions)
             self._acting.episodes -= 1
-            self._acting.leave_out()
-            self._acting.random.bit_generator.state = self._drawn
+            self._acting.exclude_episode()
+            self._acting.random.bit_generator.state = self._exploration_state
         else:
             self._acting.on_episode_end(row)
-            self._pending = self._decisions
+            self._pending = self._transitions
         return {}
 
     def submit_episode(self) -> None:
-        """Has the last episode learned from, where it is one to learn from."""
+        """Send the finished episode to the training process, unless it was excluded."""
         if self._pending is not None:
-            self._send(("learn", self._pending))
+            self._send(("learn", self._pending, self.records_metrics))
             self._pending = None
-            self.given += 1
+            self.submitted += 1
 
     def write(self, path: Path, table: pa.Table) -> None:
-        """Has a step log written there by the other process; what comes in its way is raised by what asks it next."""
+        """Write a step log in the training process; a later call raises the error if that fails."""
         self._send(("write", path, table))
 
     def finish(self) -> None:
-        """Waits until everything is learned and written, and ends the other process."""
+        """Block until everything is learned and written, and end the training process."""
         self.submit_episode()
-        while self.known < self.given:
-            self._take(self._receive())
+        while self.known < self.submitted:
+            self._receive_weights()
         self._send(("end",))
         self._process.join()
         with suppress(EOFError, ConnectionError):
-            refused = self._pipe.recv()
-            if isinstance(refused, InputError):
-                raise refused
+            answer = self._pipe.recv()
+            if isinstance(answer, InputError):
+                raise answer
 
     def close(self) -> None:
-        """Ends the other process, whatever it does."""
+        """Terminate the training process."""
         self._process.terminate()
         self._process.join()
 
+    def metrics(self) -> Mapping[str, float]:
+        """Return what the training process recorded for the newest weights."""
+        metrics, self._metrics = self._metrics, {}
+        return metrics
+
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Of who acts."""
+        """Return the policy of the acting learner; `description` holds further entries of its description."""
         return self._acting.policy(description)
 
     def has_diverged(self) -> bool:
-        """Of who acts."""
+        """Return True if a parameter of the acting learner is NaN or infinite."""
         return self._acting.has_diverged()
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Of both, and the episode that is to be learned from; to be asked for before it is handed over."""
-        while self.known < self.given:
-            self._take(self._receive())
+        """Return the state of both learners and the pending episode; call it before `submit_episode`."""
+        while self.known < self.submitted:
+            self._receive_weights()
         self._send(("state",))
-        learned, known = self._receive()
+        learned_arrays, learned_values = self._receive()
         arrays, values = self._acting.state()
         pending = self._pending or []
-        kept = {f"pending/{name}": np.array([getattr(one, name) for one in pending]) for name in _KEPT if pending}
-        both = {f"acting/{k}": v for k, v in arrays.items()} | {f"learning/{k}": v for k, v in learned.items()}
-        return both | kept, {"acting": values, "learning": known}
+        stored = {f"pending/{name}": np.array([getattr(one, name) for one in pending]) for name in _STORED if pending}
+        both = {f"acting/{k}": v for k, v in arrays.items()} | {f"learning/{k}": v for k, v in learned_arrays.items()}
+        return both | stored, {"acting": values, "learning": learned_values}
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Becomes what it was, and hands the last episode over."""
-        of = {
+        """Set the state to what `state` returned, and submit the pending episode."""
+        parts = {
             part: {key[len(part) + 1 :]: value for key, value in arrays.items() if key.startswith(part + "/")}
             for part in ("acting", "learning", "pending")
         }
-        self._acting.restore(of["acting"], values["acting"])
-        self._send(("restore", of["learning"], values["learning"]))
-        if (wrong := self._receive()) is not None:
-            raise ValueError(wrong)
-        if of["pending"]:
-            columns = [of["pending"][name] for name in _KEPT]
+        self._acting.restore(parts["acting"], values["acting"])
+        self._send(("restore", parts["learning"], values["learning"]))
+        if (message := self._receive()) is not None:
+            raise ValueError(message)
+        if parts["pending"]:
+            columns = [parts["pending"][name] for name in _STORED]
             self._pending = [
-                Transition(**dict(zip(_KEPT, one, strict=True)), info={}) for one in zip(*columns, strict=True)
+                Transition(**dict(zip(_STORED, one, strict=True)), info={}) for one in zip(*columns, strict=True)
             ]
         self.submit_episode()
 
@@ -198,49 +205,43 @@ class PipelinedLearner(Learner):
         try:
             self._pipe.send(message)
         except (BrokenPipeError, ConnectionError):
-            raise _ended() from None
+            raise _process_ended_error() from None
 
     def _receive(self) -> Any:
         try:
             answer = self._pipe.recv()
         except (EOFError, ConnectionError):
-            raise _ended() from None
+            raise _process_ended_error() from None
         if isinstance(answer, InputError):
             raise answer
         return answer
 
-    def _take(self, learned: Weights) -> None:
-        _load(self._acting, learned)
+    def _receive_weights(self) -> None:
+        weights, self._metrics = self._receive()
+        for name, module in _modules(self._acting).items():
+            module.load_state_dict({key: torch.from_numpy(value) for key, value in weights[name].items()})
         self.known += 1
 
 
-# What a learner takes from a decision, in the order of its fields.
-_KEPT = ("observation", "action", "reward", "following", "terminated", "truncated")
+# Fields of a transition that a learner uses.
+_STORED = ("observation", "action", "reward", "following", "terminated", "truncated")
 
 
 class SpacesOnlyEnv(gymnasium.Env):
-    """Of an environment, for another process."""
+    """Environment with the spaces of another one and nothing else, to send to another process."""
 
     def __init__(self, env: gymnasium.Env):
-        """
-        Args:
-            env: the environment.
-        """
+        """Copy the spaces of `env`."""
         self.observation_space, self.action_space = env.observation_space, env.action_space
 
 
-def _ended() -> InputError:
-    return InputError("the process that learns has ended: go on from the last checkpoint, where there is one")
+def _process_ended_error() -> InputError:
+    return InputError("the training process has ended: resume from the last checkpoint, if there is one")
 
 
 def _modules(learner: OffPolicyLearner) -> dict[str, Any]:
     modules = {"actor": learner.model.actor}
     return modules if learner.averaged is None else modules | {"averaged": learner.averaged}
-
-
-def _load(learner: OffPolicyLearner, weights: Weights) -> None:
-    for name, module in _modules(learner).items():
-        module.load_state_dict({key: torch.from_numpy(value) for key, value in weights[name].items()})
 
 
 def _weights(learner: OffPolicyLearner) -> Weights:
@@ -250,51 +251,54 @@ def _weights(learner: OffPolicyLearner) -> Weights:
     }
 
 
-def _learn(
+def _serve(
     pipe: Connection, niceness: int, imports: tuple[str, ...], given: tuple[Any, ...], named: dict[str, Any]
 ) -> None:
-    """The other process: learns, and writes what takes long, until nobody is at the pipe's other end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: whoever acts decides what comes of it
+    """Run the training process: answer requests until the other end of the pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the acting one decides
     os.nice(niceness)
     torch.set_num_threads(1)
-    asked: SimpleQueue[tuple[Any, ...]] = SimpleQueue()
-    # Always read: two that write into a full pipe wait for each other, and a robot waits for nobody.
-    threading.Thread(target=_read, args=(pipe, asked), daemon=True).start()
+    requests: SimpleQueue[tuple[Any, ...]] = SimpleQueue()
+    # Read at once: two processes that write into full pipes would deadlock, and a robot must not wait.
+    threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
     if imports:
         from guiderail.tools.environments import import_modules  # Drake takes a second
 
         import_modules(imports)
     learner: Any = LEARNERS.get(given[0].algorithm)(*given, **named)
-    while (message := asked.get()) != ("end",):
-        what, *rest = message
+    while (message := requests.get()) != ("end",):
+        name, *arguments = message
         try:
-            if (answer := _ANSWERS[what](learner, *rest)) is not _NOTHING:
+            if (answer := _HANDLERS[name](learner, *arguments)) is not _NO_ANSWER:
                 pipe.send(answer)
         except (BrokenPipeError, ConnectionError):
             return
 
 
-def _read(pipe: Connection, asked: SimpleQueue[tuple[Any, ...]]) -> None:
+def _read(pipe: Connection, requests: SimpleQueue[tuple[Any, ...]]) -> None:
     try:
         while True:
-            asked.put(pipe.recv())
+            requests.put(pipe.recv())
     except (EOFError, ConnectionError):
-        asked.put(("end",))
+        requests.put(("end",))
 
 
-_NOTHING = object()
+_NO_ANSWER = object()
 
 
-def _learned(learner: OffPolicyLearner, decisions: list[Transition]) -> Weights | InputError:
+def _learn(
+    learner: OffPolicyLearner, transitions: list[Transition], records_metrics: bool
+) -> tuple[Weights, Mapping[str, float]] | InputError:
+    learner.records_metrics = records_metrics
     try:
-        for decision in decisions:
-            learner.on_step(decision)
+        for transition in transitions:
+            learner.on_step(transition)
     except InputError as error:
         return error
-    return _weights(learner)
+    return _weights(learner), learner.metrics()
 
 
-def _restored(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> str | None:
+def _restore(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> str | None:
     try:
         learner.restore(arrays, values)
     except (KeyError, ValueError, RuntimeError, IndexError, TypeError) as error:
@@ -302,17 +306,17 @@ def _restored(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], value
     return None
 
 
-def _written(learner: OffPolicyLearner, path: Path, table: pa.Table) -> object:
+def _write(learner: OffPolicyLearner, path: Path, table: pa.Table) -> object:
     try:
         write_step_log(path, table)
     except InputError as error:
         return error
-    return _NOTHING
+    return _NO_ANSWER
 
 
-_ANSWERS: dict[str, Any] = {
-    "learn": _learned,
+_HANDLERS: dict[str, Any] = {
+    "learn": _learn,
     "state": lambda learner: learner.state(),
-    "restore": _restored,
-    "write": _written,
+    "restore": _restore,
+    "write": _write,
 }

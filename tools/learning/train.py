@@ -1,8 +1,10 @@
-"""`guiderail train`: what was typed becomes a checked configuration, and a run becomes a folder with its pictures."""
+"""Python API of training: `train` resolves and checks a configuration, trains the run and returns it."""
 
-import sys
+from __future__ import annotations
+
+import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,59 +13,110 @@ import pandas as pd
 
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
-from guiderail.tools.environments import check_environment, import_modules, task_content
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import check_environment, import_modules, task_content, task_named
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import PolicyFn, check_seed
-from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.config import config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.interventions import Supervisor
+from guiderail.tools.learning.learning_log import check_formats
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
-DEFAULTS: dict[str, Any] = {"algorithm": "tqc", "preset": "tqc_contact", "episodes": 60, "seed": 0}
-
-
-def own_defaults(task: str) -> dict[str, Any]:
-    """The learner that a task declares, taken where neither algorithm nor preset is asked for."""
-    return dict(TASKS.get(task).learner) if task in TASKS.names() else {}
-
-
-# What a finished run says about itself.
+DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
+# Statistics of a run's summary.
 SUMMARY = (
     "episodes", "episodes_to_convergence", "success_rate", "success_rate_last_10", "mean_return_last_10",
     "max_commanded_violation", "peak_force", "collisions", "wall_time",
 )  # fmt: skip
 
+_LOGGER = logging.getLogger(__name__)
 
-def configure(
+
+@dataclass(frozen=True)
+class Run:
+    """Training run, read from its folder.
+
+    Attributes:
+        path: Folder of the run.
+        pictures: Paths of the pictures that training left, by name.
+    """
+
+    path: Path
+    pictures: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def config(self) -> RunConfig:
+        """Configuration, with everything resolved."""
+        return RunFolder(self.path).config()
+
+    @property
+    def episodes(self) -> pd.DataFrame:
+        """Training episodes, one row each; the columns are described by `guiderail list metrics`."""
+        return RunFolder(self.path).episodes()
+
+    @property
+    def policy(self) -> Policy:
+        """Learned policy: the deterministic one, evaluated by NumPy."""
+        return Policy.load(self.path)
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Statistics of training, and the pictures."""
+        rows = self.episodes
+        statistics = summary(rows, SUMMARY)
+        recent = min(len(rows), 10)
+        note = (
+            f"{statistics['success_rate_last_10']:.2f} of the last {recent}, with exploration; evaluate the "
+            f"deterministic policy with guiderail evaluate {self.path}"
+        )
+        return {"run": str(self.path), **statistics, "success_in_training": note, **self.pictures}
+
+
+def train(
     task: str,
-    environment: Mapping[str, Any],
+    guidance: str | None = None,
     *,
-    algorithm: str = DEFAULTS["algorithm"],
-    preset: str = DEFAULTS["preset"],
+    out: Path | str,
+    episodes: int | None = None,
+    seed: int | None = None,
+    algorithm: str | None = None,
+    preset: str | None = None,
     settings: Mapping[str, Any] | None = None,
-    episodes: int = DEFAULTS["episodes"],
-    seed: int = DEFAULTS["seed"],
-    imports: Sequence[str] = (),
-    step_log: bool = True,
-    with_person: bool = False,
-) -> RunConfig:
-    """A checked configuration with everything resolved.
+    log: str | Sequence[str] = (),
+    resume: bool = False,
+    **options: Any,
+) -> Run:
+    """Train a policy and leave a run folder.
+
+    Args:
+        task: Name of the task, or the path of a task folder.
+        guidance: Name of the guidance; None for the task's default.
+        out: Folder of the run; with `resume`, that of the run to continue.
+        episodes: Total number of episodes; None for 60.
+        seed: Seed of everything random, in [0, 2³¹); None for 0.
+        algorithm: Registered name of the learner; None for the preset's or the task's.
+        preset: Name of the learner's preset; None for the task's.
+        settings: Settings of the learner by name, in place of the preset's.
+        log: Formats of a learning log in the folder's `logs/`: tensorboard, csv, json, log or stdout; none by default.
+        resume: Continue a run that was stopped, with the result of an undisturbed one.
+        **options: Options of the environment, such as `station`, `reward` or `fixture_offset`.
+
+    Returns:
+        The run: its path, configuration, table of episodes and policy.
 
     Raises:
-        InputError: for an unknown name or a number out of range.
+        InputError: If a name is unknown, a value is out of range, or the folder holds another run.
     """
-    if episodes < 1:
-        raise InputError(f"a run needs at least one episode, not {episodes}")
-    check_seed(seed)
-    learner = resolve_preset(preset, algorithm, settings)
-    resolved = check_environment(task, environment)
-    return RunConfig(
-        task, as_arguments(resolved), learner, preset, episodes, seed, installed_versions(), tuple(imports), step_log,
-        task_content(task, resolved, imports), with_person,
+    name, imports = task_named(task)
+    environment = options if guidance is None else {"guidance": guidance, **options}
+    return start_or_resume(
+        name, Path(out), environment=environment, algorithm=algorithm, preset=preset, settings=settings,
+        episodes=episodes, seed=seed, log=log, resume=resume, imports=imports,
     )  # fmt: skip
 
 
-def run(
+def start_or_resume(
     task: str | None,
     out: Path | None,
     *,
@@ -76,58 +129,124 @@ def run(
     resume: bool = False,
     imports: Sequence[str] = (),
     step_log: bool | None = None,
-    person: Callable[[], Supervisor] | None = None,
-    demonstrator: Callable[[str], Callable[[gymnasium.Env], PolicyFn]] | None = None,
-) -> dict[str, Any]:
-    """Trains, with a progress bar, and leaves the curve and the replay page too. None stands for the default.
+    log: str | Sequence[str] = (),
+    make_supervisor: Callable[[], Supervisor] | None = None,
+    find_demonstrator: Callable[[str], Callable[[gymnasium.Env], PolicyFn]] | None = None,
+) -> Run:
+    """Train with a progress bar and draw the learning curve and the replay page; None stands for a default.
 
-    A run that goes on keeps its configuration; only more episodes may be asked for. `person` makes who watches, pushes
-    and speaks, where somebody does. `demonstrator` finds who acts in
-    the learner's `demonstration_episodes` by the task's name, and raises an InputError where nobody does.
+    A resumed run keeps its configuration; only `episodes` may be larger.
 
-    Returns:
-        What happened, in a few numbers.
+    Args:
+        task: Name of the task; None with `resume`.
+        out: Folder of the run.
+        environment: Options of the environment by name.
+        algorithm: Registered name of the learner.
+        preset: Name of the learner's preset.
+        settings: Settings of the learner by name.
+        episodes: Total number of episodes.
+        seed: Seed of everything random.
+        resume: Continue the run in `out`.
+        imports: Modules or files (.py) that register the task, the learner, …
+        step_log: Whether every control step is written to the step log.
+        log: Formats of the learning log.
+        make_supervisor: Constructs the supervisor of a run with a human in the loop.
+        find_demonstrator: Returns the policy of the learner's `demonstration_episodes` for a task's name, or raises an
+            InputError if there is none.
+
+    Raises:
+        InputError: As `train`.
     """
     if out is None:
-        raise InputError("where should the run go? name a folder with --out RUN")
+        raise InputError("the run needs a folder: name one with --out RUN")
     folder = RunFolder(out)
-    imports = import_modules(imports)
+    imports, formats = import_modules(imports), check_formats(log)
     choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log}
-    choices["with_person"] = None if person is None else True
+    choices["human_in_the_loop"] = None if make_supervisor is None else True
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
     if resume:
-        config = _continued(folder, task, environment, given, settings)
+        config = _resumed_config(folder, task, environment, given, settings)
     elif task is None:
-        raise InputError("what should be learned? name a task, such as guiderail train NarrowPassage --out RUN")
+        raise InputError("training needs a task: name one, such as guiderail train NarrowPassage --out RUN")
     else:
         folder.refuse_existing()
         given["settings"] = settings
         config = configure(task, environment, imports=imports, **with_defaults(task, given))
-    from guiderail.tools.learning.trainer import train  # PyTorch takes seconds: what is wrong was refused by now
+    from guiderail.tools.learning.trainer import run_training  # PyTorch takes seconds; wrong input is refused by now
 
-    shows = demonstrator(config.task) if demonstrator and config.learner.demonstration_episodes else None
-    watching = person() if config.with_person and person is not None else None
+    demonstrator = (
+        find_demonstrator(config.task) if find_demonstrator and config.learner.demonstration_episodes else None
+    )
+    supervisor = make_supervisor() if config.human_in_the_loop and make_supervisor is not None else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
-        rows = train(folder, config, resume=resume, report=progress.update, demonstrator=shows, person=watching)
-    print(f"learned; now the learning curve and a replay page are drawn into {out}", file=sys.stderr, flush=True)
-    return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY)} | finish(out)
+        run_training(
+            folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervisor=supervisor,
+            log=formats,
+        )  # fmt: skip
+    _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", out)
+    return Run(out, draw_pictures(out))
+
+
+def configure(
+    task: str,
+    environment: Mapping[str, Any],
+    *,
+    algorithm: str | None = None,
+    preset: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    episodes: int = DEFAULT_EPISODES,
+    seed: int = DEFAULT_SEED,
+    imports: Sequence[str] = (),
+    step_log: bool = True,
+    human_in_the_loop: bool = False,
+) -> RunConfig:
+    """Return a checked configuration with everything resolved.
+
+    Args:
+        task: Name of the task.
+        environment: Options of the environment by name.
+        algorithm: Registered name of the learner; None for the preset's.
+        preset: Name of the learner's preset; None for the learner's default.
+        settings: Settings of the learner by name.
+        episodes: Total number of episodes.
+        seed: Seed of everything random.
+        imports: Modules or files that register what is not installed, as `import_modules` returns them.
+        step_log: Whether every control step is written to the step log.
+        human_in_the_loop: Whether the run has a supervisor.
+
+    Raises:
+        InputError: If a name is unknown or a value is out of range.
+    """
+    if episodes < 1:
+        raise InputError(f"a run needs at least one episode, not {episodes}")
+    check_seed(seed)
+    learner = resolve_preset(preset, algorithm, settings)
+    resolved = check_environment(task, environment)
+    return RunConfig(
+        task, as_arguments(resolved), learner, preset or default_preset(learner.algorithm), episodes, seed,
+        installed_versions(), tuple(imports), step_log, task_content(task, resolved, imports), human_in_the_loop,
+    )  # fmt: skip
 
 
 def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """What was asked for, and for the rest the learner that this task was measured with.
+    """Complete arguments of `configure` by the task's own learner.
 
     Args:
-        task: its name.
-        given: of `configure`; the task's own learner is taken where neither algorithm nor preset is among them, with
-            single settings of it replaced.
+        task: Name of the task.
+        given: Arguments of `configure`. The task's learner is used if neither `algorithm` nor `preset` is among them;
+            `settings` replaces single settings of it.
     """
-    learner = {} if given.keys() & {"algorithm", "preset"} else own_defaults(task)
+    has_learner = given.keys() & {"algorithm", "preset"} or task not in TASKS.names()
+    learner: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)
     settings = {**learner.get("settings", {}), **(given.get("settings") or {})}
     return {**learner, **given} | ({"settings": settings} if settings else {})
 
 
-def finish(out: Path) -> dict[str, str]:
-    """Adds the pictures to a run that has its numbers; what cannot be drawn on this machine is said, not raised."""
+def draw_pictures(out: Path) -> dict[str, str]:
+    """Draw the learning curve and the replay page of a run, and return their paths.
+
+    A replay that cannot be drawn on this machine is reported in place of its path.
+    """
     from guiderail.tools.visualization.curves import plot_run
     from guiderail.tools.visualization.episode_spec import EpisodeSpec
     from guiderail.tools.visualization.replay import default_page, write_page
@@ -140,18 +259,18 @@ def finish(out: Path) -> dict[str, str]:
         return {"curve": curve, "replay": f"none: {error}"}
 
 
-def _continued(
+def _resumed_config(
     folder: RunFolder,
     task: str | None,
     environment: Mapping[str, Any],
     given: Mapping[str, Any],
     settings: Mapping[str, Any] | None,
 ) -> RunConfig:
-    """The configuration of the run that goes on; refuses what would make it another run."""
+    """Return the configuration of the run to continue; refuse arguments that would make it another run."""
     config = folder.config()
     config.refuse_changed_task(folder.path)
     stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
-    stored |= {"step_log": config.step_log, "with_person": config.with_person} | config.environment
+    stored |= {"step_log": config.step_log, "human_in_the_loop": config.human_in_the_loop} | config.environment
     environment = {key: check_environment(config.task, environment).get(key, environment[key]) for key in environment}
     wanted = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in wanted.items():
@@ -159,21 +278,24 @@ def _continued(
             raise InputError(f"the run in {folder.path} has {config.episodes} episodes: it can only be given more")
         if key != "episodes" and stored.get(key) != value:
             raise InputError(
-                f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train anew"
+                f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train "
+                "again in another folder"
             )
-    stored_learner = {key: value for key, value in asdict(config.learner).items() if key != "algorithm"}
-    learner = resolve_preset(config.preset, config.learner.algorithm, stored_learner | dict(settings or {}))
-    if learner != config.learner:
-        raise InputError(f"the run in {folder.path} has other learner settings: leave --set out, or train anew")
-    return replace(config, episodes=given.get("episodes", config.episodes), versions=_versions(folder, config))
+    values = config_values(config.learner) | dict(settings or {})
+    algorithm = values.pop("algorithm")
+    if make_config(algorithm, values) != config.learner:
+        raise InputError(
+            f"the run in {folder.path} has other learner settings: leave --set out, or train again in another folder"
+        )
+    return replace(config, episodes=given.get("episodes", config.episodes), versions=_merged_versions(folder, config))
 
 
-def _versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:
-    """Of the run so far and from now on; where they differ it is said, as the result may then be another one."""
-    told = {}
-    for name, now in installed_versions().items():
-        before = config.versions.get(name, now)
-        told[name] = before if before.split(", then ")[-1] == now else f"{before}, then {now}"
-    if changed := [f"{name} {words}" for name, words in told.items() if words != config.versions.get(name, words)]:
-        print(f"the run in {folder.path} goes on with other versions: {'; '.join(changed)}", file=sys.stderr)
-    return config.versions | told
+def _merged_versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:
+    """Return the versions so far and from now on; warn if they differ, because the result may differ then."""
+    merged = {}
+    for name, current in installed_versions().items():
+        stored = config.versions.get(name, current)
+        merged[name] = stored if stored.split(", then ")[-1] == current else f"{stored}, then {current}"
+    if changed := [f"{name} {value}" for name, value in merged.items() if value != config.versions.get(name, value)]:
+        _LOGGER.warning("the run in %s continues with other versions: %s", folder.path, "; ".join(changed))
+    return config.versions | merged

@@ -56,7 +56,7 @@ class MeshcatSupervisor(Supervisor):
         while self.meshcat.GetNumActiveConnections() == 0:
             time.sleep(0.1)
 
-    def begin(self, env: gymnasium.Env) -> None:
+    def on_episode_start(self, env: gymnasium.Env) -> None:
         """Shows the episode from here on, with all sliders let go; of what was said before it, a stop alone counts."""
         base = cast(Any, env.unwrapped)
         self._name_sliders(base)
@@ -68,16 +68,16 @@ class MeshcatSupervisor(Supervisor):
             base.simulator.set_monitor(self._view.follow)
             base.simulator.set_target_realtime_rate(1.0)
         self._let_go()
-        self._is_stopped = self.says() == "stop"
+        self._is_stopped = self.label() == "stop"
 
-    def push(self, observation: np.ndarray) -> np.ndarray | None:
+    def correction(self, observation: np.ndarray) -> np.ndarray | None:
         """Where the sliders are; None while all are let go."""
         if self._clicked(LET_GO):
             self._let_go()
         values = np.array([self.meshcat.GetSliderValue(name) for name in self._sliders])
         return values if values.any() else None
 
-    def says(self) -> str | None:
+    def label(self) -> str | None:
         """What was clicked last."""
         said, self._is_stopped = "stop" if self._is_stopped else None, False
         for name, (_, word) in SAYS.items():

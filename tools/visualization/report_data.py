@@ -283,7 +283,8 @@ def command(config: RunConfig, out: str) -> str:
         environment = guidance | beyond_defaults(config.task, environment)
     if "guidance" in environment:
         words += ["--guidance", str(environment.pop("guidance"))]
-    words += ["--algorithm", config.learner.algorithm, "--preset", config.preset]
+    words += ["--algorithm", config.learner.algorithm]
+    words += [] if config.preset is None else ["--preset", config.preset]
     words += ["--episodes", str(config.episodes), "--seed", str(config.seed)]
     usual = asdict(PRESETS[config.preset]) if config.preset in PRESETS else {}
     for key, value in asdict(config.learner).items():

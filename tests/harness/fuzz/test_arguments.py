@@ -12,7 +12,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import as_value, check_environment
-from guiderail.tools.learning.config import PRESETS, LearnerConfig
+from guiderail.tools.learning.config import PRESETS, OffPolicyConfig
 from guiderail.tools.learning.train import configure
 
 TASK_NAMES = ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"]
@@ -60,7 +60,7 @@ WHAT_IS_TYPED = NUMBERS | WORDS | st.lists(NUMBERS, min_size=1, max_size=3).map(
 BOMB = (
     "{a: &a [1,1,1,1,1,1,1,1,1], b: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a], c: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b], d: [*c,*c,*c]}"
 )
-SETTINGS = [name for name in LearnerConfig.__dataclass_fields__ if name != "algorithm"]
+SETTINGS = [name for name in OffPolicyConfig.__dataclass_fields__ if name != "algorithm"]
 
 
 @given(

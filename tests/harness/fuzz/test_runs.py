@@ -218,7 +218,7 @@ def resumable(folder):
     env = Line()
     settings = {"net_arch": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_freq": 1}
     learner = LEARNERS.get("tqc")(
-        resolve_preset("tqc_contact", "tqc", settings), env, action_repeat=1, seed=0, decisions=12, symmetry=None
+        resolve_preset("tqc_contact", "tqc", settings), env, action_repeat=1, seed=0, max_transitions=12, symmetry=None
     )
     arrays, values = learner.state()
     arrays = {key: array.copy() for key, array in arrays.items()}

@@ -7,7 +7,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.trainer import run_training
 from research.benchmarks import cold_start
 
 
@@ -17,7 +17,7 @@ def test_both_kinds_of_each_seed_are_timed(monkeypatch, bead_config, capsys):
     def run(command, **_):
         settings.append(command[command.index("--set") + 1])
         assert command[command.index("--import") + 1] == "bead"
-        train(RunFolder(Path(command[command.index("--out") + 1])), bead_config)
+        run_training(RunFolder(Path(command[command.index("--out") + 1])), bead_config)
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr(cold_start.subprocess, "run", run)

@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, kept_file
 from guiderail.tools.evaluation.robustness import AXES, Axis, _Who, breaks, chosen_axes, draw, points, robustness
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.trainer import run_training
 
 WALL = Axis("wall", "wall [m]", (-0.5, 1.0), 1.0, lambda environment, value: {"wall": value})
 
@@ -79,7 +79,7 @@ def test_several_runs_are_in_one_table_and_a_further_one_costs_only_its_own_epis
     run, bead_config, tmp_path, capsys
 ):
     other = replace(bead_config, environment={**bead_config.environment, "guidance": "kmp"})
-    train(RunFolder(tmp_path / "other"), other)
+    run_training(RunFolder(tmp_path / "other"), other)
     told, out = [], tmp_path / "both"
     robustness([run], episodes=2, out=out)
     capsys.readouterr()

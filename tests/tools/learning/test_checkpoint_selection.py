@@ -56,7 +56,7 @@ def test_goes_on_as_it_would_have():
 def test_an_episode_that_is_left_out_is_as_if_it_had_not_been():
     plain, left_out = lived(CheckpointSelection(3), [0, 1, 1]), lived(CheckpointSelection(3), [0, 1])
     left_out.begin(torch.nn.Linear(1, 1), 1)
-    left_out.leave_out()
+    left_out.exclude()
     lived(left_out, [1], first=2, row=1)
     assert selected(left_out) == selected(plain) == 2
     assert left_out.state()[1] == plain.state()[1]

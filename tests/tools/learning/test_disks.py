@@ -8,7 +8,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.trainer import run_training
 from oracles.disks import bound_by_permissions, full_disk
 from oracles.same_runs import differences
 
@@ -16,7 +16,7 @@ from oracles.same_runs import differences
 @pytest.fixture(scope="module")
 def whole(module_config, tmp_path_factory):
     folder = RunFolder(tmp_path_factory.mktemp("whole") / "run")
-    train(folder, module_config)
+    run_training(folder, module_config)
     return folder.path
 
 
@@ -45,43 +45,43 @@ def test_a_run_whose_disk_is_full_goes_on_when_there_is_room(at, whole, module_c
             if row["episode"] == at:
                 until_now.enter_context(full_disk())
 
-        train(folder, module_config, report=fill)
+        run_training(folder, module_config, report=fill)
     assert not list(folder.path.rglob("*.part"))
-    train(folder, module_config, resume=True)
+    run_training(folder, module_config, resume=True)
     assert differences(whole, folder.path) == []
 
 
 def test_a_run_that_cannot_be_written_is_left_as_it_is(whole, module_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    train(folder, replace(module_config, episodes=3))
+    run_training(folder, replace(module_config, episodes=3))
     before = content(folder)
     places = (folder.path, folder.checkpoint.parent)
     for place in places:
         place.chmod(0o555)
     with bound_by_permissions(), refused("cannot be written .Permission denied.*choose a folder"):
-        train(folder, module_config, resume=True)
+        run_training(folder, module_config, resume=True)
     with bound_by_permissions(), refused("cannot be written"):
-        train(RunFolder(folder.path / "another"), module_config)
+        run_training(RunFolder(folder.path / "another"), module_config)
     for place in places:
         place.chmod(0o755)
     assert content(folder) == before
-    train(folder, module_config, resume=True)
+    run_training(folder, module_config, resume=True)
     assert differences(whole, folder.path) == []
 
 
 @pytest.mark.parametrize("lost", ["array", "value"])
 def test_a_checkpoint_of_another_version_is_left_as_it_is(lost, module_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    train(folder, replace(module_config, episodes=3))
+    run_training(folder, replace(module_config, episodes=3))
     arrays, values = load_checkpoint(folder.checkpoint)
     if lost == "array":
         arrays["buffer/returns"] = arrays.pop("buffer/rewards")
     else:
-        values["learner"]["steps"] = values["learner"].pop("decisions")
+        values["learner"]["steps"] = values["learner"].pop("transitions")
     save_checkpoint(folder.checkpoint, arrays, values)
     before = content(folder)
     with refused("belongs to other settings"):
-        train(folder, module_config, resume=True)
+        run_training(folder, module_config, resume=True)
     assert content(folder) == before
 
 
@@ -90,5 +90,5 @@ def test_a_run_killed_before_it_had_a_configuration_begins_anew(whole, module_co
     folder.path.mkdir()
     (folder.path / ".config.yaml.123.part").write_text("task: Be")
     (folder.path / ".lock").touch()
-    train(folder, module_config)
+    run_training(folder, module_config)
     assert differences(whole, folder.path) == []

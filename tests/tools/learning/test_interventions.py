@@ -7,11 +7,11 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.models.primitives import ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.reference import pass_through
-from guiderail.tools.learning.interventions import APART, WORTH, Supervisor, ViaPointCorrections
+from guiderail.tools.learning.interventions import LABEL_REWARDS, VIA_POINT_SPACING, Supervisor, ViaPointCorrections
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.trainer import run_training
 
 
 class Still(Learner):
@@ -19,6 +19,7 @@ class Still(Learner):
 
     def __init__(self, preset, env, **_):
         self.env, self.seen = env, []
+        made.append(self)
 
     def act(self, observation):
         return np.zeros(self.env.action_space.shape, np.float32)
@@ -48,11 +49,7 @@ made = []
 
 @pytest.fixture(autouse=True)
 def still():
-    def make(*given, **named):
-        made.append(Still(*given, **named))
-        return made[-1]
-
-    LEARNERS.register("still", make)
+    LEARNERS.register("still", Still)
     yield
     made.clear()
     del LEARNERS._entries["still"]
@@ -64,15 +61,15 @@ class Scripted(Supervisor):
     def __init__(self, pushes, words=None):
         self.pushes, self.words, self.episode = pushes, words or {}, -1
 
-    def begin(self, env):
+    def on_episode_start(self, env):
         self.episode += 1
         self.env = env.unwrapped
 
-    def push(self, observation):
+    def correction(self, observation):
         first, last, push = self.pushes.get(self.episode, (1, 0, None))
         return np.array(push) if first <= self.env._control_steps <= last else None
 
-    def says(self):
+    def label(self):
         step, word = self.words.get(self.episode, (None, None))
         return word if step is not None and self.env._control_steps >= step else None
 
@@ -80,20 +77,20 @@ class Scripted(Supervisor):
 def passage(episodes, **environment):
     return configure(
         "NarrowPassage", {"guidance": "kgrl", "action_repeat": 2, **environment}, algorithm="still", episodes=episodes,
-        with_person=True, step_log=False,
+        human_in_the_loop=True, step_log=False,
     )  # fmt: skip
 
 
 def test_a_push_is_a_transition_and_becomes_via_points_that_the_next_episode_passes(tmp_path):
     folder = RunFolder(tmp_path / "run")
-    rows = train(folder, passage(2), person=Scripted({0: (10, 19, [0.5, 3.0])}))
+    rows = run_training(folder, passage(2), supervisor=Scripted({0: (10, 19, [0.5, 3.0])}))
     assert [row["interventions"] for row in rows] == [1, 0]
     actions = np.array([decision.action for decision in made[0].seen])
     pushed = (actions != 0).any(axis=1)
     np.testing.assert_array_equal(actions[pushed], np.tile([0.5, 1.0], (pushed.sum(), 1)))  # as far as actions reach
     np.testing.assert_array_equal(np.flatnonzero(pushed), [5, 6, 7, 8, 9])  # remembered where they were done
     found = folder.config()
-    assert found.with_person
+    assert found.human_in_the_loop
     points = np.reshape(found.environment["via_points"], (-1, 3))
     np.testing.assert_array_equal(points[:, 0], [11, 17, 19])
     corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
@@ -119,44 +116,44 @@ def test_via_points_are_passed_and_forgotten_far_from_them():
 def test_whoever_has_not_let_go_at_the_end_means_the_rest_and_newer_pushes_replace_older_ones():
     corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
     last = corrections._reference.num_steps - 1
-    kept = np.reshape(corrections.with_pushes({20: np.array([0.1, 0.0])}, still_pushing=True), (-1, 3))
+    kept = np.reshape(corrections.with_offsets({20: np.array([0.1, 0.0])}, is_held=True), (-1, 3))
     assert (kept[0, 0], kept[-1, 0]) == (20, last)
-    assert np.diff(kept[:-1, 0]).max() <= APART
+    assert np.diff(kept[:-1, 0]).max() <= VIA_POINT_SPACING
     corrections.points = tuple(kept.ravel())
-    newer = np.reshape(corrections.with_pushes({20: np.array([-0.1, 0.0]), 30: np.array([-0.1, 0.0])}), (-1, 3))
+    newer = np.reshape(corrections.with_offsets({20: np.array([-0.1, 0.0]), 30: np.array([-0.1, 0.0])}), (-1, 3))
     assert sum(newer[:, 0] <= 30) == 2
     assert (newer[newer[:, 0] > 34] == kept[kept[:, 0] > 34]).all()
 
 
 def test_what_a_person_says_ends_an_episode_and_is_worth_something(tmp_path):
     words = {0: (10, "success"), 1: (10, "failure"), 2: (10, "stop")}
-    rows = train(RunFolder(tmp_path / "run"), passage(3), person=Scripted({}, words))
+    rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=Scripted({}, words))
     assert [row["termination"] for row in rows] == ["success", "failure", "stop"]
     assert [row["success"] for row in rows] == [1, 0, 0]
     lasts = [decision for decision in made[0].seen if decision.is_last]
     assert [decision.terminated for decision in lasts] == [True, True, False]
     same = lasts[2].reward
     np.testing.assert_allclose(
-        [one.reward - same for one in lasts], [WORTH["success"], WORTH["failure"], 0.0], atol=5.0
+        [one.reward - same for one in lasts], [LABEL_REWARDS["success"], LABEL_REWARDS["failure"], 0.0], atol=5.0
     )
 
 
 def test_a_run_that_was_stopped_goes_on_with_what_was_corrected(tmp_path):
     pushes = {0: (10, 19, [0.5, 3.0]), 2: (4, 8, [-1.0, 0.0])}
-    whole = train(RunFolder(tmp_path / "whole"), passage(4), person=Scripted(pushes))
-    train(RunFolder(tmp_path / "parts"), passage(2), person=Scripted(pushes))
+    whole = run_training(RunFolder(tmp_path / "whole"), passage(4), supervisor=Scripted(pushes))
+    run_training(RunFolder(tmp_path / "parts"), passage(2), supervisor=Scripted(pushes))
     later = Scripted({episode - 2: push for episode, push in pushes.items()})
     folder = RunFolder(tmp_path / "parts")
-    again = train(folder, passage(4), resume=True, person=later)
+    again = run_training(folder, passage(4), resume=True, supervisor=later)
     for one, other in zip(whole, again, strict=True):
         assert one | {"wall_time": 0} == other | {"wall_time": 0}
     assert folder.config().environment == RunFolder(tmp_path / "whole").config().environment
-    with pytest.raises(InputError, match="--with-person"):
-        train(folder, folder.config(), resume=True)
+    with pytest.raises(InputError, match="--human-in-the-loop"):
+        run_training(folder, folder.config(), resume=True)
 
 
 def test_guidance_without_demonstrations_can_not_be_corrected():
-    with pytest.raises(InputError, match="does without"):
+    with pytest.raises(InputError, match="does not use"):
         ViaPointCorrections("Pouring", {})
 
 
@@ -170,13 +167,15 @@ def test_five_millimetres_astray_a_person_rescues_it_with_a_push_or_two(tmp_path
         "action_dims": (0, 1),
     }
     shown = ViaPointCorrections("BncConnector", environment)
-    steps = np.arange(0, shown._reference.num_steps, APART)
+    steps = np.arange(0, shown._reference.num_steps, VIA_POINT_SPACING)
     astray = np.column_stack([steps, shown._reference.means[steps]])
     astray[:, 1] += 5e-3
     environment["via_points"] = tuple(astray.ravel())
     push = [-5e-3 / shown.reach[0], 0.0]
-    config = configure("BncConnector", environment, algorithm="still", episodes=3, with_person=True, step_log=False)
-    rows = train(RunFolder(tmp_path / "run"), config, person=Scripted({1: (0, 10**6, push)}))
+    config = configure(
+        "BncConnector", environment, algorithm="still", episodes=3, human_in_the_loop=True, step_log=False
+    )
+    rows = run_training(RunFolder(tmp_path / "run"), config, supervisor=Scripted({1: (0, 10**6, push)}))
     assert [row["success"] for row in rows] == [0, 0, 1]
     assert sum(row["interventions"] for row in rows) <= 5
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9

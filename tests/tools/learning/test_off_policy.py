@@ -12,8 +12,8 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import PRESETS, resolve_preset
-from guiderail.tools.learning.learner import LEARNERS, arguments_of, register_learner
-from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, policy_of
+from guiderail.tools.learning.learner import LEARNERS, learner_arguments, register_learner
+from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner, export_policy
 
 
 class SpacesOnlyEnv(gymnasium.Env):
@@ -30,7 +30,9 @@ def preset():
 
 
 def make(preset, action_repeat=1, seed=0):
-    return LEARNERS.get(preset.algorithm)(preset, SpacesOnlyEnv(), action_repeat=action_repeat, seed=seed, decisions=50)
+    return LEARNERS.get(preset.algorithm)(
+        preset, SpacesOnlyEnv(), action_repeat=action_repeat, seed=seed, max_transitions=50
+    )
 
 
 def decision(observation, action, reward, following, terminated=False, truncated=False):
@@ -42,7 +44,7 @@ def live(learner, decisions, seed=0):
     random = np.random.default_rng(seed)
     for _ in range(decisions):
         observation, following = random.uniform(-1, 1, (2, 3)).astype(np.float32)
-        learner.remember(decision(observation, learner.act(observation), random.normal(), following))
+        learner.store(decision(observation, learner.act(observation), random.normal(), following))
         learner.learn()
 
 
@@ -106,7 +108,7 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
     learner = make(preset)
     seen = np.zeros(3, np.float32)
     for terminated, truncated in ((True, False), (False, True), (False, False)):
-        learner.remember(decision(seen, np.zeros(2), 0.0, seen, terminated, truncated))
+        learner.store(decision(seen, np.zeros(2), 0.0, seen, terminated, truncated))
     buffer = learner.model.replay_buffer
     bootstrapped = buffer.dones[:3, 0] * (1 - buffer.timeouts[:3, 0])
     np.testing.assert_array_equal(bootstrapped, [1, 0, 0])
@@ -114,14 +116,19 @@ def test_a_time_limit_is_no_end_of_the_task(preset):
 
 def test_what_was_seen_is_remembered_from_the_other_side_too(preset):
     half_turn = Symmetry.of_signs((-1.0, -1.0, 1.0), (-1.0, 1.0))
-    learner = TqcLearner(preset, SpacesOnlyEnv(), action_repeat=1, seed=0, decisions=50, symmetry=half_turn)
+    learner = TqcLearner(preset, SpacesOnlyEnv(), action_repeat=1, seed=0, max_transitions=50, symmetry=half_turn)
     plain = TqcLearner(
-        replace(preset, symmetry=False), SpacesOnlyEnv(), action_repeat=1, seed=0, decisions=50, symmetry=half_turn
+        replace(preset, symmetry=False),
+        SpacesOnlyEnv(),
+        action_repeat=1,
+        seed=0,
+        max_transitions=50,
+        symmetry=half_turn,
     )
     for one in (learner, plain):
-        one.remember(decision(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True))
+        one.store(decision(np.array([1, 2, 3.0]), np.array([0.5, 0.25]), 7.0, np.array([4, 5, 6.0]), True))
     buffer = learner.model.replay_buffer
-    assert (buffer.size(), plain.model.replay_buffer.n_envs, learner.decisions) == (1, 1, 1)
+    assert (buffer.size(), plain.model.replay_buffer.n_envs, learner.transitions) == (1, 1, 1)
     np.testing.assert_array_equal(buffer.observations[0], [[1, 2, 3], [-1, -2, 3]])
     np.testing.assert_array_equal(buffer.next_observations[0], [[4, 5, 6], [-4, -5, 6]])
     np.testing.assert_array_equal(buffer.actions[0], [[0.5, 0.25], [-0.5, 0.25]])
@@ -135,7 +142,7 @@ def test_returns_of_several_steps_stop_where_an_episode_does(preset):
     learner = make(replace(preset, n_steps=3, gamma=0.5))
     zero = np.zeros(3, np.float32)
     for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
-        learner.remember(decision(zero, np.zeros(2), reward, zero, terminated))
+        learner.store(decision(zero, np.zeros(2), reward, zero, terminated))
     samples = learner.model.replay_buffer._get_samples(np.arange(4))
     np.testing.assert_allclose(samples.rewards[:, 0], [1 + 2 / 2, 2, 4 + 8 / 2 + 16 / 4, 8 + 16 / 2 + 32 / 4])
     np.testing.assert_array_equal(samples.dones[:, 0], [1, 1, 0, 0])
@@ -189,7 +196,7 @@ def test_greedy_episodes_do_what_the_policy_would(preset):
     action_dims, greedy = acted(learner, 2)
     assert len(np.unique(action_dims, axis=0)) == 4
     assert (greedy == greedy[0]).all()
-    policy = policy_of(learner.actor(), {"observation_shape": [3]})
+    policy = export_policy(learner.actor(), {"observation_shape": [3]})
     np.testing.assert_allclose(greedy[0], policy(np.ones(3, np.float32)), atol=1e-6)
 
 
@@ -207,7 +214,7 @@ def test_no_episode_is_greedy_before_learning_has_begun(preset):
     )
     for begun in (False, False, True, True):  # an episode has eight decisions: the second is still an exploring one
         learner.on_episode_start()
-        assert learner.has_begun() is begun
+        assert learner.is_learning() is begun
         live(learner, 8)
         learner.on_episode_end({"success": 1})
     assert learner.state()[1]["greedy_successes"] == 2
@@ -253,7 +260,7 @@ def test_a_restored_learner_is_in_the_same_episode(preset):
     arrays, values = first.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
     expected = acted(first, 3)
-    second = make(first.preset, seed=9)
+    second = make(first.config, seed=9)
     second.restore(arrays, values)
     np.testing.assert_array_equal(acted(second, 3), expected)
 
@@ -269,7 +276,7 @@ def test_the_result_is_the_selected_actor_also_after_a_restart(preset):
         live(first, 8, seed=episode)
         first.on_episode_end({"success": int(success)})
     arrays, values = first.state()
-    second = make(first.preset, seed=9)
+    second = make(first.config, seed=9)
     second.restore({key: value.copy() for key, value in arrays.items()}, values)
     for learner in (first, second):
         torch.testing.assert_close(learner.result().state_dict()["mu.weight"], greedy[2], rtol=0, atol=0)
@@ -306,7 +313,7 @@ def test_an_algorithm_more_is_one_class(monkeypatch):
     learner = make(resolve_preset("tqc_contact", "td3", SETTINGS))
     live(learner, 24)
     arrays, values = learner.state()
-    again = make(learner.preset, seed=9)
+    again = make(learner.config, seed=9)
     again.restore({key: value.copy() for key, value in arrays.items()}, values)
     np.testing.assert_array_equal(weights(again), weights(learner))
     policy, seen = learner.policy({"observation_shape": [3]}), np.full(3, 0.3, np.float32)
@@ -319,7 +326,7 @@ def test_a_network_that_a_policy_cannot_hold_is_refused(preset):
     actor = make(preset).model.actor
     actor.latent_pi[1] = torch.nn.GELU()
     with pytest.raises(InputError, match="GELU"):
-        policy_of(actor, {"observation_shape": [3]})
+        export_policy(actor, {"observation_shape": [3]})
 
 
 def test_where_the_simulation_failed_nothing_followed(preset):
@@ -331,7 +338,7 @@ def test_where_the_simulation_failed_nothing_followed(preset):
         for one in following:
             learner.on_step(one)
     buffer = learner.model.replay_buffer
-    assert (buffer.size(), learner.decisions) == (1, 1)
+    assert (buffer.size(), learner.transitions) == (1, 1)
     assert (buffer.dones[0], buffer.timeouts[0]) == (1, 1)
 
 
@@ -340,7 +347,7 @@ def test_where_a_person_pushed_nothing_is_said_of_the_policy(preset):
     live(learner, 2)
     for interventions, row in ((0, 1), (2, 1), (0, 2)):
         learner.on_episode_start()
-        assert learner._greedy
+        assert learner._is_greedy
         learner.on_episode_end({"success": 1, "interventions": interventions})
         assert learner._greedy_successes == row
     assert len(learner.selection._open) == 2
@@ -351,6 +358,6 @@ def test_what_a_person_pushed_has_no_other_sides():
     learner = SimpleNamespace(symmetry="near")
     for pushed, environment, sides in ((False, {}, "all"), (True, {}, None), (False, {"via_points": (1.0, 2.0)}, None)):
         config = SimpleNamespace(
-            episodes=1, action_repeat=1, seed=0, learner=learner, with_person=pushed, environment=environment
+            episodes=1, action_repeat=1, seed=0, learner=learner, human_in_the_loop=pushed, environment=environment
         )
-        assert arguments_of(config, task)["symmetry"] == sides
+        assert learner_arguments(config, task)["symmetry"] == sides

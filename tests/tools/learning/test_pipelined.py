@@ -10,7 +10,7 @@ from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.pipelined import PipelinedLearner, _written
+from guiderail.tools.learning.pipelined import PipelinedLearner, _write
 
 
 def made(**more):
@@ -20,7 +20,7 @@ def made(**more):
     space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
     small = {"net_arch": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_freq": 1}
     preset = resolve_preset("tqc_contact", "sac", small)
-    named = {"action_repeat": 1, "seed": 0, "decisions": 100, "symmetry": None}
+    named = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
     acting = LEARNERS.get("sac")(preset, space, **named)
     return PipelinedLearner(acting, ((preset, space), named), waits=True, **more), acting
 
@@ -33,9 +33,9 @@ def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr("os.replace", fail)
-        assert isinstance(_written(None, file, rows), InputError)
+        assert isinstance(_write(None, file, rows), InputError)
     assert list(tmp_path.rglob("*.parquet")) == []
-    _written(None, file, rows)
+    _write(None, file, rows)
     assert len(read_step_log(file.parent)) == 9
 
 
@@ -48,7 +48,7 @@ def test_a_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
 
 
 def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(forkserver):
-    student, acting = made(leaves_out=("stopped",))
+    student, acting = made(excluded=("stopped",))
     before = acting.actor().state_dict()["mu.weight"].clone()
     rng, last = np.random.default_rng(0), {"success": False}
     for termination, known in (("time_limit", 0), ("stopped", 0), ("success", 0), ("time_limit", 1), ("success", 2)):
@@ -60,5 +60,5 @@ def test_an_episode_is_known_two_episodes_later_and_one_that_is_left_out_never(f
         student.on_episode_end({"termination": termination, **last})
         student.submit_episode()
     student.finish()
-    assert (student.known, acting.decisions, acting.episodes) == (4, 24, 4)
+    assert (student.known, acting.transitions, acting.episodes) == (4, 24, 4)
     assert not np.allclose(before, acting.actor().state_dict()["mu.weight"])

@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy, _digest
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.off_policy import policy_of
+from guiderail.tools.learning.off_policy import export_policy
 
 
 class SpacesOnlyEnv(gymnasium.Env):
@@ -36,14 +36,14 @@ def learner(request):
         env,
         action_repeat=1,
         seed=3,
-        decisions=10,
+        max_transitions=10,
     )
 
 
 def test_does_what_stable_baselines_predicts(learner, tmp_path):
     space = learner.model.actor.action_space
     observations = [learner_observation(learner, seed) for seed in range(20)]
-    policy = policy_of(learner.model.actor, {"observation_shape": list(observations[0].shape)})
+    policy = export_policy(learner.model.actor, {"observation_shape": list(observations[0].shape)})
     policy.save(tmp_path)
     loaded = Policy.load(tmp_path)
     for observation in observations:
@@ -59,14 +59,14 @@ def learner_observation(learner, seed):
 
 
 def test_refuses_an_observation_of_another_shape(learner):
-    policy = policy_of(learner.model.actor, {"observation_shape": list(learner_observation(learner, 0).shape)})
+    policy = export_policy(learner.model.actor, {"observation_shape": list(learner_observation(learner, 0).shape)})
     with pytest.raises(ValueError, match="trained on observations"):
         policy(np.zeros(4))
 
 
 def test_a_truncated_policy_is_refused_in_a_sentence(learner, tmp_path):
     shape = list(learner_observation(learner, 0).shape)
-    policy_of(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+    export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
     weights = tmp_path / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-5])
     with pytest.raises(InputError, match="damaged"):
@@ -75,7 +75,7 @@ def test_a_truncated_policy_is_refused_in_a_sentence(learner, tmp_path):
 
 def test_a_policy_with_an_unknown_activation_is_refused_in_a_sentence(learner, tmp_path):
     shape = list(learner_observation(learner, 0).shape)
-    policy_of(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+    export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
     (tmp_path / "policy.json").write_text(json.dumps(description | {"activation": "gelu"}))
     with pytest.raises(InputError, match="of another version"):
@@ -85,7 +85,7 @@ def test_a_policy_with_an_unknown_activation_is_refused_in_a_sentence(learner, t
 @pytest.mark.parametrize("file", ["policy.safetensors", "policy.json"])
 def test_a_policy_in_which_one_bit_changed_is_refused_in_a_sentence(learner, file, tmp_path):
     shape = list(learner_observation(learner, 0).shape)
-    policy_of(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+    export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
     content = bytearray((tmp_path / file).read_bytes())
     at = content.index(b"action_high") + 14 if file.endswith("json") else len(content) - 4
     content[at] ^= 1

@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.evaluate import kept_file
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.study import Job, _digest
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, run
+from guiderail.tools.learning.train import configure, start_or_resume
 
 PART = {"visual": "part.obj", "mass": 0.1, "centre": [0, 0, 0], "gyration": 0.01, "pieces": [{"file": "part.obj"}]}
 TASK = {
@@ -57,7 +57,7 @@ def test_a_run_does_not_go_on_as_another_task(name, folder, tmp_path):
     before = (folder / name).read_text()
     (folder / name).write_text(CHANGES[name])
     for again in (
-        lambda: run(None, begun.path, environment={}, resume=True),
+        lambda: start_or_resume(None, begun.path, environment={}, resume=True),
         lambda: begun.refuse_another(configure("parts/pin", {}, episodes=2)),
     ):
         with pytest.raises(InputError, match="the files of parts/pin are not those"):

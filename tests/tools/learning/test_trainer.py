@@ -20,8 +20,8 @@ from guiderail.tools.evaluation.evaluate import kept_file
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, run, with_defaults
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.train import configure, start_or_resume, with_defaults
+from guiderail.tools.learning.trainer import run_training
 
 # Trains like the fixture's run, and says after each episode that it is over; then the parent pulls the plug.
 CHILD = """
@@ -32,9 +32,9 @@ import bead
 bead.register()
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.trainer import run_training
 settings = dict(net_arch="16", batch_size=16, learning_starts=10, gradient_steps=4)
-train(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
+run_training(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
       report=lambda row: print(row["episode"], flush=True))
 """
 
@@ -76,7 +76,7 @@ def test_a_demonstrator_acts_in_the_first_episodes_and_the_learner_after(bead_co
 
         return act
 
-    rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=watched)
+    rows = run_training(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=watched)
     assert acted[1:] == [row["steps"] for row in rows[:2]]  # the first was asked before anything moved
     assert len(rows) > 2
 
@@ -84,9 +84,9 @@ def test_a_demonstrator_acts_in_the_first_episodes_and_the_learner_after(bead_co
 def test_a_run_that_was_demonstrated_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
     config = shown(bead_config, 2)
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
-    train(undisturbed, config, demonstrator=always_left)
-    train(stopped, replace(config, episodes=1), demonstrator=always_left)
-    train(stopped, config, demonstrator=always_left, resume=True)
+    run_training(undisturbed, config, demonstrator=always_left)
+    run_training(stopped, replace(config, episodes=1), demonstrator=always_left)
+    run_training(stopped, config, demonstrator=always_left, resume=True)
     assert_same_run(undisturbed, stopped)
 
 
@@ -94,25 +94,27 @@ def test_who_looks_at_what_is_not_there_demonstrates_nothing(bead_config, tmp_pa
     def later(env):
         return lambda seen: env.action_space.low if seen[0] < 0.5 else env.action_space.low * seen[99]
 
-    with pytest.raises(InputError, match="sees or moves other things"):
-        train(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=later)
+    with pytest.raises(InputError, match="observations or actions of Bead's scripted policy"):
+        run_training(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=later)
 
 
 def test_where_nobody_demonstrates_a_run_is_refused_before_it_begins(bead_config, tmp_path):
     with pytest.raises(InputError, match="demonstration_episodes"):
-        train(RunFolder(tmp_path / "run"), shown(bead_config, 1))
+        run_training(RunFolder(tmp_path / "run"), shown(bead_config, 1))
     assert not (tmp_path / "run").exists()
 
 
 def test_who_moves_other_things_demonstrates_nothing(bead_config, tmp_path):
-    with pytest.raises(InputError, match="moves other things"):
-        train(RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=lambda env: lambda seen: np.zeros(7))
+    with pytest.raises(InputError, match="actions of Bead's scripted policy differ"):
+        run_training(
+            RunFolder(tmp_path / "run"), shown(bead_config, 1), demonstrator=lambda env: lambda seen: np.zeros(7)
+        )
     assert not (tmp_path / "run").exists()
 
 
 def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
     undisturbed, killed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "killed")
-    train(undisturbed, bead_config)
+    run_training(undisturbed, bead_config)
     code = CHILD.format(tests=str(Path(__file__).parents[1]), out=str(killed.path))
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
@@ -122,30 +124,30 @@ def test_a_killed_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_path):
                 break
     assert child.returncode == -signal.SIGKILL
     assert not (killed.path / "policy.safetensors").exists()
-    train(killed, bead_config, resume=True)
+    run_training(killed, bead_config, resume=True)
     assert_same_run(undisturbed, killed)
 
 
 def test_the_same_seed_gives_the_same_run_and_another_another(bead_config, tmp_path):
     folders = [RunFolder(tmp_path / name) for name in "abc"]
     for folder, seed in zip(folders, (5, 5, 6), strict=True):
-        train(folder, replace(bead_config, seed=seed))
+        run_training(folder, replace(bead_config, seed=seed))
     assert_same_run(folders[0], folders[1])
     assert without_clock(folders[0].episodes()) != without_clock(folders[2].episodes())
 
 
 def test_more_episodes_continue_a_finished_run(bead_config, tmp_path):
     long, extended = RunFolder(tmp_path / "long"), RunFolder(tmp_path / "extended")
-    train(long, bead_config)
-    train(extended, replace(bead_config, episodes=3))
-    train(extended, bead_config, resume=True)
+    run_training(long, bead_config)
+    run_training(extended, replace(bead_config, episodes=3))
+    run_training(extended, bead_config, resume=True)
     assert_same_run(long, extended)
     assert extended.config() == bead_config
 
 
 def test_a_run_that_is_killed_learning_on_has_no_policy_of_fewer_episodes(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    train(folder, replace(bead_config, episodes=2))
+    run_training(folder, replace(bead_config, episodes=2))
 
     class Killed(Exception):
         pass
@@ -154,12 +156,12 @@ def test_a_run_that_is_killed_learning_on_has_no_policy_of_fewer_episodes(bead_c
         raise Killed
 
     with pytest.raises(Killed):
-        train(folder, replace(bead_config, episodes=3), resume=True, report=kill)
+        run_training(folder, replace(bead_config, episodes=3), resume=True, report=kill)
     with pytest.raises(InputError, match="finish it with --resume"):
         Policy.load(folder.path)
-    train(folder, replace(bead_config, episodes=3), resume=True)
+    run_training(folder, replace(bead_config, episodes=3), resume=True)
     before = Policy.load(folder.path).description
-    train(folder, replace(bead_config, episodes=3), resume=True)
+    run_training(folder, replace(bead_config, episodes=3), resume=True)
     assert Policy.load(folder.path).description == before, "of a finished one nothing is removed"
 
 
@@ -168,7 +170,7 @@ def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_pat
     plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
     config = replace(plain, learner=replace(plain.learner, pipelined=True))
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
-    rows = train(undisturbed, config)
+    rows = run_training(undisturbed, config)
 
     class Stop(Exception):
         pass
@@ -178,11 +180,11 @@ def test_a_pipelined_run_goes_on_as_if_it_had_never_stopped(bead_config, tmp_pat
             raise Stop
 
     with pytest.raises(Stop):
-        train(stopped, config, report=stop)
-    train(stopped, config, resume=True)
+        run_training(stopped, config, report=stop)
+    run_training(stopped, config, resume=True)
     assert_same_run(undisturbed, stopped)
     # Another run than one that learns between its episodes: what is known is an episode older.
-    train(RunFolder(tmp_path / "other"), plain)
+    run_training(RunFolder(tmp_path / "other"), plain)
     assert without_clock(rows) != without_clock(RunFolder(tmp_path / "other").episodes())
 
 
@@ -194,27 +196,27 @@ def test_a_run_is_written_by_one_process_at_a_time(bead_config, tmp_path):
         assert other.stdout is not None
         other.stdout.readline()
         with pytest.raises(InputError, match="another process writes into"):
-            train(folder, bead_config)
+            run_training(folder, bead_config)
         other.kill()  # its lock file stays, and holds nobody back
     (folder.path / f".episodes.csv.{other.pid}.part").write_text("from a process that was killed while writing")
     with folder.locked():
         pass
-    train(folder, replace(bead_config, episodes=2))
+    run_training(folder, replace(bead_config, episodes=2))
     assert {path.name for path in folder.path.iterdir() if path.name.startswith(".")} == set()
 
 
 def test_a_step_log_that_was_turned_off_stays_off_when_a_run_resumes(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    train(folder, replace(bead_config, episodes=2, step_log=False))
+    run_training(folder, replace(bead_config, episodes=2, step_log=False))
     assert not folder.steps.exists()
     with pytest.raises(InputError, match="step_log False, not True"):
-        run(None, folder.path, environment={}, step_log=True, resume=True)
+        start_or_resume(None, folder.path, environment={}, step_log=True, resume=True)
 
 
 def test_a_run_never_replaces_another(bead_config, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="already exists"):
-        train(RunFolder(tmp_path), bead_config)
+        run_training(RunFolder(tmp_path), bead_config)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
@@ -231,32 +233,32 @@ def test_a_run_never_replaces_another(bead_config, tmp_path):
 )
 def test_a_damaged_run_is_refused_and_left_alone(bead_config, tmp_path, damage):
     folder = RunFolder(tmp_path / "run")
-    train(folder, replace(bead_config, episodes=2))
+    run_training(folder, replace(bead_config, episodes=2))
     damage(folder)
     before = {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
     with pytest.raises(InputError):
-        run(None, folder.path, environment={}, episodes=4, resume=True)
+        start_or_resume(None, folder.path, environment={}, episodes=4, resume=True)
     assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
 
 
 def test_a_run_killed_between_checkpoint_and_table_loses_nothing(bead_config, tmp_path):
     whole, torn = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "torn")
-    train(whole, bead_config)
-    train(torn, replace(bead_config, episodes=4))
+    run_training(whole, bead_config)
+    run_training(torn, replace(bead_config, episodes=4))
     lines = (torn.path / "episodes.csv").read_text().splitlines(keepends=True)
     (torn.path / "episodes.csv").write_text("".join(lines[:-1]))
-    train(torn, bead_config, resume=True)
+    run_training(torn, bead_config, resume=True)
     assert_same_run(whole, torn)
 
 
 def test_a_complete_run_whose_table_lacks_episodes_gets_them_from_its_checkpoint(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    train(folder, bead_config)
+    run_training(folder, bead_config)
     table = folder.path / "episodes.csv"
     whole = table.read_bytes()
     for left in (b"".join(whole.splitlines(keepends=True)[:2]), None):
         table.unlink() if left is None else table.write_bytes(left)
-        train(folder, bead_config, resume=True)
+        run_training(folder, bead_config, resume=True)
         assert table.read_bytes() == whole
 
 
@@ -279,49 +281,49 @@ def test_a_run_that_is_refused_in_its_first_episode_leaves_nothing_in_the_way_of
     (there / ".of_somebody").write_text("")
     for path, is_left in ((tmp_path / "new", []), (there, [".of_somebody"])):
         with pytest.raises(InputError, match="this is wrong"):
-            train(RunFolder(path), shown(bead_config, 3), demonstrator=refused_in(0))
+            run_training(RunFolder(path), shown(bead_config, 3), demonstrator=refused_in(0))
         assert path.exists() is bool(is_left)
         assert [one.name for one in path.glob("*")] == is_left
-    train(RunFolder(tmp_path / "new"), replace(bead_config, episodes=1))
+    run_training(RunFolder(tmp_path / "new"), replace(bead_config, episodes=1))
 
 
 def test_a_run_that_is_refused_later_or_going_on_keeps_what_it_has(bead_config, tmp_path):
     config, later, begun = shown(bead_config, 3), RunFolder(tmp_path / "later"), RunFolder(tmp_path / "begun")
     with pytest.raises(InputError, match="this is wrong"):
-        train(later, config, demonstrator=refused_in(1))
+        run_training(later, config, demonstrator=refused_in(1))
     assert len(later.episodes()) == 1
     begun.create(config)
     with pytest.raises(InputError, match="this is wrong"):
-        train(begun, config, resume=True, demonstrator=refused_in(0))
+        run_training(begun, config, resume=True, demonstrator=refused_in(0))
     assert begun.config() == config
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_again(bead_config, tmp_path):
     whole, begun = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "begun")
-    train(whole, bead_config)
+    run_training(whole, bead_config)
     begun.create(bead_config)
-    train(begun, bead_config, resume=True)
+    run_training(begun, bead_config, resume=True)
     assert_same_run(whole, begun)
 
 
 def test_a_resumed_run_stays_the_run_it_was(bead_config, tmp_path):
-    train(RunFolder(tmp_path / "run"), replace(bead_config, episodes=2))
+    run_training(RunFolder(tmp_path / "run"), replace(bead_config, episodes=2))
     with pytest.raises(InputError, match="seed 5, not 7"):
-        run(None, tmp_path / "run", environment={}, seed=7, resume=True)
+        start_or_resume(None, tmp_path / "run", environment={}, seed=7, resume=True)
     with pytest.raises(InputError, match="other learner settings"):
-        run(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
+        start_or_resume(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
 
 
 def test_a_run_of_another_version_is_left_as_it_is(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    rows = train(folder, bead_config)
+    rows = run_training(folder, bead_config)
     arrays, values = load_checkpoint(folder.checkpoint)
     older = [{key: value for key, value in row.items() if key != "mean_force"} for row in rows]
     save_checkpoint(folder.checkpoint, arrays, values | {"rows": older})
     folder.write_episodes(older)
     before = (folder.path / "episodes.csv").read_bytes()
     with pytest.raises(InputError, match="another version"):
-        train(folder, replace(bead_config, episodes=9), resume=True)
+        run_training(folder, replace(bead_config, episodes=9), resume=True)
     assert (folder.path / "episodes.csv").read_bytes() == before
 
 
@@ -351,7 +353,7 @@ def test_a_run_that_diverges_says_so_and_what_it_was_is_kept(pipelined, bead_con
     learner = replace(bead_config.learner, learning_rate=1e30, constant_episodes=0, pipelined=pipelined)
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(InputError, match="diverged"):
-        train(folder, replace(bead_config, learner=learner))
+        run_training(folder, replace(bead_config, learner=learner))
     assert (folder.path / "config.yaml").exists()
     assert not (folder.path / "policy.json").exists()
 
@@ -362,23 +364,24 @@ def test_more_than_fits_into_memory_is_refused_before_a_run_begins(bead_config, 
 
     monkeypatch.setitem(LEARNERS._entries, "vast", vast)
     with pytest.raises(InputError, match="buffer_size"):
-        train(RunFolder(tmp_path / "run"), replace(bead_config, learner=replace(bead_config.learner, algorithm="vast")))
+        run_training(
+            RunFolder(tmp_path / "run"), replace(bead_config, learner=replace(bead_config.learner, algorithm="vast"))
+        )
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_goes_on_by_the_words_that_began_it_and_says_of_other_versions(tmp_path, capsys):
+def test_a_run_goes_on_by_the_words_that_began_it_and_says_of_other_versions(tmp_path, caplog):
     words = {"environment": {"guidance": "kgrl", "action_dims": "0,1"}, "settings": {"net_arch": "8"}}
     out = tmp_path / "run"
-    run("NarrowPassage", out, episodes=1, **words)
+    start_or_resume("NarrowPassage", out, episodes=1, **words)
     folder = RunFolder(out)
     folder.write_config(replace(folder.config(), versions={**folder.config().versions, "drake": "1.0.0"}))
     for _ in range(2):
-        run("NarrowPassage", out, episodes=2, resume=True, **words)
-    said = capsys.readouterr().err
-    assert said.count("goes on with other versions: drake 1.0.0, then ") == 1
+        start_or_resume("NarrowPassage", out, episodes=2, resume=True, **words)
+    assert caplog.text.count("continues with other versions: drake 1.0.0, then ") == 1
     assert folder.config().versions["drake"].startswith("1.0.0, then ")
     with pytest.raises(InputError, match="has 2 episodes"):
-        run("NarrowPassage", out, episodes=1, resume=True, **words)
+        start_or_resume("NarrowPassage", out, episodes=1, resume=True, **words)
 
 
 def one_more(folder, package, kind, register, name):
@@ -397,12 +400,12 @@ def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monke
     kinds = "narrow_passage.task.NarrowPassage", "registry.register_task"
     file = one_more(tmp_path, "guiderail.diagrams.tasks", *kinds, "changes/Passage")
     out = tmp_path / "run"
-    run("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
+    start_or_resume("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
     config = RunFolder(out).config()
     before = kept_file(out, "uniform_random", config, config.environment, episodes=2)
     file.write_text(file.read_text() + "# now it is another one\n")
     with pytest.raises(InputError, match="are not those that the run"):
-        run(None, out, environment={}, episodes=2, resume=True)
+        start_or_resume(None, out, environment={}, episodes=2, resume=True)
     assert kept_file(out, "uniform_random", config, config.environment, episodes=2) != before
     gymnasium.registry.pop(environment_id("changes/Passage"), None)
 
@@ -412,15 +415,15 @@ def test_a_learner_that_is_imported_learns_in_a_process_of_its_own(tmp_path, for
     kinds = "off_policy.SacLearner", "learner.register_learner"
     file = one_more(tmp_path, "guiderail.tools.learning", *kinds, "sac_of_mine")
     settings = {"net_arch": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
-    done = run(
+    done = start_or_resume(
         "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "action_repeat": 20}, algorithm="sac_of_mine",
         settings=settings, episodes=2, imports=[str(file)],
     )  # fmt: skip
-    assert done["episodes"] == 2
+    assert done.summary["episodes"] == 2
 
 
 def test_a_demonstrated_episode_is_marked(bead_config, tmp_path):
-    rows = train(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=always_left)
+    rows = run_training(RunFolder(tmp_path / "run"), shown(bead_config, 2), demonstrator=always_left)
     assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
 
 

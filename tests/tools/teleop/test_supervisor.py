@@ -41,44 +41,44 @@ def env():
     env.close()
 
 
-def watched(person, env):
+def watched(supervisor, env):
     # A page that is no Meshcat shows nothing.
-    person._name_sliders(env.unwrapped)
-    person._let_go()
-    return person
+    supervisor._name_sliders(env.unwrapped)
+    supervisor._let_go()
+    return supervisor
 
 
 def test_sliders_push_until_they_are_let_go(env):
     page = Page()
-    person = watched(MeshcatSupervisor(print, page), env)
-    assert person.push(None) is None
+    supervisor = watched(MeshcatSupervisor(print, page), env)
+    assert supervisor.correction(None) is None
     page.sliders["push 2"] = -2.5
-    np.testing.assert_array_equal(person.push(None), [0.0, -2.5])
+    np.testing.assert_array_equal(supervisor.correction(None), [0.0, -2.5])
     page.clicks[LET_GO] += 1
-    assert person.push(None) is None
+    assert supervisor.correction(None) is None
     assert page.sliders == {"push 1": 0.0, "push 2": 0.0}
 
 
 def test_a_click_is_one_word(env):
     page = Page()
-    person = watched(MeshcatSupervisor(print, page), env)
-    assert person.says() is None
+    supervisor = watched(MeshcatSupervisor(print, page), env)
+    assert supervisor.label() is None
     for name, (_, word) in SAYS.items():
         page.clicks[name] += 2
-        assert person.says() == word
-        assert person.says() is None
+        assert supervisor.label() == word
+        assert supervisor.label() is None
 
 
 def test_of_what_is_said_between_two_episodes_a_stop_alone_counts(env, monkeypatch):
     page = Page()
-    person = MeshcatSupervisor(print, page)
+    supervisor = MeshcatSupervisor(print, page)
     monkeypatch.setattr(page_person, "look_at", lambda page, declaration: None)
     monkeypatch.setattr(page_person, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
     for name, (_, word) in SAYS.items():
         page.clicks[name] += 1
-        person.begin(env)
-        assert person.says() == ("stop" if word == "stop" else None)
-        assert person.says() is None
+        supervisor.on_episode_start(env)
+        assert supervisor.label() == ("stop" if word == "stop" else None)
+        assert supervisor.label() is None
 
 
 def test_no_key_has_two_meanings():
@@ -87,13 +87,13 @@ def test_no_key_has_two_meanings():
 
 
 def test_an_episode_is_shown_on_a_real_page(env):
-    person = MeshcatSupervisor(print)
-    assert isinstance(person.meshcat, Meshcat)
+    supervisor = MeshcatSupervisor(print)
+    assert isinstance(supervisor.meshcat, Meshcat)
     env.reset(seed=0)
-    person.begin(env)
-    assert person.push(None) is None
+    supervisor.on_episode_start(env)
+    assert supervisor.correction(None) is None
     env.step(np.zeros(2))
-    assert person.meshcat.HasPath("/drake/visualizer") or person.meshcat.HasPath("/drake/illustration")
-    person.meshcat.SetSliderValue("push 1", 1.0)
-    person.begin(env)
-    assert person.push(None) is None  # let go at the beginning of an episode
+    assert supervisor.meshcat.HasPath("/drake/visualizer") or supervisor.meshcat.HasPath("/drake/illustration")
+    supervisor.meshcat.SetSliderValue("push 1", 1.0)
+    supervisor.on_episode_start(env)
+    assert supervisor.correction(None) is None  # let go at the beginning of an episode

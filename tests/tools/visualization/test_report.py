@@ -17,7 +17,7 @@ from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog, read_step_log
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.learning.trainer import train
+from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.visualization.curves import plot_run
 from guiderail.tools.visualization.report import write_report
@@ -33,7 +33,7 @@ def studied(tmp_path_factory):
     for guidance in ("skgrl", "kmp"):
         for seed in (1, 2):
             config = configure("Bead", {"guidance": guidance}, settings=SETTINGS, episodes=3, seed=seed)
-            train(RunFolder(folder / f"{guidance}-{seed}"), config)
+            run_training(RunFolder(folder / f"{guidance}-{seed}"), config)
     rows = [("learner", "learned", seed, 3, 10, rate) for seed, rate in ((1, 0.9), (2, 0.7))]
     rows.append(("nothing", "zero", 1, 0, 10, 0.1))
     table = pd.DataFrame(rows, columns=["method", "policy", "seed", "after_episodes", "episodes", "success_rate"])
@@ -193,7 +193,7 @@ def test_a_folder_without_runs_is_refused(tmp_path):
 
 def test_a_run_that_lies_beside_a_study_is_judged_too(studied, tmp_path):
     run = tmp_path / "alone"
-    train(RunFolder(run), configure("Bead", {}, settings=SETTINGS, episodes=2, seed=9))
+    run_training(RunFolder(run), configure("Bead", {}, settings=SETTINGS, episodes=2, seed=9))
     judged = gather([run, studied], episodes=2).held_out
     assert set(judged["seed"]) == {1, 2, 9}
     assert judged[(judged["seed"] == 9) & (judged["policy"] == "learned")]["episodes"].tolist() == [2]

@@ -1,7 +1,7 @@
-"""Several equal multilayer perceptrons as one, and their gradients written out.
+"""Several multilayer perceptrons of equal shape as one batched network, with gradients written out.
 
-At a hundred units and batches of 64 a gradient step of one small layer after the other is mostly the cost of calling
-them, and of autograd's book of what was called. Here a layer of all networks is one call, forward and backward.
+At a hundred units and batches of 64, a gradient step that calls one small layer after the other mostly pays for the
+calls and for autograd's bookkeeping. Here a layer of all networks is one call, forward and backward.
 """
 
 from collections.abc import Sequence
@@ -9,23 +9,24 @@ from dataclasses import dataclass
 
 import torch
 
-_EPSILON = 1e-5  # of `torch.nn.functional.layer_norm`
+_EPSILON = 1e-5  # default of `torch.nn.functional.layer_norm`
 
 
 class Linear:
-    """The same layer of n networks: affine, with n sets of weights.
+    """The same affine layer of n networks, each with its own weights.
 
     Attributes:
-        weight: (n, outputs, inputs).
+        weight: Weights (n, outputs, inputs).
     """
 
     def __init__(self, values: torch.Tensor, gradient: torch.Tensor, inputs: int, outputs: int):
-        """
+        """Construct the layer.
+
         Args:
-            values: (n, outputs · inputs + outputs): weights and biases, as a view of all parameters.
-            gradient: the same of their gradient, which `backward` writes.
-            inputs: of one network.
-            outputs: of one network.
+            values: (n, outputs · inputs + outputs): weights and biases, a view of all parameters.
+            gradient: The same view of their gradient, which `backward` writes.
+            inputs: Number of inputs of one network.
+            outputs: Number of outputs of one network.
         """
         self.weight, bias = _split(values, inputs, outputs)
         self._transposed, self._bias = self.weight.mT, bias[:, None]
@@ -33,16 +34,21 @@ class Linear:
         self._networks = len(values)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """(n or 1, batch, inputs) to (n, batch, outputs)."""
+        """Map inputs (n or 1, batch, inputs) to outputs (n, batch, outputs)."""
         return torch.baddbmm(self._bias, x.expand(self._networks, -1, -1), self._transposed)
 
     def backward(self, x: torch.Tensor, d: torch.Tensor) -> None:
-        """Writes the weights' gradient, given that of what `forward` made of `x`."""
+        """Write the gradient of weights and biases.
+
+        Args:
+            x: Inputs of `forward`, (n or 1, batch, inputs).
+            d: Gradient of its outputs, (n, batch, outputs).
+        """
         torch.bmm(d.mT, x.expand(self._networks, -1, -1), out=self._weight_gradient)
         torch.sum(d, 1, out=self._bias_gradient)
 
     def input_gradient(self, d: torch.Tensor, shared: bool, columns: slice = slice(None)) -> torch.Tensor:
-        """That of so many columns of the input: (n or 1, batch, columns), added up if the networks share it."""
+        """Return the gradient of `columns` of the input, (n or 1, batch, columns); summed if the input is shared."""
         by_network = torch.bmm(d, self.weight[:, :, columns])
         return by_network.sum(0, keepdim=True) if shared and self._networks > 1 else by_network
 
@@ -54,64 +60,69 @@ def _split(flat: torch.Tensor, inputs: int, outputs: int) -> tuple[torch.Tensor,
 
 @dataclass
 class ForwardCache:
-    """What a forward pass leaves for the backward one: by layer, its input, and what the normalization knows."""
+    """Intermediate results of a forward pass that the backward pass needs.
+
+    Attributes:
+        inputs: Input of each layer, (n or 1, batch, inputs).
+        normalized: Of each hidden layer with normalization: its output, mean and inverse standard deviation.
+    """
 
     inputs: list[torch.Tensor]
     normalized: list[tuple[torch.Tensor, ...]]
 
     def first(self, rows: int) -> "ForwardCache":
-        """Of the first rows of the batch only."""
+        """Return the cache of the first `rows` of the batch."""
         return ForwardCache(
-            [x[:, :rows] for x in self.inputs], [tuple(x[:, :rows] for x in kept) for kept in self.normalized]
+            [x[:, :rows] for x in self.inputs], [tuple(x[:, :rows] for x in layer) for layer in self.normalized]
         )
 
 
 class BatchedMLP:
-    """Hidden layers that are rectified, and one that is not; the number of networks may differ from layer to layer."""
+    """Rectified hidden layers and an affine output layer; the number of networks may grow from layer to layer."""
 
     def __init__(self, layers: Sequence[Linear], layer_norm: bool):
-        """
+        """Construct the networks.
+
         Args:
-            layers: from the input to the output. Networks that share what is before them share it throughout: one
-                followed by n.
-            layer_norm: whether hidden layers are normalized, without learned parameters, before they are rectified.
+            layers: Layers from input to output. A layer of one network is shared by all networks of the layers after it.
+            layer_norm: Normalize hidden layers, without learned parameters, before they are rectified.
         """
         self._layers = list(layers)
         self._layer_norm = layer_norm
 
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, ForwardCache]:
-        """(n or 1, batch, inputs) to (n, batch, outputs)."""
-        done = ForwardCache([x], [])
+        """Map inputs (n or 1, batch, inputs) to outputs (n, batch, outputs), and return the cache too."""
+        cache = ForwardCache([x], [])
         for layer in self._layers[:-1]:
             x = layer.forward(x)
             if self._layer_norm:
                 before = x
                 x, mean, scale = torch.native_layer_norm(before, before.shape[-1:], None, None, _EPSILON)
-                done.normalized.append((before, mean, scale))
+                cache.normalized.append((before, mean, scale))
             x = x.relu_()
-            done.inputs.append(x)
-        return self._layers[-1].forward(x), done
+            cache.inputs.append(x)
+        return self._layers[-1].forward(x), cache
 
-    def backward(self, done: ForwardCache, d: torch.Tensor) -> None:
-        """Writes the gradient of all weights, given that of the output, (n, batch, outputs)."""
+    def backward(self, cache: ForwardCache, d: torch.Tensor) -> None:
+        """Write the gradient of all parameters, given that of the output, (n, batch, outputs)."""
         for index in reversed(range(1, len(self._layers))):
-            self._layers[index].backward(done.inputs[index], d)
-            d = self._through(index, done, d)
-        self._layers[0].backward(done.inputs[0], d)
+            self._layers[index].backward(cache.inputs[index], d)
+            d = self._through(index, cache, d)
+        self._layers[0].backward(cache.inputs[0], d)
 
-    def input_gradient(self, done: ForwardCache, d: torch.Tensor, columns: slice) -> torch.Tensor:
-        """That of so many columns of the input, (n or 1, batch, columns); no weight's gradient is touched."""
+    def input_gradient(self, cache: ForwardCache, d: torch.Tensor, columns: slice) -> torch.Tensor:
+        """Return the gradient of `columns` of the input, (n or 1, batch, columns); no parameter's gradient changes."""
         for index in reversed(range(1, len(self._layers))):
-            d = self._through(index, done, d)
-        return self._layers[0].input_gradient(d, len(done.inputs[0]) == 1, columns)
+            d = self._through(index, cache, d)
+        return self._layers[0].input_gradient(d, len(cache.inputs[0]) == 1, columns)
 
-    def _through(self, index: int, done: ForwardCache, d: torch.Tensor) -> torch.Tensor:
-        """From behind a layer to behind the one before it."""
-        x = done.inputs[index]
+    def _through(self, index: int, cache: ForwardCache, d: torch.Tensor) -> torch.Tensor:
+        """Return the gradient of the output of layer `index - 1`, given that of layer `index`."""
+        x = cache.inputs[index]
         d = torch.ops.aten.threshold_backward(self._layers[index].input_gradient(d, len(x) == 1), x, 0)
         if not self._layer_norm:
             return d
-        before, mean, scale = done.normalized[index - 1]
+        before, mean, scale = cache.normalized[index - 1]
         return torch.ops.aten.native_layer_norm_backward(
             d, before, before.shape[-1:], mean, scale, None, None, [True, False, False]
         )[0]

@@ -1,4 +1,4 @@
-"""Adam on parameters that share one buffer: a step is one call, however many layers there are."""
+"""Adam on parameters in one buffer: a step is one call, independent of the number of layers."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -9,7 +9,7 @@ _MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def flatten(parameters: Iterable[torch.Tensor]) -> torch.Tensor:
-    """One buffer of all parameters, in their order; each of them becomes a view of it."""
+    """Return one buffer of all parameters, in their order; each parameter becomes a view of it."""
     parameters = list(parameters)
     flat = torch.cat([parameter.detach().reshape(-1) for parameter in parameters])
     for parameter, part in zip(parameters, _parts(flat, [p.shape for p in parameters]), strict=True):
@@ -24,20 +24,21 @@ def _parts(flat: torch.Tensor, shapes: Iterable[torch.Size]) -> list[torch.Tenso
 
 
 class FlatAdam:
-    """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with its state named as `torch.optim.Adam` names it.
+    """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with the state dictionary of `torch.optim.Adam`.
 
-    It is no `torch.optim.Optimizer`: creating one imports PyTorch's compiler, which takes seconds of every start.
+    It is not derived from `torch.optim.Optimizer`, because creating one imports PyTorch's compiler, which takes seconds.
 
     Attributes:
-        values: (P,), all parameters, which are views of it.
-        gradient: (P,), what the next step goes against.
+        values: All parameters, (P,); each parameter is a view of it.
+        gradient: Gradient of the next step, (P,).
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], lr: float):
-        """
+        """Construct the optimizer.
+
         Args:
-            parameters: of one data type; whoever holds them sees each step.
-            lr: the learning rate.
+            parameters: Parameters of one data type; they become views of `values`.
+            lr: Learning rate.
         """
         parameters = list(parameters)
         self._shapes = [parameter.shape for parameter in parameters]
@@ -48,7 +49,7 @@ class FlatAdam:
         self._steps = torch.zeros(())
 
     def step(self) -> None:
-        """Goes one step against `gradient`."""
+        """Take one step with `gradient`."""
         first, second = self._moments
         self._steps += 1
         torch._fused_adam_(
@@ -68,19 +69,19 @@ class FlatAdam:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """As of `torch.optim.Adam`: the moments of each parameter by its index, and none before the first step."""
+        """Return the moments of each parameter by its index, as `torch.optim.Adam` does; none before the first step."""
         if not self._steps:
             return {"state": {}, "param_groups": []}
         moments = [_parts(moment, self._shapes) for moment in self._moments]
-        named = [dict(zip(_MOMENTS, of_one, strict=True)) for of_one in zip(*moments, strict=True)]
-        return {"state": {i: {"step": self._steps, **of_one} for i, of_one in enumerate(named)}, "param_groups": []}
+        named = [dict(zip(_MOMENTS, pair, strict=True)) for pair in zip(*moments, strict=True)]
+        return {"state": {i: {"step": self._steps, **one} for i, one in enumerate(named)}, "param_groups": []}
 
     def load_state_dict(self, stored: Mapping[str, Any]) -> None:
-        """Takes what `state_dict` gave, also that of a `torch.optim.Adam`.
+        """Set the state to that of a `state_dict`, also one of `torch.optim.Adam`.
 
         Raises:
-            KeyError: if a parameter's moments are missing.
-            ValueError: if one has another shape, or there are more than parameters.
+            KeyError: If the moments of a parameter are missing.
+            ValueError: If the number of moments or a shape differs.
         """
         state = stored["state"]
         for moment in self._moments:
@@ -95,4 +96,4 @@ class FlatAdam:
                 if state[index][name].shape != part.shape:
                     raise ValueError(f"the moment {name} of parameter {index} has another shape")
                 part.copy_(state[index][name])
-        self._steps.copy_(state[0]["step"].reshape(()))  # files know no number without a dimension
+        self._steps.copy_(state[0]["step"].reshape(()))  # safetensors stores 0-d arrays as 1-d

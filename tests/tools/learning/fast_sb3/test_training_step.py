@@ -11,7 +11,7 @@ from torch.nn.utils import parameters_to_vector
 
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.config import resolve_preset
-from guiderail.tools.learning.fast_sb3.ensemble import Ensemble
+from guiderail.tools.learning.fast_sb3.training_step import FastTrainingStep
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
 
 STEPS, BATCH = 6, 64
@@ -39,14 +39,14 @@ PAIRS = [(PlainSac, SacLearner), (PlainTqc, TqcLearner)]
 
 def make(kind, preset="tqc_contact", env=Vector, **settings):
     settings = {"net_arch": "32,24", "batch_size": BATCH, "symmetry": False, "learning_rate": 1e-4} | settings
-    learner = kind(resolve_preset(preset, "tqc", settings), env(), action_repeat=10, seed=0, decisions=300)
+    learner = kind(resolve_preset(preset, "tqc", settings), env(), action_repeat=10, seed=0, max_transitions=300)
     random, space = np.random.default_rng(0), env.observation_space
     for index in range(200):
         seen, then = random.uniform(0, 2, (2, *space.shape)).astype(space.dtype)
         if len(space.shape) == 3:
             seen, then = (np.moveaxis(image, 0, -1) for image in (seen, then))
         action, reward = random.uniform(-1, 1, 2).astype(np.float32), float(3 * random.normal())
-        learner.remember(Transition(seen, action, reward, then, index % 50 == 49, False, {}))
+        learner.store(Transition(seen, action, reward, then, index % 50 == 49, False, {}))
     return learner
 
 
@@ -69,8 +69,8 @@ def same(plain, ensemble, tolerance):
     for network in ("actor", "critic", "critic_target"):
         expected, found = (parameters_to_vector(getattr(x.model, network).parameters()) for x in (plain, ensemble))
         torch.testing.assert_close(found.detach(), expected.detach(), rtol=0, atol=tolerance)
-    if plain._entropy() is not None:
-        torch.testing.assert_close(ensemble._entropy(), plain._entropy().detach(), rtol=0, atol=tolerance)
+    if plain._log_ent_coef() is not None:
+        torch.testing.assert_close(ensemble._log_ent_coef(), plain._log_ent_coef().detach(), rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
@@ -130,7 +130,7 @@ def test_moments_of_other_networks_do_not_fit():
 
 
 def test_layers_whose_gradient_is_not_written_out_are_refused():
-    class Other(Ensemble, SAC):
+    class Other(FastTrainingStep, SAC):
         pass
 
     with pytest.raises(TypeError, match="GELU"):
@@ -140,11 +140,11 @@ def test_layers_whose_gradient_is_not_written_out_are_refused():
 def test_learning_does_not_wait_for_pytorchs_compiler(forks):
     code = """
 import sys
-from guiderail.tools.learning.fast_sb3.ensemble import EnsembleSac, EnsembleTqc
+from guiderail.tools.learning.fast_sb3.training_step import FastSac, FastTqc
 from gymnasium import Env, spaces
 class Vector(Env):
     observation_space = action_space = spaces.Box(-1, 1, (2,))
-for algorithm in (EnsembleSac, EnsembleTqc):
+for algorithm in (FastSac, FastTqc):
     algorithm("MlpPolicy", Vector())
 sys.exit("torch._dynamo" in sys.modules)
 """

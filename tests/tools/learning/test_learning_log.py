@@ -1,0 +1,63 @@
+"""Learning log of a run, in the formats of Stable-Baselines3's logger."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import guiderail.tools.learning.learning_log as learning_log
+from guiderail.models.common.errors import InputError
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.trainer import run_training
+from oracles.same_runs import differences
+
+LOSSES = ["train/critic_loss", "train/actor_loss", "train/ent_coef"]
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tqc"])
+@pytest.mark.parametrize("step", ["fast", "sb3"])
+def test_log_has_returns_and_losses(step, algorithm, bead_config, tmp_path):
+    learner = replace(bead_config.learner, algorithm=algorithm, training_step=step, constant_episodes=0)
+    run_training(RunFolder(tmp_path), config := replace(bead_config, learner=learner, episodes=4), log=["csv"])
+    logged, episodes = pd.read_csv(tmp_path / "logs" / "progress.csv"), RunFolder(tmp_path).episodes()
+    np.testing.assert_allclose(logged["rollout/return"], episodes["return"])
+    assert np.isfinite(logged[LOSSES].iloc[-1]).all()
+    assert config.episodes == len(logged)
+
+
+def test_log_does_not_change_the_run(bead_config, tmp_path):
+    for name, log in (("silent", ()), ("logged", ["json"])):
+        run_training(RunFolder(tmp_path / name), bead_config, log=log)
+    assert (tmp_path / "logged" / "logs" / "progress.json").is_file()
+    assert not (tmp_path / "silent" / "logs").exists()
+    assert differences(tmp_path / "silent", tmp_path / "logged") == []
+
+
+def test_pipelined_learner_logs_losses_of_its_process(bead_config, tmp_path, forkserver):
+    learner = replace(bead_config.learner, pipelined=True, constant_episodes=0)
+    run_training(RunFolder(tmp_path), replace(bead_config, learner=learner), log="csv")
+    assert pd.read_csv(tmp_path / "logs" / "progress.csv")[LOSSES].iloc[-1].notna().all()
+
+
+def test_resumed_run_keeps_the_log_of_its_first_part(bead_config, tmp_path):
+    run_training(RunFolder(tmp_path), replace(bead_config, episodes=2), log=["csv"])
+    run_training(RunFolder(tmp_path), replace(bead_config, episodes=4), resume=True, log=["csv"])
+    files = sorted(path.name for path in (tmp_path / "logs").iterdir())
+    assert files == ["progress-from-2.csv", "progress.csv"]
+
+
+def test_log_format_is_refused_when_unknown_or_not_installed(monkeypatch, bead_config, tmp_path):
+    with pytest.raises(InputError, match="did you mean tensorboard"):
+        run_training(RunFolder(tmp_path), bead_config, log=["tensorbord"])
+    monkeypatch.setattr(learning_log, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"guiderail\[tensorboard\]"):
+        run_training(RunFolder(tmp_path), bead_config, log=["tensorboard"])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(find_spec("tensorboard") is None, reason="an extra: pip install 'guiderail[tensorboard]'")
+def test_tensorboard_log_is_written(bead_config, tmp_path):
+    run_training(RunFolder(tmp_path), replace(bead_config, episodes=1), log=["tensorboard"])
+    assert list((tmp_path / "logs").glob("events.out.tfevents.*"))
