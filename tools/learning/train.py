@@ -167,7 +167,7 @@ def start_or_resume(
     if resume:
         config = _resumed_config(folder, task, environment, given, settings)
     elif task is None:
-        raise InputError("training needs a task: name one, such as guiderail train NarrowPassage --out RUN")
+        raise InputError("training needs a task: name a task, such as guiderail train NarrowPassage --out RUN")
     else:
         folder.refuse_existing()
         given["settings"] = settings
