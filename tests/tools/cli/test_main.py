@@ -155,7 +155,7 @@ def test_train_writes_all_files_of_a_run(capsys, tmp_path):
     assert code == 0
     assert json.loads(out)["episodes"] == 2
     assert "Bead 2/2" in err
-    assert err.index("learned; now the learning curve and a replay page") > err.index("Bead 2/2")
+    assert err.index("training is complete; drawing the learning curve") > err.index("Bead 2/2")
     expected = {"config.yaml", "episodes.csv", "checkpoint", "policy.safetensors", "policy.json", "learning_curve.png"}
     assert expected <= {path.name for path in (tmp_path / "run").iterdir()}
 
