@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
@@ -25,9 +24,7 @@ class TorquePublisher(LeafSystem):
 
     def __init__(
         self,
-        lcm: DrakeLcmInterface,
-        channel: str,
-        encode: Callable[[float, np.ndarray], bytes],
+        write: Callable[[np.ndarray, float], None],
         num_joints: int,
         *,
         period: float,
@@ -35,9 +32,7 @@ class TorquePublisher(LeafSystem):
         """Construct the system.
 
         Args:
-            lcm: LCM interface.
-            channel: Channel of the command messages.
-            encode: Function of time [s] and torques (n,) [Nm] that returns an encoded message.
+            write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.
             num_joints: n, at least 1.
             period: Publishing period [s], positive.
 
@@ -48,7 +43,7 @@ class TorquePublisher(LeafSystem):
         check_period(period)
         if num_joints < 1:
             raise InputError(f"torques are sent to at least one joint, not {num_joints}")
-        self._lcm, self._channel, self._encode = lcm, channel, encode
+        self._write = write
         self._torque_port = self.DeclareVectorInputPort("torque", num_joints)
         self._is_sending_port = self.DeclareVectorInputPort("is_sending", 1)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
@@ -63,5 +58,5 @@ class TorquePublisher(LeafSystem):
 
     def _publish(self, context: Context) -> EventStatus:
         if self._is_sending_port.Eval(context)[0] > 0.0:
-            self._lcm.Publish(self._channel, self._encode(context.get_time(), self._torque_port.Eval(context)))
+            self._write(self._torque_port.Eval(context), context.get_time())
         return EventStatus.Succeeded()

@@ -23,7 +23,7 @@ ON_A_BUS = (
 
 def pytest_collection_modifyitems(items):
     """Where a handler would end the process, the tests that need one are skipped, and say so."""
-    from guiderail.diagrams.hardware.clock import handlers_are_safe
+    from guiderail.diagrams.hardware.lcm.driver import handlers_are_safe
 
     if not handlers_are_safe():
         for item in items:

@@ -1,66 +1,139 @@
-"""What is to be known of the program that drives a robot and speaks on a bus."""
+"""Interface to the program that drives a robot: joint states in, joint torques out, and no message type."""
 
 from __future__ import annotations
 
-import struct
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import Registry
+from guiderail.models.control.joint_status import Heartbeat, JointStatus
+from guiderail.models.robots.robot import Robot
+from guiderail.systems.torque_safety_limiter import SafetyLimits
 
-MICROSECOND = 1e-6  # [s]
-STATUS_PERIOD = CONTROL_PERIOD / 4  # [s]: 5 ms, what drivers on LCM have; a control period is a multiple to the bit
+STATUS_PERIOD = CONTROL_PERIOD / 4  # period of Drake's drivers, 5 ms [s]; a control period is an exact multiple
+POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
+
+# Shares of the driver's reflex limits that are commanded and tolerated, and of a joint's maximum velocity.
+TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
+
+StatusCallback = Callable[[JointStatus], None]
+CommandCallback = Callable[[np.ndarray], None]
 
 
-@dataclass(frozen=True)
-class Driver:
-    """How the program that drives a robot speaks over LCM, and what it does by itself.
+class Driver(ABC):
+    """Connection to the program that drives a robot with joint torque control.
+
+    A driver of another robot or transport implements `read` and `write` and is registered with `register_driver`. A
+    driver whose program repeats the last torque when commands stop needs a `SafetyMonitor` next to it, and implements
+    `add_listener`, `read_heartbeat` and `write_heartbeat` as well.
 
     Attributes:
-        name: what Drake calls its ports.
-        status_channel, command_channel: of the bus.
-        status_type: its message, of the fields that `status_fields` names.
-        status_fields: of position, velocity and external torque.
-        external_torque_sign: what the last of these is multiplied by to be what the surroundings do to the arm.
-        command_type: its message, with the field `joint_torque`.
-        encode: from the time [s] and torques (n,) to a command.
-        trips: external torques at which it stops by itself when it is controlled by torque, (n,) [Nm].
-        has_command_timeout: whether it brings the arm to rest where commands stop; otherwise it needs a `SafetyMonitor`.
-        hold_off: for how long after its first status it wants no command [s].
-        period: at which commands are sent to it [s].
+        name: Prefix of the joint ports of a hardware station, as in Drake's own stations.
+        torque_reflex_limits: External torques at which the driver stops by itself under torque control, (n,) [Nm].
+        has_command_timeout: True if the driver brings the arm to rest when commands stop.
+        hold_off: Time after its first status for which the driver must not receive commands [s].
+        period: Period of statuses and commands [s].
+        url: Address that the connection was opened with; empty for the default.
+        num_statuses: Number of different statuses received; a repeated one counts once.
+        num_foreign_commands: Number of commands received by the robot from other programs.
     """
 
-    name: str
-    status_channel: str
-    command_channel: str
-    status_type: Any
-    status_fields: tuple[str, str, str]
-    external_torque_sign: float
-    command_type: Any
-    encode: Callable[[float, np.ndarray], bytes]
-    torque_reflex_limits: tuple[float, ...]
-    has_command_timeout: bool
-    hold_off: float = 0.25
-    period: float = STATUS_PERIOD
+    name: ClassVar[str]
+    torque_reflex_limits: ClassVar[tuple[float, ...]]
+    has_command_timeout: ClassVar[bool]
+    hold_off: ClassVar[float] = 0.25
+    period: ClassVar[float] = STATUS_PERIOD
 
-    def decode(self, message: bytes) -> JointStatus:
-        """What a message says; `MALFORMED_STATUS` where it can't be read."""
-        try:
-            status = self.status_type.decode(message)
-            positions, velocities, external = (
-                np.array(getattr(status, name), dtype=float) for name in self.status_fields
-            )
-        except (ValueError, struct.error, OverflowError):
-            return MALFORMED_STATUS
-        return JointStatus(status.utime * MICROSECOND, positions, velocities, self.external_torque_sign * external)
+    def __init__(self, url: str = ""):
+        self.url = url
+        self.num_statuses = self.num_foreign_commands = 0
+        self._last_time = np.nan
 
-    def decode_command(self, message: bytes) -> np.ndarray | None:
-        """The torques of a command [Nm]; None where it can't be read."""
-        try:
-            return np.array(self.command_type.decode(message).joint_torque, dtype=float)
-        except (ValueError, struct.error, OverflowError):
-            return None
+    @abstractmethod
+    def read(self) -> JointStatus | None:
+        """Return the newest status, or None before the first."""
+
+    @abstractmethod
+    def write(self, torque: np.ndarray, time: float) -> None:
+        """Send joint torques (n,) [Nm]; `time` is the time of the command [s]."""
+
+    def receive(self, timeout: float = 0.0) -> None:
+        """Receive what has arrived.
+
+        Args:
+            timeout: Longest time to wait for a new status if none has arrived [s].
+        """
+        end = time.monotonic() + timeout
+        while True:
+            status = self.read()
+            if status is not None and status.time != self._last_time:
+                self.num_statuses, self._last_time = self.num_statuses + 1, status.time
+                return
+            if time.monotonic() >= end:
+                return
+            time.sleep(POLL_PERIOD)
+
+    def check_usable(self) -> None:
+        """Raise `InputError` if the connection cannot receive in this environment."""
+
+    def add_listener(self, on_status: StatusCallback, on_command: CommandCallback) -> None:
+        """Call back for every status, and for the torques of every readable command of another program.
+
+        Raises:
+            InputError: If the driver does not show the commands of other programs.
+        """
+        raise InputError(f"the driver {self.name} cannot be watched by a safety monitor")
+
+    def read_heartbeat(self) -> Heartbeat | None:
+        """Return the newest heartbeat of the safety monitor, or None before the first."""
+        return None
+
+    def write_heartbeat(self, heartbeat: Heartbeat) -> None:
+        """Send a heartbeat of the safety monitor."""
+        raise InputError(f"the driver {self.name} transports no heartbeat of a safety monitor")
+
+    def __str__(self) -> str:
+        """Return where the robot is listened to, for messages."""
+        return self.url or self.name
+
+
+DRIVERS: Registry[type[Driver]] = Registry(
+    "driver of a robot",
+    package="guiderail.diagrams.hardware",
+    decorator="register_driver",
+    entry_points="guiderail.drivers",
+)
+"""Driver classes by the name of their robot."""
+
+register_driver = DRIVERS.register
+
+
+def find_driver(robot: Robot | str) -> type[Driver]:
+    """Return the driver class of a robot.
+
+    Raises:
+        InputError: If no driver is registered for it.
+    """
+    return DRIVERS.get(robot if isinstance(robot, str) else robot.name)
+
+
+def safety_limits(plant: MultibodyPlant, driver: Driver | type[Driver]) -> SafetyLimits:
+    """Return limits below those at which the driver stops by itself, and below the limits of the joints.
+
+    Args:
+        plant: The arm's controller plant.
+        driver: Driver of the arm.
+    """
+    reflex_limits = np.array(driver.torque_reflex_limits)
+    return SafetyLimits(
+        velocity=tuple((VELOCITY_SHARE * plant.GetVelocityUpperLimits()).tolist()),
+        torque=tuple(np.minimum(TORQUE_SHARE * reflex_limits, plant.GetEffortUpperLimits()).tolist()),
+        external_torque=tuple((EXTERNAL_TORQUE_SHARE * reflex_limits).tolist()),
+    )

@@ -1,47 +1,19 @@
-"""Whoever stands by at a robot, and stops it where the program that commands it is gone."""
+"""Safety monitor: damps the arm to rest when torque commands stop arriving."""
 
 from __future__ import annotations
 
-import struct
-from collections import deque
 from enum import IntEnum
 
 import numpy as np
-from pydrake.common.value import Value
-from pydrake.lcm import DrakeLcmInterface
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.lcm import SerializerInterface
 
 from guiderail.diagrams.hardware.driver import Driver
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Heartbeat, JointStatus, damping_torque
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimits
 
-_WORD = struct.Struct(">q?")
-
-
-def word_channel(command_channel: str) -> str:
-    """Of what a deputy says."""
-    return command_channel + "_MONITOR"
-
-
-class WordSerializer(SerializerInterface):
-    """Reads a deputy's words; what can't be read counts as none."""
-
-    def __init__(self) -> None:
-        SerializerInterface.__init__(self)
-
-    def CreateDefaultValue(self) -> Value:
-        """No word yet."""
-        return Value[object]()
-
-    def Deserialize(self, buffer: bytes, abstract_value: Value) -> None:
-        """A message as a `Heartbeat`."""
-        if len(buffer) == _WORD.size:
-            abstract_value.set_value(Heartbeat(*_WORD.unpack(bytes(buffer))))
-
 
 class MonitorState(IntEnum):
-    """What a deputy does: nobody commands; somebody does; it damps; it says that there is no torque."""
+    """State of a safety monitor: no commands; commands arrive; damping the arm; commanding zero torque."""
 
     IDLE = 0
     WATCHING = 1
@@ -50,93 +22,80 @@ class MonitorState(IntEnum):
 
 
 class SafetyMonitor:
-    """Listens to a robot's statuses and commands, and brings the arm to rest where commands stop.
+    """Watch the statuses and commands of a robot, and damp the arm to rest when commands stop.
 
-    A driver may repeat the last torque for ever when the program that sent it is killed, or when its commands get lost.
-    So this belongs on the driver's machine, in a process of its own. It has the robot's clock: nothing here waits. What
-    it does it says with every status, so that whoever commands stops as well, and stops where there is no deputy any
-    more.
+    A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
+    lost. The monitor therefore runs on the driver's machine, in a process of its own. Its only clock is the robot's. It
+    sends a heartbeat with every status, so that a commanding program stops if the monitor stops the arm or is gone.
 
     Attributes:
-        duty: what it does now.
+        state: Current state.
     """
 
-    def __init__(
-        self,
-        lcm: DrakeLcmInterface,
-        driver: Driver,
-        plant: MultibodyPlant,
-        limits: SafetyLimits,
-        silence: float | None = None,
-    ):
-        """
+    def __init__(self, driver: Driver, plant: MultibodyPlant, limits: SafetyLimits, max_silence: float | None = None):
+        """Construct the monitor.
+
         Args:
-            lcm: the robot's bus.
-            driver: of the arm.
-            plant: the arm with what it carries and nothing else, finalized; only its inertia is used.
-            limits: of the torques, and how a stop damps.
-            silence: of the commands, beyond which it acts [s]; some of them may be lost unless given.
+            driver: The monitor's own connection to the robot.
+            plant: Controller plant of the arm and its tool, finalized; only its inertia is used.
+            limits: Limits of the torques, and times of a stop.
+            max_silence: Largest accepted time between commands [s]; some consecutive commands may be lost by default.
         """
-        self.duty = MonitorState.IDLE
-        self._lcm, self._driver, self._plant, self._limits = lcm, driver, plant, limits
-        self._silence = MAX_MISSED_MESSAGES * driver.period if silence is None else silence
+        driver.check_usable()
+        self.state = MonitorState.IDLE
+        self._driver, self._plant, self._limits = driver, plant, limits
+        self._max_silence = MAX_MISSED_MESSAGES * driver.period if max_silence is None else max_silence
         self._context = plant.CreateDefaultContext()
-        self._now = self._commanded_at = self._since = -np.inf
-        self._has_torque = False
-        self._words = 0
-        self._mine: deque[bytes] = deque(maxlen=64)
-        lcm.Subscribe(driver.command_channel, self._hear_command)
-        lcm.Subscribe(driver.status_channel, self._hear_status)
+        # Times by the robot's clock [s]: of the last status, of the last command, and of the state's begin.
+        self._now = self._commanded_at = self._entered_at = -np.inf
+        self._has_torque = False  # the last command was not zero
+        self._num_heartbeats = 0
+        driver.add_listener(self._on_status, self._on_command)
 
-    def _hear_command(self, message: bytes) -> None:
-        if message in self._mine:
-            return
-        torque = self._driver.decode_command(message)
-        if torque is None:
-            return
+    def _on_command(self, torque: np.ndarray) -> None:
         self._commanded_at, self._has_torque = self._now, bool(np.any(torque))
-        if self.duty == MonitorState.IDLE:
-            self.duty = MonitorState.WATCHING
+        if self.state == MonitorState.IDLE:
+            self.state = MonitorState.WATCHING
 
-    def _hear_status(self, message: bytes) -> None:
-        status = self._driver.decode(message)
+    def _on_status(self, status: JointStatus) -> None:
         if not status.is_readable or not np.isfinite(status.values()).all():
             return
         if len(status.positions) != self._plant.num_positions() or len(status.velocities) != len(status.positions):
             return
-        if self._now - self._silence <= status.time < self._now:
-            return  # another one overtook it
-        if self.duty == MonitorState.WATCHING and (status.time < self._now or not np.isfinite(self._now)):
-            self._commanded_at = status.time  # the robot's clock went back, or only began
-            if self._now - status.time > self._silence and self._has_torque:
-                self.duty, self._since = (
-                    MonitorState.DAMPING,
-                    status.time,
-                )  # a torque may be on its way that is of another time
+        if self._now - self._max_silence <= status.time < self._now:
+            return  # drop an out-of-order status
+        if self.state == MonitorState.WATCHING and (status.time < self._now or not np.isfinite(self._now)):
+            # The robot's clock was set back, or this is its first status.
+            self._commanded_at = status.time
+            if self._now - status.time > self._max_silence and self._has_torque:
+                # A torque meant for the robot before its restart may still be on its way.
+                self.state, self._entered_at = MonitorState.DAMPING, status.time
         self._now = status.time
-        self._act(status)
-        self._words += 1
-        is_acting = self.duty in (MonitorState.DAMPING, MonitorState.RESTING)
-        self._lcm.Publish(word_channel(self._driver.command_channel), _WORD.pack(self._words, is_acting))
+        self._update_state()
+        is_stopping = self.state in (MonitorState.DAMPING, MonitorState.RESTING)
+        if is_stopping:
+            self._driver.write(self._torque(status), self._now)
+        self._num_heartbeats += 1
+        self._driver.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping))
 
-    def _act(self, status: JointStatus) -> None:
-        if self.duty == MonitorState.WATCHING and self._now - self._commanded_at > self._silence:
-            self.duty, self._since = (MonitorState.DAMPING if self._has_torque else MonitorState.IDLE), self._now
-        if self.duty in (MonitorState.DAMPING, MonitorState.RESTING) and self._now < self._since:
-            self._since = self._now
-        if self.duty == MonitorState.DAMPING and self._now - self._since >= self._limits.damping_time:
-            self.duty, self._since = MonitorState.RESTING, self._now
-        if self.duty == MonitorState.RESTING and self._now - self._since > ZERO_TORQUE_TIME:
-            self.duty = MonitorState.IDLE
-        if self.duty not in (MonitorState.DAMPING, MonitorState.RESTING):
-            return
-        torque = np.zeros(len(status.positions))
-        if self.duty == MonitorState.DAMPING:
-            self._plant.SetPositions(self._context, status.positions)
-            M = self._plant.CalcMassMatrix(self._context)
-            limits = np.array(self._limits.torque)
-            damping = damping_torque(M, status.velocities, self._limits.decay_time, period=self._driver.period)
-            torque = np.clip(damping, -limits, limits)
-        message = self._driver.encode(self._now, torque)
-        self._mine.append(message)
-        self._lcm.Publish(self._driver.command_channel, message)
+    def _update_state(self) -> None:
+        if self.state == MonitorState.WATCHING and self._now - self._commanded_at > self._max_silence:
+            self.state, self._entered_at = (
+                MonitorState.DAMPING if self._has_torque else MonitorState.IDLE,
+                self._now,
+            )
+        if self.state in (MonitorState.DAMPING, MonitorState.RESTING) and self._now < self._entered_at:
+            self._entered_at = self._now
+        if self.state == MonitorState.DAMPING and self._now - self._entered_at >= self._limits.damping_time:
+            self.state, self._entered_at = MonitorState.RESTING, self._now
+        if self.state == MonitorState.RESTING and self._now - self._entered_at > ZERO_TORQUE_TIME:
+            self.state = MonitorState.IDLE
+
+    def _torque(self, status: JointStatus) -> np.ndarray:
+        if self.state != MonitorState.DAMPING:
+            return np.zeros(len(status.positions))
+        self._plant.SetPositions(self._context, status.positions)
+        M = self._plant.CalcMassMatrix(self._context)
+        limits = np.array(self._limits.torque)
+        damping = damping_torque(M, status.velocities, self._limits.decay_time, period=self._driver.period)
+        return np.clip(damping, -limits, limits)

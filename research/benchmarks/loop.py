@@ -21,7 +21,9 @@ from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.hardware.clock import set_realtime_priority
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.policy import FORMAT, Policy
@@ -31,7 +33,7 @@ TASK, HOLD = "BncConnector", 10
 UNITS = 128
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
 SECONDS = 6.0  # robot time for each of the two loads [s]
-PERIOD = IIWA_DRIVER.period
+PERIOD = IiwaDriver.period
 Row = dict[str, Any]
 
 
@@ -91,7 +93,7 @@ def _parts() -> list[Row]:
     predictions = _timed(lambda index: primitive.predict(index % steps, actions[index], history), number)
     rows.append(_row("primitive", CONTROL_PERIOD, predictions))
     lcm = DrakeLcm("memq://")
-    station = HardwareStation(BncWorkcell(), lcm)
+    station = HardwareStation(BncWorkcell(), IiwaDriver(lcm))
     rows.append(_row("station with its monitors", PERIOD, _stepped(lcm, station, number)))
     return rows
 

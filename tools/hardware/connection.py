@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from guiderail.diagrams.hardware.clock import Clock, LockstepClock, WallClock, check_rate
+from guiderail.diagrams.hardware.clock import Clock, WallClock, check_rate
+from guiderail.diagrams.hardware.lcm.simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM

@@ -19,7 +19,8 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_skill
 from guiderail.diagrams.envs.options import Options
 from guiderail.diagrams.envs.trace import EpisodeTrace
-from guiderail.diagrams.hardware.clock import Clock, MessageCounter, set_realtime_priority
+from guiderail.diagrams.hardware.clock import Clock, set_realtime_priority
+from guiderail.diagrams.hardware.lcm.driver import MessageCounter
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.driver import Driver
-from guiderail.diagrams.hardware.station import SimulatedIiwa
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
 from guiderail.diagrams.tasks.insertion import InsertionTask
 
 

@@ -14,7 +14,8 @@ from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.env import GuidedEnv
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
-from guiderail.diagrams.hardware.clock import Clock, MessageCounter
+from guiderail.diagrams.hardware.clock import Clock
+from guiderail.diagrams.hardware.lcm.driver import MessageCounter
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.hardware.bus import open_bus
+from guiderail.diagrams.hardware.lcm.driver import open_bus
 from guiderail.diagrams.hardware.clock import set_realtime_priority
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
-from guiderail.diagrams.hardware.station import find_driver, safety_limits
+from guiderail.diagrams.hardware.driver import find_driver, safety_limits
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
@@ -32,7 +32,7 @@ def stand_by(url: str, robot: str, task: str, *, say: Callable[[str], None] = pr
         raise InputError(f"{task} is done by no arm with a tool: name an insertion")
     plant = ArmControllerPlant(declared.workcell(), robot).plant
     lcm = open_bus(url)
-    deputy = SafetyMonitor(lcm, driver, plant, safety_limits(plant, driver))
+    deputy = SafetyMonitor(type(driver)(lcm), plant, safety_limits(plant, driver))
     words = "" if set_realtime_priority() else "; the system serves this process as any other"
     say(f"standing by on {driver.command_channel} of {url or 'LCM'}{words}")
     before = deputy.duty

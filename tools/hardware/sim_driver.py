@@ -8,10 +8,13 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.hardware.bus import open_bus
-from guiderail.diagrams.hardware.clock import check_rate, serve, serve_in_real_time, set_realtime_priority
+from guiderail.diagrams.hardware.lcm.driver import open_bus
+from guiderail.diagrams.hardware.clock import check_rate, set_realtime_priority
+from guiderail.diagrams.hardware.lcm.simulated import serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa, safety_limits
+from guiderail.diagrams.hardware.driver import safety_limits
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.tools.hardware.part_randomization import put
@@ -65,7 +68,7 @@ def serve_iiwa(
     moved = None if offset is None else validate_options(declared.Reset, {"offset": tuple(offset)}, "a robot")
     start = START if task == TASK else declared.start_pose(np.random.default_rng(0)) + ASIDE
     directives = [] if scenario is None else load_scenario(scenario).directives
-    lcm, driver = open_bus(url), IIWA_DRIVER
+    lcm, driver = open_bus(url), IiwaDriver
     # In real time, the deputy has ears of its own: beside a real driver it is another process.
     within, ears = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
     robot = SimulatedIiwa(
@@ -73,7 +76,7 @@ def serve_iiwa(
     )
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
-    SafetyMonitor(ears, driver, robot.controller_plant.plant, safety_limits(robot.controller_plant.plant, driver))
+    SafetyMonitor(type(driver)(ears), robot.controller_plant.plant, safety_limits(robot.controller_plant.plant, driver))
     if moved is not None:
         fixture, workpiece = declared.offsets.draw(np.random.default_rng(0), moved)
         declared.set_part_offsets(robot, simulator.get_mutable_context(), fixture, workpiece)

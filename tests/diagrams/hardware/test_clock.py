@@ -8,18 +8,12 @@ from pydrake.systems.framework import EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.diagrams.hardware import clock as pace_module
-from guiderail.diagrams.hardware.clock import (
-    HEAD,
-    TAKEN,
-    IntervalHistogram,
-    LockstepClock,
-    MessageCounter,
-    WallClock,
-    serve,
-    serve_in_real_time,
-)
+from guiderail.diagrams.hardware.clock import IntervalHistogram, WallClock
+from guiderail.diagrams.hardware.lcm.driver import HEAD_SIZE, MessageCounter
+from guiderail.diagrams.hardware.lcm.simulated import ACKNOWLEDGED, LockstepClock, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.driver import STATUS_PERIOD
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
@@ -148,7 +142,7 @@ def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
 def test_in_step_a_status_that_comes_again_is_answered_again_and_is_no_step():
     lcm, words = DrakeLcm("memq://"), []
     pace, simulator = LockstepClock(lcm, 0.01, "STATUS"), Simulator(ConstantVectorSource([0.0]))
-    lcm.Subscribe("STATUS" + TAKEN, words.append)
+    lcm.Subscribe("STATUS" + ACKNOWLEDGED, words.append)
     pace.begin()
     for number in range(3):
         for _ in range(3):
@@ -157,14 +151,14 @@ def test_in_step_a_status_that_comes_again_is_answered_again_and_is_no_step():
         lcm.HandleSubscriptions(0)
     assert simulator.get_context().get_time() == 3 * STATUS_PERIOD
     # What is asked for is the status after this one, and not before anybody wants it.
-    assert words == [b"", *(bytes([number]) * HEAD for number in range(2))]
+    assert words == [b"", *(bytes([number]) * HEAD_SIZE for number in range(2))]
     words.clear()
     lcm.Publish("STATUS", bytes([2]) * 40)
     pace.advance(simulator, Told(), 1)  # nobody speaks but of what is known: the word was lost, and it goes on without
     while lcm.HandleSubscriptions(0):
         pass
     assert len(words) > 1
-    assert set(words) == {bytes([2]) * HEAD}
+    assert set(words) == {bytes([2]) * HEAD_SIZE}
 
 
 def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
@@ -173,14 +167,14 @@ def test_a_robot_in_step_waits_for_the_word_about_its_own_status():
     simulator = Simulator(SimulatedIiwa(BncWorkcell(), within))
 
     def answer(message):
-        heard.append(message[:HEAD])
+        heard.append(message[:HEAD_SIZE])
         earlier = dict.fromkeys(heard)
-        lcm.Publish(IIWA_DRIVER.status_channel + TAKEN, list(earlier)[-2 if heard.count(heard[-1]) < 3 else -1])
+        lcm.Publish(IiwaDriver.status_channel + ACKNOWLEDGED, list(earlier)[-2 if heard.count(heard[-1]) < 3 else -1])
 
-    heard.append(b"\x7f" * HEAD)
-    lcm.Subscribe(IIWA_DRIVER.status_channel, answer)
+    heard.append(b"\x7f" * HEAD_SIZE)
+    lcm.Subscribe(IiwaDriver.status_channel, answer)
     simulator.Initialize()
-    assert serve(simulator, within, lcm, IIWA_DRIVER, 4 * STATUS_PERIOD, 5.0) == 4 * STATUS_PERIOD
+    assert serve_in_lockstep(simulator, within, lcm, 4 * STATUS_PERIOD, 5.0) == 4 * STATUS_PERIOD
     heard = heard[1:]
     assert [heard.count(head) for head in dict.fromkeys(heard)][:4] == [3] * 4
 
@@ -196,12 +190,12 @@ def test_in_step_it_does_not_matter_who_is_faster():
             heard.append(message)
             if heard.count(message) == wait:
                 step = len(set(heard))
-                lcm.Publish(IIWA_DRIVER.command_channel, IIWA_DRIVER.encode(step, np.full(7, (-1.0) ** step * step)))
-                lcm.Publish(IIWA_DRIVER.status_channel + TAKEN, message[:HEAD])
+                lcm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(step, np.full(7, (-1.0) ** step * step)))
+                lcm.Publish(IiwaDriver.status_channel + ACKNOWLEDGED, message[:HEAD_SIZE])
 
-        lcm.Subscribe(IIWA_DRIVER.status_channel, answer)
+        lcm.Subscribe(IiwaDriver.status_channel, answer)
         simulator.Initialize()
-        serve(simulator, within, lcm, IIWA_DRIVER, 6 * STATUS_PERIOD, 5.0)
+        serve_in_lockstep(simulator, within, lcm, 6 * STATUS_PERIOD, 5.0)
         plant = simulator.get_system().plant
         moved.append(plant.GetPositions(plant.GetMyContextFromRoot(simulator.get_context())))
     np.testing.assert_array_equal(*moved)
@@ -211,9 +205,9 @@ def test_in_step_it_does_not_matter_who_is_faster():
 def test_a_word_that_is_none_answers_nothing():
     within, lcm = DrakeLcm("memq://"), DrakeLcm("memq://")
     simulator = Simulator(SimulatedIiwa(BncWorkcell(), within))
-    lcm.Subscribe(IIWA_DRIVER.status_channel, lambda message: lcm.Publish(IIWA_DRIVER.status_channel + TAKEN, b"yes"))
+    lcm.Subscribe(IiwaDriver.status_channel, lambda message: lcm.Publish(IiwaDriver.status_channel + ACKNOWLEDGED, b"yes"))
     simulator.Initialize()
-    assert serve(simulator, within, lcm, IIWA_DRIVER, 2 * STATUS_PERIOD, 0.01) == 0.0
+    assert serve_in_lockstep(simulator, within, lcm, 2 * STATUS_PERIOD, 0.01) == 0.0
 
 
 @pytest.mark.parametrize(("periods", "says"), [(MAX_MISSED_MESSAGES - 1, False), (MAX_MISSED_MESSAGES + 1, True)])
@@ -227,7 +221,7 @@ def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch,
 
     attended = []
     simulator = Simulator(ConstantVectorSource([0.0]))
-    serve_in_real_time(simulator, IIWA_DRIVER, 3 * STATUS_PERIOD, attend, 1.0, said.append)
+    serve_in_real_time(simulator, IiwaDriver, 3 * STATUS_PERIOD, attend, 1.0, said.append)
     assert len(attended) == 3
     assert bool(said) == says
     assert len(said) <= 1

@@ -5,13 +5,14 @@ import pytest
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor, word_channel
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, safety_limits
+from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
+from guiderail.diagrams.hardware.driver import safety_limits
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
 
-PERIOD = IIWA_DRIVER.period
+PERIOD = IiwaDriver.period
 MOVING = np.array([0.3, -0.2, 0.1, 0.2, 0.0, 0.1, -0.1])
 
 
@@ -25,13 +26,13 @@ class Bus:
 
     def __init__(self, known):
         self.lcm, self.time, self.heard, self.words = DrakeLcm("memq://"), 100.0, [], []
-        self.limits = safety_limits(known.plant, IIWA_DRIVER)
-        self.deputy = SafetyMonitor(self.lcm, IIWA_DRIVER, known.plant, self.limits)
+        self.limits = safety_limits(known.plant, IiwaDriver)
+        self.deputy = SafetyMonitor(IiwaDriver(self.lcm), known.plant, self.limits)
         self.lcm.Subscribe("IIWA_COMMAND", self.hear)
-        self.lcm.Subscribe(word_channel("IIWA_COMMAND"), self.words.append)
+        self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self.words.append)
 
     def hear(self, message):
-        torque = IIWA_DRIVER.decode_command(message)
+        torque = IiwaDriver.decode_command(message)
         if torque is not None:
             self.heard.append(torque)
 
@@ -48,7 +49,7 @@ class Bus:
             self.publish("IIWA_STATUS", message.encode())
 
     def command(self, torque):
-        self.publish("IIWA_COMMAND", IIWA_DRIVER.encode(self.time, np.array(torque)))
+        self.publish("IIWA_COMMAND", IiwaDriver.encode(self.time, np.array(torque)))
 
     def publish(self, channel, message):
         self.lcm.Publish(channel, message)

@@ -14,9 +14,12 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.diagrams.hardware.clock import LockstepClock
-from guiderail.diagrams.hardware.monitor import word_channel
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa, find_driver, safety_limits
+from guiderail.diagrams.hardware.lcm.simulated import LockstepClock
+
+from guiderail.diagrams.hardware.driver import find_driver, safety_limits
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance
@@ -27,7 +30,7 @@ from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 
 WORKCELL = BncWorkcell()
-PERIOD = IIWA_DRIVER.period
+PERIOD = IiwaDriver.period
 ALIASES = ("position_measured", "velocity_estimated", "state_estimated", "torque_external", "torque_commanded")
 
 
@@ -38,8 +41,8 @@ class OneProcess:
         self.lcm = lcm = DrakeLcm("memq://")
         self.torques = []
         self.robot = SimulatedIiwa(WORKCELL, lcm)
-        limits = replace(safety_limits(self.robot.controller_plant.plant, IIWA_DRIVER), damping_time=0.2, ramp_time=0.1)
-        self.station = HardwareStation(WORKCELL, lcm, robot_timeout=1.0, limits=limits)
+        limits = replace(safety_limits(self.robot.controller_plant.plant, IiwaDriver), damping_time=0.2, ramp_time=0.1)
+        self.station = HardwareStation(WORKCELL, IiwaDriver(lcm), robot_timeout=1.0, limits=limits)
         self.robot_simulator, self.simulator = self.robot.simulator(), Simulator(self.station)
         self.robot.set_pose(self.robot_simulator.get_mutable_context(), START)
         self.context = self.simulator.get_mutable_context()
@@ -103,14 +106,14 @@ def test_two_processes_on_one_machine(monkeypatch):
     command = [sys.executable, "-c", call]
     with subprocess.Popen(command) as robot:
         lcm = DrakeLcm(url)
-        station = HardwareStation(WORKCELL, lcm, robot_timeout=30.0)
+        station = HardwareStation(WORKCELL, IiwaDriver(lcm), robot_timeout=30.0)
         simulator = Simulator(station)
         context = simulator.get_mutable_context()
         goal = START + [0.0, 0.008, 0.0, 0.0, 0.0, 0.0]
         station.get_desired_pose_input_port().FixValue(context, goal)
         station.start(simulator)
         before = station.get_pose_output_port().Eval(context).copy()
-        pace = LockstepClock(lcm, 5.0, IIWA_DRIVER.status_channel)
+        pace = LockstepClock(lcm, 5.0, IiwaDriver.status_channel)
         pace.begin()
         pace.advance(simulator, station, round(1.4 / PERIOD))
         after = station.get_pose_output_port().Eval(context)
@@ -227,7 +230,7 @@ def test_another_station_takes_over_without_letting_go():
     both = OneProcess()
     goal = START + [0.005, 0.0, 0.0, 0.0, 0.0, 0.0]
     both.go(goal, 0.3)
-    other = HardwareStation(WORKCELL, both.lcm)
+    other = HardwareStation(WORKCELL, IiwaDriver(both.lcm))
     simulator = Simulator(other)
     context = simulator.get_mutable_context()
     other.get_desired_pose_input_port().FixValue(context, goal)
@@ -261,7 +264,7 @@ def test_an_external_torque_has_the_sign_of_what_the_surroundings_do():
 
 @pytest.mark.parametrize("robot", ["iiwa14", "panda"])
 def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
-    station = HardwareStation(WORKCELL, DrakeLcm("memq://"), robot=robot)
+    station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")), robot=robot)
     torque_reflex_limits = np.array(station.driver.torque_reflex_limits)
     assert (np.array(station.limits.torque) < torque_reflex_limits).all()
     assert (np.array(station.limits.external_torque) < torque_reflex_limits).all()
@@ -270,14 +273,14 @@ def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
 
 def test_the_full_wrench_at_the_longest_lever_is_clipped_on_the_wrist_alone():
     """With an outstretched tool the impedance's limits would take more than the driver allows on joints 4 to 6."""
-    station = HardwareStation(WORKCELL, DrakeLcm("memq://"))
+    station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")))
     load = station.load_of_force(station.controller_plant.solve(START, station.controller_plant.posture))
     assert (load[[0, 1, 2, 6]] < 0.7).all()
     assert 1.0 < load[3:6].max() < 1.5
 
 
 def test_no_wrench_within_its_limits_loads_a_joint_more_than_is_read_out():
-    station = HardwareStation(WORKCELL, DrakeLcm("memq://"), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1)))
+    station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1)))
     positions = station.controller_plant.solve(START, station.controller_plant.posture)
     J = np.roll(station._jacobian(positions), 3, axis=0)  # the force first
     corners = np.array(list(itertools.product(*((-limit, limit) for limit in (40.0, 30.0, 20.0, 1, 2, 3)))))
@@ -286,7 +289,7 @@ def test_no_wrench_within_its_limits_loads_a_joint_more_than_is_read_out():
 
 
 def test_says_that_no_robot_answers():
-    station = HardwareStation(WORKCELL, DrakeLcm("memq://"), robot_timeout=0.1)
+    station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")), robot_timeout=0.1)
     simulator = Simulator(station)
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
     with pytest.raises(InputError, match="no robot answers"):
@@ -294,26 +297,26 @@ def test_says_that_no_robot_answers():
 
 
 def test_a_real_arm_is_not_put_anywhere():
-    station = HardwareStation(WORKCELL, DrakeLcm("memq://"))
+    station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")))
     with pytest.raises(InputError, match="move it there"):
         station.set_pose(station.CreateDefaultContext(), START)
 
 
 def test_a_deputy_is_heard_in_a_larger_diagram_too():
     lcm, builder = DrakeLcm("memq://"), DiagramBuilder()
-    station = builder.AddSystem(HardwareStation(WORKCELL, lcm, robot_timeout=0.0))
+    station = builder.AddSystem(HardwareStation(WORKCELL, IiwaDriver(lcm), robot_timeout=0.0))
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     station.get_desired_pose_input_port().FixValue(context, START)
     assert not station.has_safety_monitor(context)
-    lcm.Publish(word_channel(IIWA_DRIVER.command_channel), bytes(9))
+    lcm.Publish(IiwaDriver.heartbeat_channel(), bytes(9))
     lcm.HandleSubscriptions(0)
     simulator.AdvancePendingEvents()
     assert station.has_safety_monitor(context)
 
 
 def test_all_stations_have_the_same_ports():
-    stations = [GantryStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, DrakeLcm("memq://"))]
+    stations = [GantryStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")))]
     simulated_only = {"query", "body_poses"}
     robots_own = {"fault", "arm_state"} | {f"iiwa.{name}" for name in ALIASES}
     for station in stations:

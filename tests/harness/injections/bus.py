@@ -12,20 +12,23 @@ from drake import lcmt_iiwa_command, lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor, word_channel
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, HardwareStation, SimulatedIiwa, safety_limits
+from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
+from guiderail.diagrams.hardware.driver import safety_limits
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 
-PERIOD = IIWA_DRIVER.period
+PERIOD = IiwaDriver.period
 STOPPED_WITHIN = 0.05  # [s] of a fault's detection
 STANDSTILL = 0.05  # [rad/s] of the fastest joint, which was up to 1 rad/s fast
 UNSEEN = 0.15  # [rad/s], where it was stopped without a status to go by
 RADIUS, TURN, FREQUENCY = 0.01, 0.15, 1.0  # [m], [rad], [Hz] of the motion during which faults happen
-WORDS = word_channel(IIWA_DRIVER.command_channel)
+WORDS = IiwaDriver.heartbeat_channel()
 
 Relay = Callable[[bytes], list[bytes]]
 
@@ -59,11 +62,11 @@ class Bus:
         workcell = BncWorkcell()
         self.near_robot, self.near_station = DrakeLcm("memq://"), DrakeLcm("memq://")
         self.robot = SimulatedIiwa(workcell, self.near_robot)
-        limits = safety_limits(self.robot.controller_plant.plant, IIWA_DRIVER)
+        limits = safety_limits(self.robot.controller_plant.plant, IiwaDriver)
         limits = dataclasses.replace(limits, damping_time=0.2, ramp_time=0.1)
         self.limits = np.array(limits.torque)
-        self.station = HardwareStation(workcell, self.near_station, robot_timeout=1.0, limits=limits)
-        self.deputy = SafetyMonitor(self.near_robot, IIWA_DRIVER, self.robot.controller_plant.plant, limits)
+        self.station = HardwareStation(workcell, IiwaDriver(self.near_station), robot_timeout=1.0, limits=limits)
+        self.deputy = SafetyMonitor(IiwaDriver(self.near_robot), self.robot.controller_plant.plant, limits)
         self.on_status = self.on_command = passes
         self.has_robot = self.has_controller = self.has_safety_monitor = True
         self.torques: list[np.ndarray] = []
@@ -71,10 +74,10 @@ class Bus:
         self._statuses: list[bytes] = []
         self._words: list[bytes] = []
         self._commands: list[bytes] = []
-        self.near_robot.Subscribe(IIWA_DRIVER.status_channel, self._statuses.append)
+        self.near_robot.Subscribe(IiwaDriver.status_channel, self._statuses.append)
         self.near_robot.Subscribe(WORDS, self._words.append)
-        self.near_robot.Subscribe(IIWA_DRIVER.command_channel, self._arrive)
-        self.near_station.Subscribe(IIWA_DRIVER.command_channel, self._commands.append)
+        self.near_robot.Subscribe(IiwaDriver.command_channel, self._arrive)
+        self.near_station.Subscribe(IiwaDriver.command_channel, self._commands.append)
         self.robot_simulator = self.robot.simulator()
         self._pristine = self.robot.CreateDefaultContext()
         self.robot_time = 0  # steps since it was started
@@ -135,7 +138,7 @@ class Bus:
         return (
             is_stopping
             or (self.has_controller and self.fault != Fault.NONE)
-            or self.deputy.duty > MonitorState.WATCHING
+            or self.deputy.state > MonitorState.WATCHING
         )
 
     # How time passes.
@@ -158,12 +161,12 @@ class Bus:
             context = self.simulator.get_mutable_context()
             self.station.get_desired_pose_input_port().FixValue(context, self.desired())
             self.simulator.AdvancePendingEvents()
-            self.station.tell_time(context, self.step * PERIOD)
+            self.station.receive(context, self.step * PERIOD)
             self.simulator.AdvanceTo(self._station_step * PERIOD)
             self._settle(self.near_station)
         commands, self._commands[:] = list(self._commands), []
         for message in commands:
-            self._send(self.near_robot, IIWA_DRIVER.command_channel, self.on_command(message))
+            self._send(self.near_robot, IiwaDriver.command_channel, self.on_command(message))
 
     def desired(self) -> np.ndarray:
         """Where the tool is told to be now: on a circle, turning to and fro."""
@@ -174,7 +177,7 @@ class Bus:
         statuses, self._statuses[:] = list(self._statuses), []
         words, self._words[:] = list(self._words), []
         for message in statuses:
-            self._send(self.near_station, IIWA_DRIVER.status_channel, self.on_status(message), settle)
+            self._send(self.near_station, IiwaDriver.status_channel, self.on_status(message), settle)
         # What a deputy says goes the same way as the statuses, and is lost with them.
         if self.has_safety_monitor and self.on_status(b""):
             self._send(self.near_station, WORDS, words[-1:], settle)

@@ -18,7 +18,7 @@ from guiderail.tools.teleop.teleoperator import no_pauses
 
 def main(url: str, rate: float) -> None:
     """Until it is killed."""
-    station = HardwareStation(BncWorkcell(), DrakeLcm(url), robot_timeout=60.0)
+    station = HardwareStation(BncWorkcell(), IiwaDriver(DrakeLcm(url)), robot_timeout=60.0)
     pace = WallClock(station.lcm, station.driver.status_channel, station.period, rate)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()

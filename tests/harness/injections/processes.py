@@ -22,8 +22,9 @@ from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.hardware.clock import set_realtime_priority
-from guiderail.diagrams.hardware.monitor import word_channel
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, safety_limits
+
+from guiderail.diagrams.hardware.driver import safety_limits
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 
@@ -44,11 +45,11 @@ class Ear:
         self.speeds: list[tuple[float, float]] = []
         self.acting: list[float] = []
         self.commands: list[tuple[float, float]] = []  # when it came by the wall's clock, and the largest torque
-        self.limits = np.array(safety_limits(ArmControllerPlant(BncWorkcell()).plant, IIWA_DRIVER).torque)
+        self.limits = np.array(safety_limits(ArmControllerPlant(BncWorkcell()).plant, IiwaDriver).torque)
         self.wrong: list[str] = []
-        self.lcm.Subscribe(IIWA_DRIVER.status_channel, self._status)
-        self.lcm.Subscribe(IIWA_DRIVER.command_channel, self._command)
-        self.lcm.Subscribe(word_channel(IIWA_DRIVER.command_channel), self._word)
+        self.lcm.Subscribe(IiwaDriver.status_channel, self._status)
+        self.lcm.Subscribe(IiwaDriver.command_channel, self._command)
+        self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self._word)
 
     def _status(self, message: bytes) -> None:
         status = lcmt_iiwa_status.decode(message)
@@ -56,7 +57,7 @@ class Ear:
         self.speeds.append((self.clock, self.speed))
 
     def _command(self, message: bytes) -> None:
-        torque = IIWA_DRIVER.decode_command(message)
+        torque = IiwaDriver.decode_command(message)
         if torque is None or len(torque) != 7 or not (np.abs(torque) <= self.limits + 1e-12).all():
             self.wrong.append(f"sent {torque}")
             return

@@ -1,7 +1,9 @@
 """A simulated robot, its deputy and whoever drives it, stepped in turn in one process."""
 
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa, safety_limits
+from guiderail.diagrams.hardware.driver import safety_limits
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
 
 
 class Together:
@@ -18,7 +20,7 @@ class Together:
         self.robot = SimulatedIiwa(workcell, lcm)
         plant = self.robot.controller_plant.plant
         if deputy:
-            self.deputy = SafetyMonitor(lcm, IIWA_DRIVER, plant, safety_limits(plant, IIWA_DRIVER))
+            self.deputy = SafetyMonitor(IiwaDriver(lcm), plant, safety_limits(plant, IiwaDriver))
         self.simulator = self.robot.simulator()
         self.robot.set_pose(self.simulator.get_mutable_context(), start)
         self.simulator.Initialize()
@@ -33,9 +35,9 @@ class Together:
             self.step += 1
             self.happens.get(self.step, lambda: None)()
             if not self.is_silent:
-                self.simulator.AdvanceTo(self.step * IIWA_DRIVER.period)
+                self.simulator.AdvanceTo(self.step * IiwaDriver.period)
             if self.clock is not None:
-                self.clock += IIWA_DRIVER.period
+                self.clock += IiwaDriver.period
                 simulator.AdvancePendingEvents()
-                station.tell_time(simulator.get_mutable_context(), self.clock)
-            simulator.AdvanceTo(start + (step + 1) * IIWA_DRIVER.period)
+                station.receive(simulator.get_mutable_context(), self.clock)
+            simulator.AdvanceTo(start + (step + 1) * IiwaDriver.period)

@@ -5,7 +5,8 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.hardware.station import IIWA_DRIVER, SimulatedIiwa
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
 from guiderail.tools.hardware.part_randomization import PartRandomizer, put
 
 SEED = 30
@@ -16,8 +17,8 @@ def test_the_same_seed_puts_them_where_a_simulations_resets_do():
     lcm = DrakeLcm("memq://")
     robot = SimulatedIiwa(task.workcell(), lcm)
     context = robot.CreateDefaultContext()
-    put(lcm, IIWA_DRIVER, task, robot, context)
-    places, rng = PartRandomizer(task, lcm, IIWA_DRIVER, SEED), np.random.default_rng(7)
+    put(lcm, IiwaDriver, task, robot, context)
+    places, rng = PartRandomizer(task, lcm, IiwaDriver, SEED), np.random.default_rng(7)
     simulated = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
     simulated.offsets.draw(np.random.default_rng(SEED), validate_options(simulated.Reset, {}, "a reset"))
     others, jacks = np.random.default_rng(7), []

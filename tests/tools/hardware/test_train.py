@@ -13,7 +13,7 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
-from guiderail.diagrams.hardware.station import IIWA_DRIVER
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
@@ -208,9 +208,9 @@ def test_what_changes_while_the_person_thinks_is_seen_before_the_arm_moves(ready
             pose = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
             pace.robot.set_pose(pace.simulator.get_mutable_context(), pose)
         elif name == "deputy":
-            monkeypatch.setattr(pace.deputy, "_driver", replace(IIWA_DRIVER, command_channel="ANOTHER"))
+            monkeypatch.setattr(pace.deputy, "_driver", replace(IiwaDriver, command_channel="ANOTHER"))
         else:
-            lcm.Publish(IIWA_DRIVER.command_channel, IIWA_DRIVER.encode(1.0, np.zeros(7)))
+            lcm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(1.0, np.zeros(7)))
 
     monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", change)
     with pytest.raises(InputError, match=f"stays where it is: {name}"), begin():
@@ -235,7 +235,7 @@ def test_an_arm_that_somebody_else_commands_is_left_alone(monkeypatch):
         return {one.name: one.is_well for one in env.checks()}["commands"]
 
     assert check()
-    env._elsewhere.lcm.Publish(IIWA_DRIVER.command_channel, IIWA_DRIVER.encode(1.0, np.zeros(7)))
+    env._elsewhere.lcm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(1.0, np.zeros(7)))
     env._pass(1)
     assert not check()
 

@@ -1,0 +1,1 @@
+"""Drivers on LCM, Drake's message bus, and the simulated driver."""

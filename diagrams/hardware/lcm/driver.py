@@ -1,0 +1,281 @@
+"""Drivers on LCM: the messages of an iiwa and of a Panda, and the bus that carries them."""
+
+from __future__ import annotations
+
+import struct
+import time as wall_time
+from collections import deque
+from ipaddress import IPv4Address
+from typing import Any, ClassVar
+from urllib.parse import urlsplit
+
+import numpy as np
+from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
+
+from guiderail.diagrams.hardware.driver import CommandCallback, Driver, StatusCallback, register_driver
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.control.joint_status import MALFORMED_STATUS, Heartbeat, JointStatus
+
+PROVIDERS = ("udpm", "mpudpm", "tcpq", "memq")
+MICROSECOND = 1e-6  # unit of a message's time [s]
+HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time [µs]
+HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
+HEARTBEAT_FORMAT = struct.Struct(">q?")
+
+
+def open_bus(url: str) -> DrakeLcm:
+    """Open the LCM bus at `url`, LCM's default if empty.
+
+    `DrakeLcm` accepts any URL; messages to an unusable one are lost without an error.
+
+    Raises:
+        InputError: If the URL is unusable.
+    """
+    if url:
+        _check_url(url)
+    return DrakeLcm(url)
+
+
+def _check_url(url: str) -> None:
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError as error:
+        raise InputError(f"{brief(url)} is no URL of LCM: {error}") from None
+    if parts.scheme not in PROVIDERS or "://" not in url:
+        raise InputError(f"{brief(url)} is no URL of LCM, such as udpm://239.255.76.67:7667?ttl=0 or memq://")
+    if parts.scheme in ("udpm", "mpudpm") and host is not None:
+        try:
+            is_group = IPv4Address(host).is_multicast
+        except ValueError:
+            is_group = False
+        if not is_group or port == 0:
+            raise InputError(f"{brief(url)}: LCM's messages go to a multicast address, 224.0.0.0 to 239.255.255.255")
+
+
+def handlers_are_safe() -> bool:
+    """Return True if Drake holds the interpreter's lock when it calls a Python message handler.
+
+    Bindings made with nanobind (Drake 1.58 was tried) create the handler's argument without the lock while a simulator
+    reads the bus, which ends the process.
+    """
+    return not type(DrakeLcmInterface.__dict__["Subscribe"]).__module__.startswith("nanobind")
+
+
+def check_handlers() -> None:
+    """Check that messages can be received.
+
+    Raises:
+        InputError: If a message handler in Python would end the process.
+    """
+    if not handlers_are_safe():
+        raise InputError(
+            "this version of Drake calls Python's handlers of LCM messages without the interpreter's lock, which "
+            "ends the process: for a robot or a simulated driver use drake 1.51 (constraints.txt)"
+        )
+
+
+class MessageCounter:
+    """Counts the messages of a channel; one that is sent again counts once, even with other torques.
+
+    Attributes:
+        count: Number of different messages.
+        repeats: Number of repeated messages.
+        head: Type and time of the newest message, which tell messages apart.
+    """
+
+    def __init__(self) -> None:
+        self.count = self.repeats = 0
+        self.head = b""
+
+    def add(self, message: bytes) -> None:
+        """Count one message."""
+        if message[:HEAD_SIZE] != self.head:
+            self.head, self.count = message[:HEAD_SIZE], self.count + 1
+        else:
+            self.repeats += 1
+
+
+class LcmDriver(Driver):
+    """Driver whose statuses and commands are LCM messages.
+
+    Attributes:
+        status_channel: Channel of the statuses.
+        command_channel: Channel of the commands.
+        status_type: Message class of the statuses.
+        status_fields: Fields of `status_type` with position, velocity and external torque.
+        external_torque_sign: Factor that makes the external torque that of the surroundings on the arm.
+        command_type: Message class of the commands, with the field ``joint_torque``.
+        lcm: The bus.
+        statuses: Counter of the statuses.
+    """
+
+    status_channel: ClassVar[str]
+    command_channel: ClassVar[str]
+    status_type: ClassVar[Any]
+    status_fields: ClassVar[tuple[str, str, str]]
+    external_torque_sign: ClassVar[float]
+    command_type: ClassVar[Any]
+
+    def __init__(self, lcm: DrakeLcmInterface | str = ""):
+        """Open the connection.
+
+        Args:
+            lcm: The bus, or its URL.
+
+        Raises:
+            InputError: If the URL is unusable.
+        """
+        super().__init__(lcm if isinstance(lcm, str) else "")
+        self.lcm = open_bus(lcm) if isinstance(lcm, str) else lcm
+        self.statuses = MessageCounter()
+        self._message: bytes | None = None  # newest status
+        self._status: JointStatus | None = None  # the same, decoded when it is read
+        self._heartbeat: Heartbeat | None = None
+        self._written: deque[bytes] = deque(maxlen=64)  # this program's own commands, which the bus returns
+        self._listeners: list[tuple[StatusCallback, CommandCallback]] = []
+        if handlers_are_safe():
+            self.lcm.Subscribe(self.command_channel, self._on_command)
+            self.lcm.Subscribe(self.heartbeat_channel(), self._on_heartbeat)
+            self.lcm.Subscribe(self.status_channel, self._on_status)
+
+    @classmethod
+    def heartbeat_channel(cls) -> str:
+        """Return the channel of the safety monitor's heartbeat."""
+        return cls.command_channel + "_MONITOR"
+
+    @classmethod
+    def encode(cls, torque: np.ndarray, time: float) -> bytes:
+        """Return the command message of torques (n,) [Nm] at a time [s]."""
+        raise NotImplementedError
+
+    @classmethod
+    def decode(cls, message: bytes) -> JointStatus:
+        """Return the content of a status message, `MALFORMED_STATUS` if it cannot be decoded."""
+        try:
+            status = cls.status_type.decode(message)
+            positions, velocities, external = (
+                np.array(getattr(status, name), dtype=float) for name in cls.status_fields
+            )
+        except (ValueError, struct.error, OverflowError):
+            return MALFORMED_STATUS
+        return JointStatus(status.utime * MICROSECOND, positions, velocities, cls.external_torque_sign * external)
+
+    @classmethod
+    def decode_command(cls, message: bytes) -> np.ndarray | None:
+        """Return the torques of a command message (n,) [Nm], None if it cannot be decoded."""
+        try:
+            return np.array(cls.command_type.decode(message).joint_torque, dtype=float)
+        except (ValueError, struct.error, OverflowError):
+            return None
+
+    def read(self) -> JointStatus | None:
+        """Return the newest status, or None before the first."""
+        if self._status is None and self._message is not None:
+            self._status = self.decode(self._message)
+        return self._status
+
+    def write(self, torque: np.ndarray, time: float) -> None:
+        """Send joint torques (n,) [Nm]; `time` is the time of the command [s]."""
+        message = self.encode(torque, time)
+        self._written.append(message)
+        self.lcm.Publish(self.command_channel, message)
+
+    def receive(self, timeout: float = 0.0) -> None:
+        """Receive what has arrived; wait at most `timeout` [s] if nothing has."""
+        self.lcm.HandleSubscriptions(max(1, int(1000 * timeout)) if timeout > 0.0 else 0)
+
+    def check_usable(self) -> None:
+        """Raise `InputError` if a message handler in Python would end the process."""
+        check_handlers()
+
+    def add_listener(self, on_status: StatusCallback, on_command: CommandCallback) -> None:
+        """Call back for every status, and for the torques of every readable command of another program."""
+        self._listeners.append((on_status, on_command))
+
+    def read_heartbeat(self) -> Heartbeat | None:
+        """Return the newest heartbeat of the safety monitor, or None before the first."""
+        return self._heartbeat
+
+    def write_heartbeat(self, heartbeat: Heartbeat) -> None:
+        """Send a heartbeat of the safety monitor."""
+        self.lcm.Publish(self.heartbeat_channel(), HEARTBEAT_FORMAT.pack(heartbeat.sequence, heartbeat.is_stopping))
+
+    def __str__(self) -> str:
+        """Return bus and channel of the statuses."""
+        return f"{self.url or 'LCM'}, channel {self.status_channel}"
+
+    def _on_status(self, message: bytes) -> None:
+        self._message, self._status = message, None
+        self.statuses.add(message)
+        self.num_statuses = self.statuses.count
+        for on_status, _ in self._listeners:
+            on_status(self.decode(message))
+
+    def _on_command(self, message: bytes) -> None:
+        if message in self._written:
+            return
+        self.num_foreign_commands += 1
+        torque = self.decode_command(message)
+        if torque is not None:
+            for _, on_command in self._listeners:
+                on_command(torque)
+
+    def _on_heartbeat(self, message: bytes) -> None:
+        if len(message) == HEARTBEAT_FORMAT.size:
+            self._heartbeat = Heartbeat(*HEARTBEAT_FORMAT.unpack(message))
+
+
+@register_driver("iiwa14")
+class IiwaDriver(LcmDriver):
+    """Drake's driver of a KUKA LBR iiwa, in torque mode."""
+
+    name = "iiwa"
+    status_channel = "IIWA_STATUS"
+    command_channel = "IIWA_COMMAND"
+    status_type = lcmt_iiwa_status
+    status_fields = ("joint_position_measured", "joint_velocity_estimated", "joint_torque_external")
+    external_torque_sign = 1.0
+    command_type = lcmt_iiwa_command
+    has_command_timeout = False
+    torque_reflex_limits = tuple(60.0 * share for share in (1.0, 1.0, 1.0, 0.5, 0.2, 0.2, 0.1))
+
+    @classmethod
+    def encode(cls, torque: np.ndarray, time: float) -> bytes:
+        """Return the command message of torques (7,) [Nm] at a time [s]."""
+        command = lcmt_iiwa_command()
+        command.utime = round(time / MICROSECOND)
+        command.num_torques, command.joint_torque = len(torque), torque.tolist()
+        return command.encode()
+
+
+@register_driver("panda")
+class PandaDriver(LcmDriver):
+    """Drake's driver of a Franka Emika Panda, in torque mode.
+
+    Franka's external torque is that of the arm on the surroundings. The reflex limits are those of libfranka's examples.
+    """
+
+    name = "panda"
+    status_channel = "PANDA_STATUS"
+    command_channel = "PANDA_COMMAND"
+    status_type = lcmt_panda_status
+    status_fields = ("joint_position", "joint_velocity", "joint_torque_external")
+    external_torque_sign = -1.0
+    command_type = lcmt_panda_command
+    has_command_timeout = True
+    torque_reflex_limits = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)
+
+    @classmethod
+    def encode(cls, torque: np.ndarray, time: float) -> bytes:
+        """Return the command message of torques (7,) [Nm], with the wall clock as its time.
+
+        The driver drops commands that are older than 0.1 s by the clock on which both machines agree.
+        """
+        del time
+        command = lcmt_panda_command()
+        command.utime = wall_time.time_ns() // 1000
+        command.num_joint_torque, command.joint_torque = len(torque), torque.tolist()
+        command.control_mode_expected = lcmt_panda_status.CONTROL_MODE_TORQUE
+        return command.encode()

@@ -1,0 +1,273 @@
+"""Simulated driver: an iiwa and Drake's driver around it, for another process on LCM."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from pydrake.lcm import DrakeLcm, DrakeLcmInterface
+from pydrake.manipulation import BuildIiwaControl
+from pydrake.manipulation import IiwaDriver as IiwaDriverConfig
+from pydrake.multibody.parsing import ModelDirective
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+from pydrake.systems.lcm import LcmInterfaceSystem
+
+from guiderail.diagrams.hardware.clock import ReceivingStation
+from guiderail.diagrams.hardware.lcm.driver import (
+    HEAD_FORMAT,
+    HEAD_SIZE,
+    MICROSECOND,
+    IiwaDriver,
+    LcmDriver,
+    MessageCounter,
+    check_handlers,
+)
+from guiderail.diagrams.stations.arm import ArmControllerPlant, ArmModel, add_arm
+from guiderail.diagrams.stations.station import add_workcell_plant
+from guiderail.diagrams.stations.workcell import Workcell
+from guiderail.models.common.parsing import follow_directives
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
+from guiderail.models.robots.iiwa import IIWA14
+from guiderail.models.robots.robot import DEFAULT_END_EFFECTOR, EndEffector
+
+ACKNOWLEDGED = "_TAKEN"  # suffix of the channel on which a `LockstepClock` acknowledges a status
+REPEAT_INTERVAL = 0.05  # wall clock time after which an unacknowledged status is sent again [s]
+
+
+class SimulatedIiwa(Diagram):
+    """An iiwa and its driver in simulation: receives torques on LCM and sends joint states.
+
+    Attributes:
+        controller_plant: The arm as its controller models it.
+        arm: The arm in the simulated plant.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        lcm: DrakeLcmInterface,
+        time_step: float = IiwaDriver.period,
+        end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
+        directives: Sequence[ModelDirective] = (),
+    ):
+        """Construct the diagram.
+
+        Args:
+            workcell: Fixture in the world and held workpiece.
+            lcm: The bus.
+            time_step: Time step of the plant [s], a divisor of the status period.
+            end_effector: Tool on the flange, or its name; a gripper has a driver of its own, and stays open here.
+            directives: Model directives of the surroundings.
+
+        Raises:
+            InputError: If the directives cannot be followed.
+        """
+        super().__init__()
+        builder = DiagramBuilder()
+        builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm))
+
+        def add(plant: MultibodyPlant) -> ArmModel:
+            arm = add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
+            follow_directives(plant, directives)
+            return arm
+
+        self.plant, self.scene_graph, self.arm = add_workcell_plant(builder, workcell, time_step, add)
+        self.controller_plant = ArmControllerPlant(workcell, IIWA14, end_effector)
+        BuildIiwaControl(
+            builder,
+            lcm,
+            self.plant,
+            self.arm.model,
+            IiwaDriverConfig(control_mode="torque_only", lcm_status_period=IiwaDriver.period),
+            self.controller_plant.plant,
+        )
+        builder.BuildInto(self)
+
+    def simulator(self) -> Simulator:
+        """Return a simulator of this diagram, not initialized.
+
+        The only continuous state is the driver's low-pass filter. An integrator computes the contact, the most expensive
+        part, for each evaluation of the filter's derivative: one evaluation a step is enough.
+        """
+        simulator = Simulator(self)
+        ResetIntegratorFromFlags(simulator, "explicit_euler", self.plant.time_step())
+        simulator.get_mutable_integrator().set_fixed_step_mode(True)
+        return simulator
+
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""
+        self.controller_plant.place(self.plant, self.arm.model, context, pose)
+
+
+class LockstepClock:
+    """Advance a hardware station in lockstep with a simulated driver: one step per new status.
+
+    Before each step the newest used status is acknowledged. `serve_in_lockstep` waits for this acknowledgement and for
+    no other: a second one of the same status, which was sent again in the meantime, has no effect. The robot therefore
+    stands still while this program computes, and the result of a run does not depend on either side's speed.
+    """
+
+    def __init__(self, driver: LcmDriver, command_timeout: float, period: float | None = None):
+        """Construct the clock.
+
+        Args:
+            driver: Connection to the simulated driver.
+            command_timeout: Longest wall clock time to wait for a status [s]; then steps are made without one, and the
+                station's watchdog notices.
+            period: Period of a step [s]; the driver's by default.
+
+        Raises:
+            InputError: If the driver cannot receive in this environment.
+        """
+        driver.check_usable()
+        self._driver, self._timeout, self._period = driver, command_timeout, period or driver.period
+        self._channel = driver.status_channel + ACKNOWLEDGED
+        self._used = b""
+        self._has_timed_out = False
+
+    def begin(self) -> None:
+        """Prepare to advance a simulator that has just been initialized with the newest status."""
+        self._driver.receive()
+        self._used = self._driver.statuses.head
+
+    def advance(self, simulator: Simulator, station: ReceivingStation, steps: int) -> None:
+        """Advance the simulator by `steps` status periods."""
+        context = simulator.get_mutable_context()
+        start = context.get_time()
+        for step in range(steps):
+            # A silent robot is waited for once, and not in every step.
+            self._wait(self._period if self._has_timed_out else self._timeout)
+            self._has_timed_out = self._driver.statuses.head == self._used
+            self._used = self._driver.statuses.head
+            simulator.AdvancePendingEvents()
+            station.receive(context)
+            simulator.AdvanceTo(start + (step + 1) * self._period)
+
+    def _wait(self, timeout: float) -> None:
+        statuses, end = self._driver.statuses, time.monotonic() + timeout
+        self._acknowledge()
+        while statuses.head == self._used and (left := end - time.monotonic()) > 0.0:
+            repeats = statuses.repeats
+            self._driver.receive(left)
+            if statuses.head == self._used and statuses.repeats > repeats:
+                self._acknowledge()  # the acknowledgement may have been lost
+
+    def _acknowledge(self) -> None:
+        self._driver.lcm.Publish(self._channel, self._used)
+
+
+def serve_in_lockstep(
+    simulator: Simulator, robot_lcm: DrakeLcm, lcm: DrakeLcm, seconds: float, command_timeout: float
+) -> float:
+    """Simulate an arm for another process, and wait after each step until its status is acknowledged.
+
+    Neither side outruns the other, however slow the machine is. An acknowledgement is a `LockstepClock`'s of this very
+    status; before the first one, a command counts too. The arm has a bus of its own, so that no message arrives within
+    a step: commands sent until then count for the next step, independently of timing.
+
+    Args:
+        simulator: Simulator of the arm, initialized.
+        robot_lcm: Bus of the arm and its safety monitor, in memory.
+        lcm: Bus shared with the other process.
+        seconds: Simulated time to run [s].
+        command_timeout: Longest wall clock time to wait for each acknowledgement, and ten times that for the first [s].
+
+    Returns:
+        The simulated time of the end [s]; less than `seconds` if acknowledgements stopped.
+
+    Raises:
+        InputError: If messages cannot be received in this environment.
+    """
+    check_handlers()
+    acknowledgements, commands = MessageCounter(), list[bytes]()
+    lcm.Subscribe(IiwaDriver.status_channel + ACKNOWLEDGED, acknowledgements.add)
+    lcm.Subscribe(IiwaDriver.command_channel, commands.append)
+    # A status's heartbeat is sent before it, so that the other process has both when it waits for the status.
+    outgoing = dict.fromkeys((IiwaDriver.heartbeat_channel(), IiwaDriver.status_channel), b"")
+    for channel in outgoing:
+        robot_lcm.Subscribe(channel, partial(outgoing.__setitem__, channel))
+    period, steps, repeats = IiwaDriver.period, 0, max(1, round(command_timeout / REPEAT_INTERVAL))
+
+    def is_acknowledged() -> bool:
+        if not acknowledgements.count:
+            return bool(commands)
+        if len(acknowledgements.head) != HEAD_SIZE:
+            return False
+        status_time = struct.unpack(HEAD_FORMAT, acknowledgements.head)[1]
+        return abs(status_time * MICROSECOND - steps * period) < 0.5 * period
+
+    def handle_messages() -> None:
+        while robot_lcm.HandleSubscriptions(0):
+            pass
+
+    def send() -> None:
+        for channel, message in outgoing.items():
+            if message:
+                lcm.Publish(channel, message)
+
+    simulator.get_system().ForcedPublish(simulator.get_context())
+    handle_messages()
+    send()
+    while steps * period < seconds:
+        for _ in range(repeats if steps else 10 * repeats):
+            # A command arrives before the acknowledgement that belongs to it.
+            while lcm.HandleSubscriptions(round(1000 * REPEAT_INTERVAL)) and not is_acknowledged():
+                pass
+            if is_acknowledged():
+                break
+            # A datagram may be lost, and the other process may have subscribed late.
+            send()
+        else:
+            break
+        for message in commands:
+            robot_lcm.Publish(IiwaDriver.command_channel, message)
+        commands.clear()
+        handle_messages()
+        steps += 1
+        simulator.AdvanceTo(steps * period)
+        handle_messages()
+        send()
+    return steps * period
+
+
+def serve_in_real_time(
+    simulator: Simulator,
+    seconds: float,
+    after_status: Callable[[], None],
+    rate: float = 1.0,
+    log: Callable[[str], None] = print,
+) -> None:
+    """Simulate an arm by the wall clock, as a real robot, which does not wait for commands.
+
+    Contact makes the simulation slower. If it falls so far behind that its statuses count as old, a message says so
+    once, because the commanding program is not at fault then.
+
+    Args:
+        simulator: Simulator of the arm, initialized.
+        seconds: Simulated time to run [s].
+        after_status: Function that is called after every status, for a safety monitor.
+        rate: Rate of the robot's clock relative to the wall clock.
+        log: Function that shows a message.
+
+    Raises:
+        InputError: If messages cannot be received in this environment.
+    """
+    check_handlers()
+    period, max_delay = IiwaDriver.period, MAX_MISSED_MESSAGES * IiwaDriver.period
+    simulator.set_target_realtime_rate(rate)
+    start, is_reported = time.monotonic(), False
+    for step in range(1, round(seconds / period) + 1):
+        simulator.AdvanceTo(step * period)
+        after_status()
+        delay = (time.monotonic() - start) * rate - step * period
+        if delay > max_delay and not is_reported:
+            log(
+                f"this machine is too slow, or too busy, for a simulated robot whose clock goes at {rate:g} of the "
+                f"wall's: it is {delay:.2f} s behind; give a smaller --rate, or --synchronous"
+            )
+            is_reported = True
