@@ -15,7 +15,7 @@ settings.load_profile("quick")
 
 # What hears a robot's bus from Python while a simulator reads it, which a Drake of nanobind's bindings can not.
 ON_A_BUS = (
-    "hardware/test_station.py", "stations/test_injections.py", "hardware/test_clock.py",
+    "hardware/test_station.py", "hardware/test_injections.py", "hardware/test_clock.py",
     "hardware/test_part_randomization.py", "hardware/test_connection.py", "hardware/test_executor.py",
     "hardware/test_train.py", "benchmarks/test_loop.py",
 )  # fmt: skip

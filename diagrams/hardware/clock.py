@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -76,6 +79,19 @@ def set_realtime_priority() -> bool:
     except (AttributeError, OSError):
         return False
     return True
+
+
+@contextmanager
+def garbage_collection_disabled() -> Iterator[None]:
+    """Disable garbage collection: a full collection can exceed the robot's command timeout."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
 
 
 class WallClock:

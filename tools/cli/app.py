@@ -265,7 +265,7 @@ def is_hardware(station: Any) -> bool:
 def hardware_arguments(
     environment: Mapping[str, Any], *, sim: bool, synchronous: bool, rate: float | None
 ) -> dict[str, Any]:
-    """Return the arguments of `RobotConnection.in_scenario` that were given.
+    """Return the arguments of `RobotConnection.from_scenario` that were given.
 
     Args:
         environment: Options of the environment; `lcm_url` and `robot` are taken from it.

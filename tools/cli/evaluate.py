@@ -83,11 +83,19 @@ def _evaluate_on_hardware(
     from guiderail.tools.hardware.evaluate import evaluate_on_robot
     from guiderail.tools.learning.run_folder import RunFolder
 
-    driver = RobotConnection.in_scenario(scenario, **connection)
+    robot = RobotConnection.from_scenario(scenario, **connection)
     config = RunFolder(run).config()
-    acting = None if policy is None else make_baseline(config.task, policy, config.seed)
+    make_policy = None if policy is None else make_baseline(config.task, policy, config.seed)
     return evaluate_on_robot(
-        run, driver, episodes, station=station, policy=policy or "", acting=acting, yes=yes, out=out, say=print_message
+        run,
+        robot,
+        episodes,
+        station=station,
+        policy=policy or "",
+        make_policy=make_policy,
+        assume_yes=yes,
+        out=out,
+        log=print_message,
     )
 
 

@@ -33,12 +33,12 @@ def deploy(
     was executed to its end, and 1 if a limit, a fault or a key stopped it.
     """
     from guiderail.tools.hardware.connection import RobotConnection
-    from guiderail.tools.hardware.executor import run_policy
+    from guiderail.tools.hardware.executor import deploy as deploy_policy
 
     environment = cli.parse_environment(None, lcm_url=lcm_url, robot=robot)
     given = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
-    connection = RobotConnection.in_scenario(scenario, **given)
-    raise typer.Exit(run_policy(run, connection, station=station, yes=yes, out=out, say=print_progress))
+    connection = RobotConnection.from_scenario(scenario, **given)
+    raise typer.Exit(deploy_policy(run, connection, station=station, assume_yes=yes, out=out, log=print_progress))
 
 
 @cli.command("teleoperate ./peg --record demonstrations.npz")
@@ -93,12 +93,12 @@ def sim_driver(
 
     The robot stands in front of a task's fixture. The exit code is 1 if commands stopped arriving.
     """
-    from guiderail.tools.hardware.sim_driver import serve_iiwa
+    from guiderail.tools.hardware.sim_driver import run_sim_driver
 
     name = cli.find_task(task, imports)[0]
     xy = None if offset is None else tuple(cli.parse_floats(offset, 2, "--offset"))
-    completed = serve_iiwa(
-        url, seconds, command_timeout, name, rate=rate, offset=xy, scenario=scenario, say=print_progress
+    completed = run_sim_driver(
+        url, seconds, command_timeout, name, rate=rate, offset=xy, scenario=scenario, log=print_progress
     )
     raise typer.Exit(0 if completed else 1)
 
@@ -115,6 +115,6 @@ def safety_monitor(
     For a driver that repeats the last torque when the program that sent it has ended. It runs next to the driver, on
     the same machine, until it is terminated; without it, guiderail deploy moves nothing.
     """
-    from guiderail.tools.hardware.safety_monitor import stand_by
+    from guiderail.tools.hardware.sim_driver import run_safety_monitor
 
-    stand_by(url, robot, cli.find_task(task, imports)[0], say=print_progress)
+    run_safety_monitor(url, robot, cli.find_task(task, imports)[0], log=print_progress)

@@ -105,12 +105,12 @@ def train(
         result = train_on_robot(
             task,
             out,
-            RobotConnection.in_scenario(scenario, **connection),
+            RobotConnection.from_scenario(scenario, **connection),
             environment=environment,
             given={name: value for name, value in given.items() if value is not None},
             settings=settings,
-            yes=yes,
-            say=print_message,
+            assume_yes=yes,
+            log=print_message,
         )
         print_result(result, as_json)
         return

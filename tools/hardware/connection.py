@@ -1,4 +1,4 @@
-"""Who is at the other end of the bus: a robot, or in a rehearsal a simulated one in a process of its own."""
+"""Connection to the robot driver: real hardware, or a simulated driver in a subprocess."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from guiderail.diagrams.hardware.clock import Clock, WallClock, check_rate
+from guiderail.diagrams.hardware.lcm.driver import LcmDriver
 from guiderail.diagrams.hardware.lcm.simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
@@ -20,19 +21,28 @@ from guiderail.models.common.units import MM
 from guiderail.models.robots.robot import DEFAULT_ROBOT
 from guiderail.tools.hardware.scenario import load_scenario
 
+LOCKSTEP_TIMEOUT = 20.0  # longest wait for a status in lockstep [s of wall clock time]
+COMMAND_TIMEOUT = 300.0  # longest wait of the simulated driver for an acknowledgement [s of wall clock time]
+MAX_DURATION = 7 * 24 * 3600.0  # of a simulated driver, by the robot's clock [s]
+DEFAULT_RATE = 0.2  # in contact, a simulated robot with 1 kHz is slower than real time on usual machines
+ROBOT_TIMEOUT = 60.0  # a simulated driver is started with the command [s]
+NO_REALTIME_PRIORITY = "no real-time priority: on a busy machine the arm will be stopped because commands are late"
+
+Log = Callable[[str], None]
+
 
 @contextmanager
 def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen]:
-    """Runs Python code in a process of its own, which is gone after the block, and wherever this process is.
+    """Run Python code in a child process that exits when its parent does, even if the parent is killed.
 
-    It holds one end of a pipe, and the system closes the other one even where this process is killed.
+    The child's standard input is a pipe, whose other end the operating system closes with the parent.
 
     Args:
-        code: what it runs; its standard input is that pipe.
+        code: Program of the child.
     """
-    watched = f"from {__name__} import end_with_input; end_with_input()\n{code}"
-    # Ctrl-C is meant for us: whoever needs the other one still, to bring an arm to rest, ends it afterwards.
-    process = subprocess.Popen([sys.executable, "-c", watched], stdin=subprocess.PIPE, start_new_session=True)
+    program = f"from {__name__} import exit_with_parent; exit_with_parent()\n{code}"
+    # A new session, because Ctrl-C is meant for this process, which needs the child to bring the arm to rest.
+    process = subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, start_new_session=True)
     try:
         yield process
     finally:
@@ -40,8 +50,8 @@ def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen]:
         process.wait()
 
 
-def end_with_input() -> None:
-    """Ends this process where its standard input ends."""
+def exit_with_parent() -> None:
+    """Exit this process when its standard input is closed."""
 
     def wait() -> None:
         while os.read(0, 1024):
@@ -51,107 +61,109 @@ def end_with_input() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-PATIENCE = 20.0  # [s] of wall clock that a rehearsal in step waits for a status
-LONGEST = 7 * 24 * 3600.0  # [s] of the robot's clock: it is there until the rehearsal is over
-# Contact takes a simulated robot with 1 kHz longer than the wall's clock would allow, on the machines that we know.
-REHEARSAL_RATE = 0.2
-
-
 @dataclass(frozen=True)
 class RobotConnection:
-    """The other end of the bus.
+    """Connection to the robot driver.
 
     Args:
-        lcm_url: of the bus; LCM's own default where it is empty, and in a rehearsal one of this process alone.
-        robot: which arm.
-        rehearse: a simulated robot stands in, in a process of its own.
-        lockstep: of a rehearsal: each side waits for the other instead of going by the wall's clock.
-        rate: of a simulated robot's clock to the wall's.
-        scenario: a file that says the first three of these, and what stands around a simulated robot.
+        lcm_url: Address of the driver, LCM's default if empty; a simulated driver has a bus of its own.
+        robot: Name of the arm.
+        sim: Use a simulated driver, in a process of its own.
+        synchronous: Run station and simulated driver in lockstep instead of by the wall clock.
+        rate: Rate of a simulated robot's clock relative to the wall clock.
+        scenario: Scenario file with robot, address and surroundings.
 
     Raises:
-        InputError: for a real robot that should wait, or a simulated one that there is not.
+        InputError: If the options contradict each other, or no such simulated driver exists.
     """
 
     lcm_url: str = ""
     robot: str = DEFAULT_ROBOT
     sim: bool = False
     synchronous: bool = False
-    rate: float = REHEARSAL_RATE
+    rate: float = DEFAULT_RATE
     scenario: Path | None = None
 
     @classmethod
-    def in_scenario(cls, file: Path | None, **given: Any) -> RobotConnection:
-        """What a scenario's file says, if there is one, and for the rest what is given by name.
+    def from_scenario(cls, file: Path | None, **options: Any) -> RobotConnection:
+        """Return the connection of a scenario file and of further options; the file may be None.
 
         Raises:
-            InputError: for a file that makes no sense, or another robot or bus than the file's.
+            InputError: If the file is invalid, or its robot or address is not that of the options.
         """
         if file is None:
-            return cls(**given)
-        said = load_scenario(file)
-        for name, theirs in (("robot", said.robot), ("lcm_url", said.lcm_url)):
-            if given.get(name) and theirs and given[name] != theirs:
+            return cls(**options)
+        scenario = load_scenario(file)
+        for name, value in (("robot", scenario.robot), ("lcm_url", scenario.lcm_url)):
+            if options.get(name) and value and options[name] != value:
                 option = name.replace("_", "-")
-                raise InputError(f"{file} says {theirs}, and --{option} {given[name]}: leave one of the two out")
-        sim = said.is_simulated or given.get("sim", False)
-        url = given.get("lcm_url", "") if sim else said.lcm_url or given.get("lcm_url", "")
-        return cls(**given | {"lcm_url": url, "robot": said.robot, "scenario": file, "sim": sim})
+                raise InputError(f"{file} has {value}, and --{option} {options[name]}: leave one of the two out")
+        sim = scenario.is_simulated or options.get("sim", False)
+        url = options.get("lcm_url", "") if sim else scenario.lcm_url or options.get("lcm_url", "")
+        return cls(**options | {"lcm_url": url, "robot": scenario.robot, "scenario": file, "sim": sim})
 
     def __post_init__(self) -> None:
         if self.synchronous and not self.sim:
-            raise InputError("a real robot waits for nobody: --lockstep is for a rehearsal")
+            raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
         if self.sim and self.robot != DEFAULT_ROBOT:
-            raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver to rehearse with, not {self.robot}")
+            raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver, not {self.robot}")
         if self.sim and self.lcm_url:
             raise InputError(
-                "a rehearsal has a bus of its own, so that no real driver ever hears it: leave --lcm-url out"
+                "a simulated driver has a bus of its own, so that no real driver receives its messages: leave --lcm-url "
+                "out"
             )
         check_rate(self.rate)
 
-    def environment(self, station: str) -> dict[str, Any]:
-        """Options of an environment whose station is there."""
+    def environment_options(self, station: str) -> dict[str, Any]:
+        """Return the environment options of a hardware station on this connection."""
         url = self.lcm_url
         if self.sim:
             # With a time to live of zero no message leaves this machine.
             url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
         options: dict[str, Any] = {"station": station, "lcm_url": url, "robot": self.robot}
-        # A simulated robot starts with the command.
-        return options | ({"robot_timeout": 60.0} if self.sim else {})
+        return options | ({"robot_timeout": ROBOT_TIMEOUT} if self.sim else {})
 
-    def paces(self, station: HardwareStation) -> tuple[Clock, WallClock]:
-        """How time passes, and the wall's clock, whether it counts or not."""
-        channel, period = station.driver.status_channel, station.period
-        clock = WallClock(station.lcm, channel, period, self.rate if self.sim else 1.0)
-        return (LockstepClock(station.lcm, PATIENCE, channel, period) if self.synchronous else clock), clock
+    def clocks(self, station: HardwareStation) -> tuple[Clock, WallClock]:
+        """Return the clock of a station, and a wall clock, which is the same unless in lockstep."""
+        wall_clock = WallClock(station.driver, station.period, self.rate if self.sim else 1.0)
+        if not self.synchronous:
+            return wall_clock, wall_clock
+        assert isinstance(station.driver, LcmDriver)
+        return LockstepClock(station.driver, LOCKSTEP_TIMEOUT, station.period), wall_clock
 
     def timing(self, station: HardwareStation, clock: WallClock) -> Mapping[str, Any]:
-        """How regularly the robot was heard, where the wall's clock counts."""
+        """Return statistics of the intervals between statuses; empty in lockstep."""
         if self.synchronous:
             return {}
         return {
             "milliseconds_between_statuses": {
                 "period": station.period / (self.rate if self.sim else 1.0) / MM,
-                "99 %": clock.gaps.quantile(0.99) / MM,
-                "longest": clock.gaps.longest / MM,
+                "99 %": clock.intervals.quantile(0.99) / MM,
+                "longest": clock.intervals.longest / MM,
             }
         }
 
     @contextmanager
-    def standing_in(self, task: str, url: str, imports: Sequence[str] = ()) -> Iterator[None]:
-        """A simulated robot in front of a task's fixture; nobody, of a real robot.
+    def simulated_driver(self, task: str, url: str, imports: Sequence[str] = ()) -> Iterator[None]:
+        """Run the simulated driver of an arm in front of a task's fixture; do nothing for a real robot.
 
         Args:
-            task: its name.
-            url: of the bus.
-            imports: what registers the task: modules, files and task folders.
+            task: Name of the task.
+            url: LCM URL of the driver's bus.
+            imports: Modules, files and task folders that register the task.
         """
         if not self.sim:
             yield
             return
-        arguments = ["sim-driver", "--url", url, "--task", task, "--command-timeout", "300", "--seconds", str(LONGEST)]
-        arguments += [] if self.synchronous else ["--rate", str(self.rate)]
-        arguments += [word for module in imports for word in ("--import", module)]
-        arguments += [] if self.scenario is None else ["--scenario", str(self.scenario.resolve())]
-        with subprocess_tied_to_parent(f"from guiderail.tools.cli.main import main; main({arguments!r})"):
+        rate = None if self.synchronous else self.rate
+        scenario = None if self.scenario is None else str(self.scenario.resolve())
+        code = (
+            "from pathlib import Path\n"
+            "from guiderail.tools.environments import import_modules\n"
+            "from guiderail.tools.hardware import sim_driver\n"
+            f"import_modules({list(imports)!r})\n"
+            f"sim_driver.run_sim_driver({url!r}, {MAX_DURATION!r}, {COMMAND_TIMEOUT!r}, {task!r}, rate={rate!r}, "
+            f"scenario={scenario!r} and Path({scenario!r}))"
+        )
+        with subprocess_tied_to_parent(code):
             yield

@@ -1,4 +1,4 @@
-"""`guiderail run RUN --episodes N`: how often a policy succeeds on a robot, or in a rehearsal."""
+"""Evaluation of a policy on a robot or a simulated driver: `guiderail evaluate RUN --station hardware`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import pandas as pd
 
+from guiderail.diagrams.hardware.clock import garbage_collection_disabled
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED
@@ -17,14 +18,13 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.progress import EpisodeProgress
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.files import write_atomically
-from guiderail.tools.hardware.connection import RobotConnection
-from guiderail.tools.hardware.executor import on_a_robot
-from guiderail.tools.hardware.session import Say, robot_session
+from guiderail.tools.hardware.connection import Log, RobotConnection
+from guiderail.tools.hardware.executor import hardware_environment
+from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import table_text
-from guiderail.tools.teleop.teleoperator import no_pauses
 
-FOUND = (
+STATISTICS = (
     "episodes",
     "success_rate",
     "success_low",
@@ -37,43 +37,45 @@ FOUND = (
 
 def evaluate_on_robot(
     run: Path,
-    other: RobotConnection,
+    connection: RobotConnection,
     episodes: int,
     *,
     station: str = "hardware",
     policy: str = "",
-    acting: Callable[[gymnasium.Env], PolicyFn] | None = None,
-    yes: bool = False,
+    make_policy: Callable[[gymnasium.Env], PolicyFn] | None = None,
+    assume_yes: bool = False,
     out: Path | None = None,
-    say: Say = print,
+    log: Log = print,
 ) -> Mapping[str, Any]:
-    """Runs episodes one after the other, and writes a row for each; returns what came of them, in a few numbers.
+    """Run episodes of a policy, and write a row for each.
 
-    In a rehearsal they are those that `guiderail evaluate` has: conditions that training never met, and the run's own
-    for what is hidden in it.
+    With a simulated driver they are those of `guiderail evaluate`: held-out conditions, and the run's own hidden offset.
 
     Args:
-        run: the folder of a run.
-        other: the other end of the bus.
-        episodes: how many.
-        station: a real one.
-        policy: what acts instead of the run's own policy is called so.
-        acting: what that is, for an environment.
-        yes: what is asked is answered so.
-        out: the folder of the rows; `hardware` in the run unless given.
-        say: what a person is told.
+        run: Run folder.
+        connection: Connection to the robot driver.
+        episodes: Number of episodes.
+        station: Name of a hardware station.
+        policy: Name of the policy that replaces the run's own, for the file name.
+        make_policy: Function that returns this policy for an environment.
+        assume_yes: Do not ask for confirmation.
+        out: Folder of the rows; `hardware` in the run folder by default.
+        log: Function that shows a message.
+
+    Returns:
+        Path of the rows, and statistics of the episodes.
 
     Raises:
-        InputError: for what can't be run, where no robot answers, a check fails or isn't confirmed, or for rows
-            that are there already.
+        InputError: If the policy cannot be executed, no robot answers, a check fails or is not confirmed, or the rows
+            exist already.
     """
     if episodes < 1:
         raise InputError(f"a number of episodes is at least one, not {episodes}")
     folder = RunFolder(run)
     config = folder.config()
-    learned = Policy.load(folder.path) if acting is None else None
-    environment = on_a_robot(config.task, config.environment, station) | other.environment(station)
-    config = replace(config, environment=environment)
+    own_policy = Policy.load(folder.path) if make_policy is None else None
+    environment = hardware_environment(config.task, config.environment, station)
+    config = replace(config, environment=environment | connection.environment_options(station))
     path = (out or run / "hardware") / f"episodes{'-' * bool(policy)}{policy}.csv"
     rows: list[dict[str, Any]] = []
 
@@ -84,14 +86,18 @@ def evaluate_on_robot(
     with RunFolder(path.parent).locked():
         if path.exists():
             raise InputError(f"{path} already exists: name another folder with --out, or remove it")
-        with robot_session(config, other, yes=yes, say=say) as robot:
-            env = robot.env
-            act = learned if acting is None else acting(env)
+        with robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
+            env = session.env
+            act = own_policy if make_policy is None else make_policy(env)
             assert act is not None
-            with no_pauses(), EpisodeProgress(episodes, name=policy or config.task, window=None) as progress:
+            with (
+                garbage_collection_disabled(),
+                EpisodeProgress(episodes, name=policy or config.task, window=None) as progress,
+            ):
                 try:
                     for index in range(episodes):
-                        rows.append(rollout(env, act, index=index, seed=HELD_OUT_SEED + index, held_out=other.sim))
+                        seed = HELD_OUT_SEED + index
+                        rows.append(rollout(env, act, index=index, seed=seed, held_out=connection.sim))
                         env.idle()
                         write(rows)
                         env.idle()
@@ -101,5 +107,5 @@ def evaluate_on_robot(
                     try:
                         env.rest()
                     finally:
-                        write(rows)  # of the last episode too, where nobody let the arm go on
-    return {"rows": str(path), **summary(pd.DataFrame(rows), FOUND)}
+                        write(rows)  # with the last episode, even if its motion back was not confirmed
+    return {"rows": str(path), **summary(pd.DataFrame(rows), STATISTICS)}

@@ -1,4 +1,4 @@
-"""Where fixture and workpiece are in a rehearsal: what a reset draws in a simulation, and at a robot a person does."""
+"""Offsets of fixture and workpiece in front of a simulated driver, where a reset in simulation would sample them."""
 
 from __future__ import annotations
 
@@ -11,41 +11,44 @@ from pydrake.lcm import DrakeLcmInterface
 from pydrake.systems.framework import Context
 
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.hardware.driver import Driver
+from guiderail.diagrams.hardware.lcm.driver import LcmDriver
 from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
 from guiderail.diagrams.tasks.insertion import InsertionTask
 
-
-def _channel(driver: Driver) -> str:
-    return driver.status_channel + "_PLACES"
+CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
 class PartRandomizer:
-    """Draws where the parts of a task are, and tells a simulated robot, which puts them there."""
+    """Sample the offsets of a task's parts, and send them to the simulated driver."""
 
-    def __init__(self, task: InsertionTask, lcm: DrakeLcmInterface, driver: Driver, seed: int):
-        """
+    def __init__(self, task: InsertionTask, driver: LcmDriver, seed: int):
+        """Sample the offset of the run.
+
         Args:
-            task: whose parts.
-            lcm: the robot's bus.
-            driver: of the robot.
-            seed: of what is hidden for the whole run: the same as in a simulation with this seed.
+            task: Task with the parts.
+            driver: Connection to the simulated driver.
+            seed: Seed of the offset that is fixed for the run: the same as in simulation with this seed.
         """
-        self._task, self._lcm, self._driver = task, lcm, driver
-        task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a rehearsal"))
+        self._task, self._driver = task, driver
+        task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Puts them anew; returns what was drawn. `options` are those of a reset in a simulation."""
-        fixture, workpiece = self._task.offsets.draw(rng, validate_options(self._task.Reset, options, "a rehearsal"))
-        self._lcm.Publish(_channel(self._driver), json.dumps([fixture.tolist(), workpiece.tolist()]).encode())
+        """Move the parts to new offsets; `options` are those of a reset in simulation.
+
+        Returns:
+            The offsets by name.
+        """
+        reset = validate_options(self._task.Reset, options, "a simulated driver")
+        fixture, workpiece = self._task.offsets.draw(rng, reset)
+        self._driver.lcm.Publish(CHANNEL, json.dumps([fixture.tolist(), workpiece.tolist()]).encode())
         return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 
 
-def put(lcm: DrakeLcmInterface, driver: Driver, task: InsertionTask, robot: SimulatedIiwa, context: Context) -> None:
-    """Has a simulated robot do what `PartRandomizer` say, whenever its bus is heard; `context` is the root context."""
+def subscribe_part_offsets(lcm: DrakeLcmInterface, task: InsertionTask, robot: SimulatedIiwa, context: Context) -> None:
+    """Let a simulated robot apply the offsets that a `PartRandomizer` sends; `context` is the root context."""
 
-    def move(message: bytes) -> None:
+    def apply(message: bytes) -> None:
         fixture, workpiece = json.loads(message)
         task.set_part_offsets(robot, context, np.array(fixture), np.array(workpiece))
 
-    lcm.Subscribe(_channel(driver), move)
+    lcm.Subscribe(CHANNEL, apply)

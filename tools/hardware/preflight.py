@@ -1,142 +1,182 @@
-"""What a person should know of a robot before it moves, and whether it is as it should be."""
+"""Pre-flight checks: state of the robot and assumptions about it, printed and confirmed before it moves."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
+from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
-from guiderail.tools.hardware.slow_motion import distance
+from guiderail.tools.hardware.operator import confirm
+from guiderail.tools.hardware.slow_motion import pose_distance
 
-FARTHEST, FARTHEST_TURN = 0.15, 1.0  # [m], [rad] from the skill's start, beyond which nobody wants to approach it alone
-STANDSTILL = 0.05  # [rad/s] of a joint
-UNLOADED = 5.0  # [N]: what a robot feels at rest whose payload is known to it
-LISTENING = 20  # statuses before anything is judged
+MAX_DISTANCE, MAX_ANGLE = 0.15, 1.0  # from the start pose, for an unattended approach [m], [rad]
+MAX_JOINT_SPEED = 0.05  # of an arm at rest [rad/s]
+MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
+NUM_STATUSES = 20  # statuses that are received before the checks
 
 
 @dataclass(frozen=True)
 class Check:
-    """What a person should know, and whether it is as it should be."""
+    """Result of one pre-flight check."""
 
     name: str
-    words: str
-    is_well: bool = True
+    description: str
+    passed: bool = True
 
 
-def check_robot(station: HardwareStation, context: Context, start: np.ndarray, commands: int) -> list[Check]:
-    """What the robot's statuses say, and what is assumed of it.
+class PreflightChecks:
+    """Pre-flight checks of a station that receives statuses and sends nothing.
+
+    Attributes:
+        simulator: Simulator of the station, with the newest status.
+    """
+
+    def __init__(self, station: HardwareStation, clock: Clock, start: np.ndarray, num_steps: int):
+        """Receive the first statuses.
+
+        Args:
+            station: Station of the arm.
+            clock: Clock of the station.
+            start: Start pose of the skill, (6,).
+            num_steps: Status periods of a control step.
+
+        Raises:
+            InputError: If no robot answers.
+        """
+        self._station, self._clock, self._start, self._num_steps = station, clock, start, num_steps
+        self.simulator = start_simulator(station, clock)
+        self._commands_before = station.driver.num_foreign_commands
+        # Nothing is sent yet, and a safety monitor's first heartbeat may take a status or two.
+        clock.advance(self.simulator, station, NUM_STATUSES)
+
+    def run(self) -> list[Check]:
+        """Return the checks on the newest status."""
+        num_commands = self._station.driver.num_foreign_commands - self._commands_before
+        return check_robot(self._station, self.simulator.get_context(), self._start, num_commands)
+
+    def repeat(self) -> list[Check]:
+        """Repeat the checks on fresh statuses, because time has passed in which none was received."""
+        self._clock.begin()
+        self._clock.advance(self.simulator, self._station, self._num_steps)
+        # A new simulator accepts the arm's position at once, even if it was moved by hand in the meantime.
+        self.simulator = start_simulator(self._station, self._clock)
+        self._clock.advance(self.simulator, self._station, NUM_STATUSES)
+        return self.run()
+
+
+def start_simulator(station: HardwareStation, clock: Clock) -> Simulator:
+    """Return an initialized simulator of a station that holds the arm where it is.
+
+    Raises:
+        InputError: If no robot answers.
+    """
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
+    station.start(simulator)
+    clock.begin()
+    return simulator
+
+
+def check_robot(station: HardwareStation, context: Context, start: np.ndarray, num_commands: int) -> list[Check]:
+    """Check a robot's status, and list the assumptions about it.
 
     Args:
-        station: that has heard it for a moment.
-        context: the root context, of a simulator of the station alone.
-        start: where the skill starts, (6,).
-        commands: how many the robot was sent meanwhile, by whomever.
+        station: Station that has received some statuses.
+        context: Root context of a simulator of the station alone.
+        start: Start pose of the skill, (6,).
+        num_commands: Number of commands that the robot received from other programs in the meantime.
     """
     plant, arm = station.controller_plant.plant, station.controller_plant.arm
+    driver, limits = station.driver, station.limits
     pose = station.get_pose_output_port().Eval(context)
-    away, turned = distance(pose, start)
-    name = station.driver.name
-    positions, velocities = (
-        station.GetOutputPort(f"{name}.{signal}").Eval(context)
-        for signal in ("position_measured", "velocity_estimated")
+    distance, angle = pose_distance(pose, start)
+    positions, velocities, external_torque = (
+        station.GetOutputPort(f"{driver.name}.{signal}").Eval(context)
+        for signal in ("position_measured", "velocity_estimated", "torque_external")
     )
-    external = station.GetOutputPort(f"{name}.torque_external").Eval(context)
-    force = float(np.linalg.norm(station.force_of(positions, external)))
+    force = float(np.linalg.norm(station.estimate_force(positions, external_torque)))
     fastest = float(np.abs(velocities).max())
     p_WT = arm.target.CalcPoseInWorld(plant.CreateDefaultContext()).translation()
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     payload = sum(body.default_mass() for body in arm.tool)
-    load, along = station.load_of_force(positions).max(), station.impedance.limits[:3]
-    limits, has_safety_monitor = station.limits, station.has_safety_monitor(context)
-    nobody = "nobody stands by: start guiderail stand-by on the driver's machine"
-    somebody = "somebody commands it: end the other program, or wait until the deputy has brought the arm to rest"
-    by_itself = "needed by no driver of this kind: it stops by itself where commands stop"
+    torque_share, axis_limits = station.max_torque_shares(positions).max(), station.impedance.limits[:3]
+    has_monitor = station.has_safety_monitor(context)
+    if driver.has_command_timeout:
+        monitor = "not needed: this driver stops the arm when commands stop"
+    elif has_monitor:
+        monitor = "its heartbeat is received"
+    else:
+        monitor = "no heartbeat: start guiderail safety-monitor on the driver's machine"
     return [
-        Check("robot", f"{name}, {len(positions)} joints, {station.driver.status_channel}"),
-        Check(
-            "deputy",
-            by_itself
-            if station.driver.has_command_timeout
-            else "stands by at the robot"
-            if has_safety_monitor
-            else nobody,
-            station.driver.has_command_timeout or has_safety_monitor,
-        ),
+        Check("robot", f"{driver.name}, {len(positions)} joints, {driver}"),
+        Check("monitor", monitor, driver.has_command_timeout or has_monitor),
         Check(
             "joints",
             f"{np.rad2deg(positions).round(1).tolist()} degrees",
             bool((lower < positions).all() and (positions < upper).all()),
         ),
-        Check("commands", somebody if commands else "nobody else commands it", not commands),
-        Check("standstill", f"fastest joint {fastest:.3f} rad/s", fastest < STANDSTILL),
-        Check("payload", f"{payload:.2f} kg bolted to the flange, as the robot must have been told"),
-        Check("load", f"{force:.1f} N felt at rest", force < UNLOADED),
+        Check(
+            "commands",
+            "another program commands the robot: end it, or wait until the safety monitor has brought the arm to rest"
+            if num_commands
+            else "no other program commands the robot",
+            not num_commands,
+        ),
+        Check("standstill", f"fastest joint {fastest:.3f} rad/s", fastest < MAX_JOINT_SPEED),
+        Check("payload", f"{payload:.2f} kg on the flange, which must be configured on the robot"),
+        Check("load", f"{force:.1f} N of external force at rest", force < MAX_FORCE),
         Check("target", f"at {p_WT} m of the base"),
         Check("tool", f"at {pose[:3].round(4)} m and {np.rad2deg(pose[3:]).round(1)} degrees of the target"),
         Check(
             "start",
-            f"{away / MM:.0f} mm and {np.rad2deg(turned):.0f} degrees away",
-            away < FARTHEST and turned < FARTHEST_TURN,
+            f"{distance / MM:.0f} mm and {np.rad2deg(angle):.0f} degrees away",
+            distance < MAX_DISTANCE and angle < MAX_ANGLE,
         ),
         Check(
             "force",
-            f"at most {max(along):.0f} N commanded along an axis, {np.linalg.norm(along):.0f} N askew, "
-            f"{limits.force:.0f} N felt",
+            f"at most {max(axis_limits):.0f} N commanded along an axis, {np.linalg.norm(axis_limits):.0f} N in all "
+            f"three, {limits.force:.0f} N measured",
         ),
-        Check("torques", f"at most {list(limits.torque)} Nm sent; the full force takes {load:.0%} of the nearest"),
+        Check(
+            "torques",
+            f"at most {list(limits.torque)} Nm sent; the full force takes {torque_share:.0%} of the nearest limit",
+        ),
         Check("workspace", f"from {limits.lower} to {limits.upper} m around the target"),
     ]
 
 
-def confirm_checks(
-    checks: Sequence[Check],
-    say: Callable[[str], None],
-    *,
-    again: Callable[[], Sequence[Check]],
-    is_confirmed: bool,
-) -> None:
-    """Says them, and has them confirmed.
+def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assume_yes: bool) -> list[Check]:
+    """Show the checks and have the operator confirm them; then repeat them, because the robot may have changed.
 
     Args:
-        checks: of before.
-        say: what a person is told.
-        again: the checks of now: while a person thinks, anything may happen.
-        is_confirmed: nobody is asked.
+        checks: The checks.
+        log: Function that shows a message.
+        assume_yes: Do not ask.
+
+    Returns:
+        The checks that were shown.
 
     Raises:
-        InputError: if one fails, before or after the question, or nobody confirms.
+        InputError: If a check fails, before or after the question, or the operator does not confirm.
     """
-    for check in checks:
-        say(f"{'ok ' if check.is_well else 'NOT'}  {check.name:<12}{check.words}")
-    _refuse_wrong(checks)
-    if not is_confirmed:
+    shown = checks.run()
+    for check in shown:
+        log(f"{'ok ' if check.passed else 'NOT'}  {check.name:<12}{check.description}")
+    _refuse_failed(shown)
+    if not assume_yes:
         confirm("Is all of this so, and is the workspace clear?")
-        _refuse_wrong(again())
+        _refuse_failed(checks.repeat())
+    return shown
 
 
-def _refuse_wrong(checks: Sequence[Check]) -> None:
-    wrong = [check for check in checks if not check.is_well]
-    if wrong:
-        raise InputError(f"the arm stays where it is: {wrong[0].name}: {wrong[0].words}")
-
-
-def confirm(question: str) -> None:
-    """Asks a person.
-
-    Raises:
-        InputError: unless the answer is yes.
-    """
-    if not sys.stdin.isatty():
-        raise InputError("nobody is there to confirm this: read it, and say --yes")
-    try:
-        answer = input(f"{question} Type yes: ")
-    except EOFError:
-        answer = ""
-    if answer.strip().lower() != "yes":
-        raise InputError("not confirmed: nothing moves")
+def _refuse_failed(checks: Sequence[Check]) -> None:
+    failed = [check for check in checks if not check.passed]
+    if failed:
+        raise InputError(f"the arm stays where it is: {failed[0].name}: {failed[0].description}")

@@ -1,4 +1,4 @@
-"""A task on a robot as an environment, in which a reset is a motion and an episode can be cut short."""
+"""Environment of a task on a robot: a reset is a motion, and a stop truncates the episode."""
 
 from __future__ import annotations
 
@@ -15,26 +15,29 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.env import GuidedEnv
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.hardware.clock import Clock
-from guiderail.diagrams.hardware.lcm.driver import MessageCounter
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.models.control.joint_status import FAULT_DESCRIPTIONS, Fault
 from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.hardware.preflight import LISTENING, Check, check_robot
-from guiderail.tools.hardware.slow_motion import back, crawl, distance, is_near
-from guiderail.tools.teleop.teleoperator import Keys
+from guiderail.tools.hardware.connection import Log
+from guiderail.tools.hardware.operator import OperatorKeys
+from guiderail.tools.hardware.preflight import PreflightChecks
+from guiderail.tools.hardware.slow_motion import is_near, pose_distance, retrace, slow_approach
 
-PULL, GIVES_WAY, LEAST_PULL = 3.0 * MM, 1.0 * MM, 1.5  # [m] commanded, [m] followed at most, [N] felt at least
-PULL_STEPS = 25  # control steps
-LEVER = 0.1  # [m/rad] for which a turn counts where the nearest of several poses is looked for
-PATIENCE = 10.0  # [s] until an arm that was told to go on does
-
-Say = Callable[[str], None]
+# A pull that checks a success: commanded distance, largest measured distance [m], smallest measured force [N].
+PULL_DISTANCE, MAX_PULL_MOTION, MIN_PULL_FORCE = 3.0 * MM, 1.0 * MM, 1.5
+PULL_STEPS = 25  # control steps of the pull
+ANGLE_WEIGHT = 0.1  # weight of an angle in the distance to the return path [m/rad]
+RESUME_TIMEOUT = 10.0  # longest time until the arm has resumed [s]
 
 
 class RobotStoppedError(Exception):
-    """The arm is being stopped: a limit, a fault or a person."""
+    """The arm is being stopped by a limit, a fault or the operator.
+
+    Attributes:
+        fault: Reason of the stop.
+    """
 
     def __init__(self, fault: Fault):
         super().__init__(FAULT_DESCRIPTIONS[fault])
@@ -42,308 +45,318 @@ class RobotStoppedError(Exception):
 
 
 class RobotEnv(GuidedEnv):
-    """Runs a `TaskDiagram` whose station is a robot.
+    """Environment of a `TaskDiagram` with a hardware station.
 
-    A reset moves the arm: back along the way that it came, and to the start at a crawl. Where something stops the arm,
-    in an episode or a reset, it comes to rest and `go_on` is asked; then it goes on from where it is. An episode that
-    was cut short so is truncated with `termination` "stopped", and `info["stopped"]` says why: nobody should learn from
-    it.
-    A success that the pose tells is believed when the workpiece also holds against a pull; otherwise `termination` is
-    "did_not_hold", and nobody should learn from that either.
+    A reset moves the arm: back along its path, and slowly to the start. If the arm is stopped, in an episode or a reset,
+    it comes to rest, `confirm_resume` is called, and the motion continues from where the arm is. An episode that was
+    stopped is truncated with `termination` "stopped", and `info["stopped"]` has the reason.
+
+    A success by pose is confirmed by a pull on the workpiece; if it gives way, `termination` is "did_not_hold". Episodes
+    that end as "stopped" or "did_not_hold" must not be learned from.
 
     Attributes:
-        fault: that ended the last episode.
+        fault: Fault that ended the last episode, or NONE.
+        preflight: Pre-flight checks, to be run before anything moves.
     """
 
     def __init__(
         self,
         task: TaskDiagram,
         station: HardwareStation,
-        elsewhere: HardwareStation,
+        transfer_station: HardwareStation,
         start: np.ndarray,
-        pace: Clock,
+        clock: Clock,
         *,
         action_repeat: int,
-        keys: Keys,
-        go_on: Callable[[str], None],
-        say: Say,
-        places: Callable[[np.random.Generator, Mapping[str, Any]], dict[str, Any]] | None = None,
+        keys: OperatorKeys,
+        confirm_resume: Callable[[str], None],
+        log: Log,
+        randomize_parts: Callable[[np.random.Generator, Mapping[str, Any]], dict[str, Any]] | None = None,
     ):
-        """
+        """Connect to the robot.
+
         Args:
-            task: what to run.
-            station: its station.
-            elsewhere: another station of the same arm on the same bus, for the motions between episodes.
-            start: pose at which an episode begins, (6,).
-            pace: how time passes.
-            hold: control steps per decision.
-            keys: of a person.
-            go_on: called with why the arm is at rest; returns when it may move again, or raises.
-            say: what a person is told.
-            places: called with random numbers and a reset's options when the arm is at the start: where the parts
-                are is drawn anew, as in a simulation, and returned.
+            task: Diagram of the task.
+            station: Its station.
+            transfer_station: Clone of the station, for the motions between episodes.
+            start: Pose at which an episode starts, (6,).
+            clock: Clock of both stations.
+            action_repeat: Control steps per action.
+            keys: The operator's keys.
+            confirm_resume: Function called with the reason of a stop; returns when the arm may move again, or raises.
+            log: Function that shows a message.
+            randomize_parts: Function called at the start pose with a random number generator and the reset's options;
+                moves the parts as a reset in simulation and returns what was sampled.
+
+        Raises:
+            InputError: If no robot answers.
         """
         super().__init__(task, action_repeat=action_repeat)
-        self._places = places
-        self._skills, self._elsewhere, self._start, self._pace = station, elsewhere, start, pace
-        self._keys, self._go_on, self._say = keys, go_on, say
+        self._randomize_parts = randomize_parts
+        self._task_station, self._transfer_station, self._start, self._clock = station, transfer_station, start, clock
+        self._keys, self._confirm_resume, self._log = keys, confirm_resume, log
         self._steps = round(task.control_period / station.period)
-        self._acting, self._is_in_step = elsewhere, False
-        self._moving = self._initialized()
-        # A deputy may need a status or two to be heard; nothing is sent so soon.
-        self._heard = MessageCounter(self._elsewhere.lcm, self._elsewhere.driver.command_channel)
-        self._pass(LISTENING)
-        self._way_back: list[np.ndarray] = []
+        self._station, self._is_stepping = transfer_station, False
+        self.preflight = PreflightChecks(transfer_station, clock, start, self._steps)
+        self._last_transfer: Simulator | None = None
+        self._return_path: list[np.ndarray] = []  # the last pose is the nearest
         self.fault = Fault.NONE
 
-    # Whose turn it is.
-
-    @property
-    def _root(self) -> Context:
-        return (self.simulator if self._acting is self._skills else self._moving).get_mutable_context()
-
-    @property
-    def _mine(self) -> Context:
-        return self._acting.GetMyMutableContextFromRoot(self._root)
+    # The two stations.
 
     @property
     def pose(self) -> np.ndarray:
-        """Where the tool is, (6,)."""
-        return self._acting.get_pose_output_port().Eval(self._mine).copy()
+        """Pose of the tool, (6,)."""
+        return self._station.get_pose_output_port().Eval(self._context).copy()
 
-    def checks(self) -> list[Check]:
-        """What the robot's first statuses say, and what is assumed of it: before anything moves."""
-        return check_robot(self._elsewhere, self._moving.get_context(), self._start, self._heard.count)
+    @property
+    def _transfer_simulator(self) -> Simulator:
+        return self._last_transfer or self.preflight.simulator
 
-    def checks_again(self) -> list[Check]:
-        """The same of now, after a person took their time, in which nobody listened."""
-        self._pace.begin()
-        self._pass(self._steps)
-        # A simulator that knew where the arm was would not believe at once where somebody moved it meanwhile.
-        self._moving = self._initialized()
-        self._pass(LISTENING)
-        return self.checks()
+    @property
+    def _active_simulator(self) -> Simulator:
+        return self.simulator if self._station is self._task_station else self._transfer_simulator
 
-    def _initialized(self) -> Simulator:
-        simulator = Simulator(self._elsewhere)
-        self._elsewhere.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
-        self._elsewhere.start(simulator)
-        self._pace.begin()
-        return simulator
+    @property
+    def _root_context(self) -> Context:
+        return self._active_simulator.get_mutable_context()
 
-    def _hand_over(self, simulator: Simulator, station: HardwareStation) -> None:
-        before = self._mine
+    @property
+    def _context(self) -> Context:
+        return self._station.GetMyMutableContextFromRoot(self._root_context)
+
+    @property
+    def _arm_state(self) -> int:
+        return int(self._station.get_arm_state_output_port().Eval(self._context)[0])
+
+    @property
+    def _active_fault(self) -> Fault:
+        return Fault(int(self._station.get_fault_output_port().Eval(self._context)[0]))
+
+    def _switch_station(self, simulator: Simulator, station: HardwareStation) -> None:
+        """Let another station control the arm from now on, without a gap."""
+        previous, previous_context = self._station, self._context
         station.start(simulator)
-        station.copy_state_from(station.GetMyMutableContextFromRoot(simulator.get_mutable_context()), before)
-        if station is self._skills:
+        context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+        station.copy_state_from(context, previous, previous_context)
+        if station is self._task_station:
             self.simulator = simulator
         else:
-            self._moving = simulator
-        self._acting, self._is_in_step = station, False
+            self._last_transfer = simulator
+        self._station, self._is_stepping = station, False
 
-    def _elsewhere_acts(self) -> None:
-        if self._acting is self._skills:
-            here, simulator = self.pose, Simulator(self._elsewhere)
-            self._elsewhere.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), here)
-            self._hand_over(simulator, self._elsewhere)
+    def _switch_to_new_transfer(self) -> None:
+        pose, simulator = self.pose, Simulator(self._transfer_station)
+        self._transfer_station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), pose)
+        self._switch_station(simulator, self._transfer_station)
 
-    # What an episode is.
+    def _switch_to_transfer(self) -> None:
+        if self._station is self._task_station:
+            self._switch_to_new_transfer()
+
+    # Episodes.
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """Moves the arm to the start.
+        """Move the arm to the start.
 
         Raises:
-            InputError: if it doesn't get there, or options are given where nothing can be drawn.
+            InputError: If the start is not reached, or options are given for a real robot.
         """
-        if options and self._places is None:
-            raise InputError("a reset of a robot takes no options: nothing of it can be drawn")
+        if options and self._randomize_parts is None:
+            raise InputError("a reset of a robot takes no options: its parts are where they are")
         gymnasium.Env.reset(self, seed=seed)
         self._running = False
-        self._return()
-        drawn = {} if self._places is None else self._places(self.np_random, options or {})
+        self._return_to_start()
+        drawn = {} if self._randomize_parts is None else self._randomize_parts(self.np_random, options or {})
         simulator = Simulator(self.task.diagram)
         self._action_value = self.action_port.FixValue(simulator.get_mutable_context(), self._neutral)
-        self._hand_over(simulator, self._skills)
+        self._switch_station(simulator, self._task_station)
         self.fault, self.drawn = Fault.NONE, drawn
         return self._begun()
 
     def step(self, action):
-        """As `GuidedEnv.step`; where the arm is stopped, the episode is truncated."""
-        begun = len(self.trace)
+        """Advance by one action; truncate the episode if the arm is stopped."""
+        first = len(self.trace)
         try:
-            following, reward, terminated, truncated, info = super().step(action)
-        except RobotStoppedError as stopped:
-            self._way_back.extend(back(self.trace.measured, self.task.control_period)[::-1])
-            self._running, self.fault = False, stopped.fault
+            observation, reward, terminated, truncated, info = super().step(action)
+        except RobotStoppedError as stop:
+            self._extend_return_path()
+            self._running, self.fault = False, stop.fault
             self._come_to_rest()
             terms = dict.fromkeys(self.task.reward_terms, 0.0)
-            info = self._info(0, *self._since(begun), terms)
-            info |= {"termination": "stopped", "stopped": str(stopped)}
+            info = self._info(0, *self._statistics(first), terms)
+            info |= {"termination": "stopped", "stopped": str(stop)}
             return self._observation, 0.0, False, True, info
         if terminated or truncated:
-            self._way_back.extend(back(self.trace.measured, self.task.control_period)[::-1])
-            if info["is_success"] and not self._holds():
+            self._extend_return_path()
+            if info["is_success"] and not self._resists_pull():
                 info |= {"is_success": False, "termination": "did_not_hold"}
-        return following, reward, terminated, truncated, info
+        return observation, reward, terminated, truncated, info
 
-    def _since(self, begun: int) -> tuple[float, float, float, bool]:
-        """Worst commanded and measured violation, largest force and fallback of the control steps from that one on."""
-        signals = {name: values[begun:, 0] for name, values in self.trace.signals.items()}
-        if not len(self.trace) > begun:
+    def _extend_return_path(self) -> None:
+        self._return_path.extend(retrace(self.trace.measured, self.task.control_period)[::-1])
+
+    def _statistics(self, first: int) -> tuple[float, float, float, bool]:
+        """Return largest commanded and measured violation, largest force and fallback of the steps from `first` on."""
+        signals = {name: values[first:, 0] for name, values in self.trace.signals.items()}
+        if not len(self.trace) > first:
             return *self._violations, 0.0, False
         commanded, measured = (float(signals[name].max()) for name in ("commanded_violation", "measured_violation"))
-        return commanded, measured, float(self.trace.force[begun:].max()), bool(signals["fallback"].any())
+        return commanded, measured, float(self.trace.force[first:].max()), bool(signals["fallback"].any())
 
     def pause(self) -> None:
-        """Brings the arm to rest between two episodes where somebody asked for it; the next reset asks to go on."""
-        if self._keys.wants_pause:
-            self._keys.wants_pause = False
+        """Bring the arm to rest between episodes if the operator has requested a pause; the next reset resumes."""
+        if self._keys.is_pause_requested:
+            self._keys.is_pause_requested = False
             self.rest()
 
     def idle(self) -> None:
-        """Holds the arm for a control step, so that whoever calls this between other work isn't missed."""
-        self._elsewhere_acts()
-        self._try(lambda: self._hold(1))
+        """Hold the arm for a control step, so that work between episodes does not exceed the command timeout."""
+        self._switch_to_transfer()
+        self._retry_until_ok(self._advance)
 
     def rest(self) -> None:
-        """Brings the arm to rest because somebody asks for it, or because something was raised in whatever it did."""
-        if self._is_in_step:
-            # Drake goes on with no simulator that was left in the midst of a step.
-            here, simulator = self.pose, Simulator(self._elsewhere)
-            self._elsewhere.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), here)
-            self._hand_over(simulator, self._elsewhere)
-        self._acting.stop(self._root)
+        """Bring the arm to rest, also after an exception within a step."""
+        if self._is_stepping:
+            # Drake cannot continue a simulator that raised within a step.
+            self._switch_to_new_transfer()
+        self._station.stop(self._root_context)
         self._come_to_rest()
 
-    def _pass(self, steps: int) -> None:
-        """So many statuses."""
-        self._is_in_step = True
-        self._pace.advance(self.simulator if self._acting is self._skills else self._moving, self._acting, steps)
-        self._is_in_step = False
+    def _advance_statuses(self, steps: int) -> None:
+        """Advance by `steps` status periods."""
+        self._is_stepping = True
+        self._clock.advance(self._active_simulator, self._station, steps)
+        self._is_stepping = False
 
     def _advance(self) -> None:
-        self._pass(self._steps)
-        mine = self._mine
-        arm_state, fault = (int(self._acting.GetOutputPort(name).Eval(mine)[0]) for name in ("arm_state", "fault"))
-        if arm_state in (ArmState.DAMPING, ArmState.OFF):
-            raise RobotStoppedError(Fault(fault))
-        if self._keys.stops():
-            self._acting.stop(self._root)
+        """Advance by a control step.
+
+        Raises:
+            RobotStoppedError: If the arm is being stopped.
+        """
+        self._advance_statuses(self._steps)
+        if self._arm_state in (ArmState.DAMPING, ArmState.OFF):
+            raise RobotStoppedError(self._active_fault)
+        if self._keys.is_stop_requested():
+            self._station.stop(self._root_context)
             raise RobotStoppedError(Fault.USER_STOP)
 
     # Motions between episodes.
 
     def _command(self, pose: np.ndarray) -> None:
-        self._elsewhere.get_desired_pose_input_port().FixValue(self._moving.get_mutable_context(), pose)
+        self._transfer_station.get_desired_pose_input_port().FixValue(
+            self._transfer_simulator.get_mutable_context(), pose
+        )
         self._advance()
 
-    def _hold(self, steps: int) -> None:
-        for _ in range(steps):
-            self._advance()
-
-    def _holds(self) -> bool:
-        """Whether the workpiece stays where it is when it is pulled up."""
-        self._elsewhere_acts()
+    def _resists_pull(self) -> bool:
+        """Return True if the workpiece stays where it is when it is pulled up."""
+        self._switch_to_transfer()
         before = self.pose
-        felt = 0.0
+        force = 0.0
         try:
             for step in range(1, PULL_STEPS + 1):
-                self._command(before + [0.0, 0.0, PULL * step / PULL_STEPS, 0.0, 0.0, 0.0])
-            felt = float(-self._acting.get_wrench_output_port().Eval(self._mine)[2])
-        except RobotStoppedError as stopped:
-            self.fault = stopped.fault
+                self._command(before + [0.0, 0.0, PULL_DISTANCE * step / PULL_STEPS, 0.0, 0.0, 0.0])
+            force = float(-self._station.get_wrench_output_port().Eval(self._context)[2])
+        except RobotStoppedError as stop:
+            self.fault = stop.fault
             self._come_to_rest()
             return False
-        return bool(self.pose[2] - before[2] < GIVES_WAY and felt > LEAST_PULL)
+        return bool(self.pose[2] - before[2] < MAX_PULL_MOTION and force > MIN_PULL_FORCE)
 
-    def _return(self) -> None:
-        """Back along the way, and to the start."""
-        self._elsewhere_acts()
-        self._try(self._take_over)
-        while self._way_back:
-            # What is stopped on its way goes on with the rest of it.
-            self._try(lambda: self._command(self._way_back[-1]))
-            self._way_back.pop()
-        self._try(self._crawl_to_start)
+    def _return_to_start(self) -> None:
+        """Move back along the return path, and slowly to the start."""
+        self._switch_to_transfer()
+        self._retry_until_ok(self._take_control)
+        while self._return_path:
+            # After a stop the motion continues with the rest of the path.
+            self._retry_until_ok(lambda: self._command(self._return_path[-1]))
+            self._return_path.pop()
+        self._retry_until_ok(self._approach_start)
         if not is_near(self.pose, self._start):
-            away, turned = distance(self.pose, self._start)
+            distance, angle = pose_distance(self.pose, self._start)
             raise InputError(
-                f"the arm did not reach the start: {away / MM:.1f} mm and {np.rad2deg(turned):.1f} degrees are left; "
+                f"the arm did not reach the start: {distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are left; "
                 "is something in its way?"
             )
         gc.collect()
 
-    def _find_the_way(self) -> None:
-        """At a crawl to the way back, where it is nearest, if the arm was moved by hand meanwhile."""
-        here = self.pose
-        if not self._way_back or is_near(here, self._way_back[-1]):
+    def _rejoin_return_path(self) -> None:
+        """If the arm was moved by hand, prepend a slow motion to the nearest pose of the return path."""
+        pose = self.pose
+        if not self._return_path or is_near(pose, self._return_path[-1]):
             return
-        apart = [away + LEVER * turned for away, turned in (distance(here, pose) for pose in self._way_back)]
-        nearest = int(np.argmin(apart))
-        del self._way_back[nearest + 1 :]
-        there = self._way_back[nearest]
-        away, turned = distance(here, there)
-        self._say(
-            f"the arm was moved: back to its way, {away / MM:.0f} mm and {np.rad2deg(turned):.0f} degrees, at a crawl"
+        distances = [
+            distance + ANGLE_WEIGHT * angle
+            for distance, angle in (pose_distance(pose, waypoint) for waypoint in self._return_path)
+        ]
+        nearest = int(np.argmin(distances))
+        del self._return_path[nearest + 1 :]
+        target = self._return_path[nearest]
+        distance, angle = pose_distance(pose, target)
+        self._log(
+            f"the arm was moved: slowly back to its path, {distance / MM:.0f} mm and {np.rad2deg(angle):.0f} degrees"
         )
-        self._way_back.extend(crawl(here, there, self.task.control_period)[::-1])
+        self._return_path.extend(slow_approach(pose, target, self.task.control_period)[::-1])
 
-    def _crawl_to_start(self) -> None:
-        for pose in crawl(self.pose, self._start, self.task.control_period):
+    def _approach_start(self) -> None:
+        for pose in slow_approach(self.pose, self._start, self.task.control_period):
             self._command(pose)
 
-    def _take_over(self) -> None:
-        """Until the arm follows."""
-        self._elsewhere_acts()
-        if self._elsewhere.get_arm_state_output_port().Eval(self._mine)[0] == ArmState.WAITING:
-            self._pace.begin()  # nothing was sent yet: how long nobody listened is no gap between statuses
-        here, waited = self.pose, 0.0
-        while self._elsewhere.get_arm_state_output_port().Eval(self._mine)[0] != ArmState.RUNNING:
-            self._command(here)
-            waited += self.task.control_period
-            if waited > PATIENCE:
-                fault = Fault(int(self._elsewhere.get_fault_output_port().Eval(self._mine)[0]))
-                raise InputError(f"the arm can't be taken over: {FAULT_DESCRIPTIONS[fault]}")
+    def _take_control(self) -> None:
+        """Hold the arm until the transfer station has full authority."""
+        self._switch_to_transfer()
+        if self._arm_state == ArmState.WAITING:
+            self._clock.begin()  # nothing was sent yet, so the time since the last status is no gap
+        pose, elapsed = self.pose, 0.0
+        while self._arm_state != ArmState.RUNNING:
+            self._command(pose)
+            elapsed += self.task.control_period
+            if elapsed > RESUME_TIMEOUT:
+                raise InputError(f"the arm can't be taken over: {FAULT_DESCRIPTIONS[self._active_fault]}")
 
-    def _try(self, motion: Callable[[], Any]) -> None:
-        """Does it until nothing stops the arm meanwhile."""
+    def _retry_until_ok(self, motion: Callable[[], Any]) -> None:
+        """Retry `motion` until it completes without a stop."""
         while True:
             try:
                 self._resume()
                 motion()
                 return
-            except RobotStoppedError as stopped:
-                self.fault = stopped.fault
+            except RobotStoppedError as stop:
+                self.fault = stop.fault
                 self._come_to_rest()
 
     def _come_to_rest(self) -> None:
-        """Hears statuses until the arm has no torque."""
-        self._pass(round((self._acting.limits.damping_time + 0.1) / self._acting.period))
+        """Advance until the arm has no torque."""
+        self._advance_statuses(round((self._station.limits.damping_time + 0.1) / self._station.period))
 
     def _resume(self) -> None:
-        """Asks, and goes on, if the arm is at rest."""
-        if self._acting.get_arm_state_output_port().Eval(self._mine)[0] != ArmState.OFF:
+        """If the arm is at rest after a stop, have the operator confirm, and resume."""
+        if self._arm_state != ArmState.OFF:
             return
-        fault = Fault(int(self._acting.get_fault_output_port().Eval(self._mine)[0]))
-        self._go_on(FAULT_DESCRIPTIONS[fault])
-        # Nobody listened while the person thought: what is judged is a status of now, once statuses are believed again,
-        # which those of an arm that was moved meanwhile are only after the settling time.
-        self._pace.begin()
-        self._pass(self._steps + math.ceil(self._acting.status_limits.settling_time / self._acting.period))
-        self._keys.take_back()
-        self._find_the_way()
-        if self._acting is self._elsewhere:
-            self._elsewhere.get_desired_pose_input_port().FixValue(self._moving.get_mutable_context(), self.pose)
-        for _ in range(round(PATIENCE / self.task.control_period)):
+        self._confirm_resume(FAULT_DESCRIPTIONS[self._active_fault])
+        # No status was received while the operator was asked. Those of an arm that was moved in the meantime are
+        # accepted after the settling time only.
+        self._clock.begin()
+        settling_steps = math.ceil(self._station.status_limits.settling_time / self._station.period)
+        self._advance_statuses(self._steps + settling_steps)
+        self._keys.clear_stop()
+        self._rejoin_return_path()
+        if self._station is self._transfer_station:
+            self._transfer_station.get_desired_pose_input_port().FixValue(
+                self._transfer_simulator.get_mutable_context(), self.pose
+            )
+        for _ in range(round(RESUME_TIMEOUT / self.task.control_period)):
             try:
-                self._acting.resume(self._root)
+                self._station.resume(self._root_context)
             except InputError as error:
-                words = str(error)
-                self._pass(self._steps)
+                reason = str(error)
+                self._advance_statuses(self._steps)
             else:
                 break
         else:
-            raise InputError(words)
-        self._say("going on from here")
-        self._elsewhere_acts()
-        self._take_over()
+            raise InputError(reason)
+        self._log("resuming from here")
+        self._switch_to_transfer()
+        self._take_control()

@@ -1,4 +1,4 @@
-"""A robot, or a simulated one that stands in for it, with everything checked: ready for episodes."""
+"""Session at a robot: connection, environment and confirmed pre-flight checks, ready for episodes."""
 
 from __future__ import annotations
 
@@ -15,76 +15,89 @@ from guiderail.diagrams.envs.assemble import build_task_diagram
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.clock import set_realtime_priority
+from guiderail.diagrams.hardware.lcm.driver import LcmDriver
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.tools.hardware.connection import NO_REALTIME_PRIORITY, Log, RobotConnection
+from guiderail.tools.hardware.operator import confirm, operator_keys
 from guiderail.tools.hardware.part_randomization import PartRandomizer
-from guiderail.tools.hardware.preflight import confirm, confirm_checks
+from guiderail.tools.hardware.preflight import confirm_checks
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.learning.run_folder import RunConfig
-from guiderail.tools.teleop.teleoperator import listening
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class RobotSession:
-    """What episodes need: the environment, and how regularly the robot was heard until now."""
+    """Session at a robot.
+
+    Attributes:
+        env: The environment.
+        timing: Function that returns statistics of the intervals between statuses until now.
+    """
 
     env: RobotEnv
     timing: Callable[[], Mapping[str, Any]]
 
 
 @contextmanager
-def robot_session(config: RunConfig, other: RobotConnection, *, yes: bool, say: Say) -> Iterator[RobotSession]:
-    """Waits for the robot, reads out what is assumed of it, and has that confirmed.
+def robot_session(
+    config: RunConfig, connection: RobotConnection, *, assume_yes: bool, log: Log
+) -> Iterator[RobotSession]:
+    """Wait for the robot, and have the pre-flight checks confirmed.
 
-    In a rehearsal a reset draws what it does in a simulation, and the simulated robot's parts are put there.
+    In front of a simulated driver a reset samples the offsets of the parts as in simulation.
 
     Args:
-        config: of a run: its task, and an environment whose station is a robot.
-        other: the other end of the bus.
-        yes: what is asked is answered so: of a rehearsal, that the arm goes on after a stop, too.
-        say: what a person is told.
+        config: Configuration of a run, with a hardware station.
+        connection: Connection to the robot driver.
+        assume_yes: Do not ask to confirm the checks; with a simulated driver, nor to resume after a stop.
+        log: Function that shows a message.
 
     Raises:
-        InputError: for a task that no robot can do so, or where a check fails or isn't confirmed.
+        InputError: If the task cannot be done on hardware, or a check fails or is not confirmed.
     """
     task = EnvConfig.resolve(config.task, config.environment).make_task()
     if not isinstance(task, InsertionTask) or task.observable_success() is None:
-        raise InputError(f"nobody wrote down how a robot tells that {config.task} is done: learn it in a simulation")
+        raise InputError(f"{config.task} has no success that a robot can observe: train it in simulation")
     if task.config.reward in task.simulated_rewards:
-        raise InputError(f"the reward {task.config.reward!r} is of what a simulation alone knows: choose another")
+        raise InputError(f"the reward {task.config.reward!r} needs simulation state: choose another")
     threadpool_limits(1)
     torch.set_num_threads(1)
     station = make_station(task)
     assert isinstance(station, HardwareStation)
     diagram = build_task_diagram(task, station, make_guidance(task, station))
     start = task.start_pose(np.random.default_rng(0))
-    with other.standing_in(config.task, station.lcm_url, config.imports), listening() as keys:
-        pace, clock = other.paces(station)
-        say(f"waiting for {other.robot} on {station.lcm_url or 'LCM'}, channel {station.driver.status_channel}")
+    with (
+        connection.simulated_driver(config.task, station.driver.url, config.imports),
+        operator_keys() as keys,
+    ):
+        clock, wall_clock = connection.clocks(station)
+        log(f"waiting for {connection.robot} on {station.driver}")
 
-        def go_on(words: str) -> None:
-            say(f"the arm is at rest: {words}")
-            if not (yes and other.sim):
-                confirm("Shall it go on from where it is?")
+        def confirm_resume(reason: str) -> None:
+            log(f"the arm is at rest: {reason}")
+            if not (assume_yes and connection.sim):
+                confirm("Resume from where it is?")
 
+        randomize_parts = None
+        if connection.sim:
+            assert isinstance(station.driver, LcmDriver)
+            randomize_parts = PartRandomizer(task, station.driver, config.seed)
         env = RobotEnv(
             diagram,
             station,
             station.clone(task.workcell()),
             start,
-            pace,
+            clock,
             action_repeat=config.action_repeat,
             keys=keys,
-            go_on=go_on,
-            say=say,
-            places=PartRandomizer(task, station.lcm, station.driver, config.seed) if other.sim else None,
+            confirm_resume=confirm_resume,
+            log=log,
+            randomize_parts=randomize_parts,
         )
-        confirm_checks(env.checks(), say, again=env.checks_again, is_confirmed=yes)
-        if not other.synchronous and not set_realtime_priority():
-            say("the system serves this process as any other: on a busy machine the arm will be stopped as late")
-        say(keys.words(pauses=True))
-        yield RobotSession(env, lambda: other.timing(station, clock))
+        confirm_checks(env.preflight, log, assume_yes=assume_yes)
+        if not connection.synchronous and not set_realtime_priority():
+            log(NO_REALTIME_PRIORITY)
+        log(keys.describe(has_pauses=True))
+        yield RobotSession(env, lambda: connection.timing(station, wall_clock))

@@ -1,4 +1,6 @@
-"""`guiderail serve-iiwa`: a simulated iiwa at the other end of LCM, in a process of its own."""
+"""Programs on the robot's side of the bus: the simulated driver and the safety monitor."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,86 +10,118 @@ from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.hardware.lcm.driver import open_bus
 from guiderail.diagrams.hardware.clock import check_rate, set_realtime_priority
-from guiderail.diagrams.hardware.lcm.simulated import serve_in_lockstep, serve_in_real_time
+from guiderail.diagrams.hardware.driver import find_driver, safety_limits
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver, open_bus
+from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
-from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.tools.hardware.part_randomization import put
+from guiderail.tools.hardware.part_randomization import subscribe_part_offsets
 from guiderail.tools.hardware.scenario import load_scenario
 
-START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # the plug above the jack
-TASK = "BncConnector"
-ASIDE = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # of where another task starts: a robot is never just there
-PLANT_SHARE = 5  # plant steps to a status in real time: the arm's own loop has 1 kHz
+DEFAULT_TASK = "BncConnector"
+START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # initial pose of the default task: the plug above the jack
+START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # of the initial pose from another task's start pose
+PLANT_STEPS_PER_STATUS = 5  # in real time; the arm's own control loop has 1 kHz
 
 
-def serve_iiwa(
+def run_sim_driver(
     url: str,
     seconds: float,
     command_timeout: float,
-    task: str = TASK,
+    task: str = DEFAULT_TASK,
     *,
     rate: float | None = None,
     offset: Sequence[float] | None = None,
     scenario: Path | None = None,
-    say: Callable[[str], None] = print,
+    log: Callable[[str], None] = print,
 ) -> bool:
-    """Serves the arm in front of a task's fixture; whether commands kept coming until the end.
-
-    A deputy stands by. Unless a rate is given it waits for an answer to every status: so neither side outruns the other
-    on a slow machine.
+    """Simulate an iiwa, its driver and a safety monitor in front of a task's fixture.
 
     Args:
-        url: LCM's; its own default where it is empty.
-        seconds: of simulated time.
-        patience: how long to wait for a command [s].
-        task: an insertion.
-        rate: it goes by the wall's clock, as a robot does, or so much slower, and waits for nobody.
-        offset: (x, y) of the fixture from where it is thought to be [m].
-        scenario: a file that says what stands around it; see `load_scenario`.
-        say: what a person is told.
+        url: LCM URL of the driver's bus; LCM's default if empty.
+        seconds: Simulated time to run [s].
+        command_timeout: Longest wait for the acknowledgement of a status [s of wall clock time].
+        task: Name of an insertion task.
+        rate: Rate of the robot's clock relative to the wall clock; None to wait for an acknowledgement of each status
+            instead (lockstep).
+        offset: Offset (x, y) of the fixture from its nominal position [m].
+        scenario: Scenario file with the surroundings; see `load_scenario`.
+        log: Function that shows a message.
+
+    Returns:
+        True if acknowledgements arrived until the end.
 
     Raises:
-        InputError: if the task or the bus is none, a time or the rate is no positive number, or the offset is too far.
+        InputError: If the task is no insertion, or an argument is out of range.
     """
-    for name, value in {"seconds": seconds, "patience": command_timeout}.items():
+    for name, value in {"seconds": seconds, "command_timeout": command_timeout}.items():
         if not 0.0 < value < np.inf:
             raise InputError(f"{name} must be a positive number, not {value:g}")
     if rate is not None:
         check_rate(rate)
-    declared = EnvConfig.resolve(task, {}).make_task()
-    if not isinstance(declared, InsertionTask):
-        raise InputError(f"{task} is done by no arm with a tool: serve an insertion")
+    insertion = _insertion_task(task)
     if offset is not None and len(offset) != 2:
         raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
-    moved = None if offset is None else validate_options(declared.Reset, {"offset": tuple(offset)}, "a robot")
-    start = START if task == TASK else declared.start_pose(np.random.default_rng(0)) + ASIDE
+    reset = None if offset is None else validate_options(insertion.Reset, {"offset": tuple(offset)}, "a robot")
+    start = START if task == DEFAULT_TASK else insertion.start_pose(np.random.default_rng(0)) + START_OFFSET
     directives = [] if scenario is None else load_scenario(scenario).directives
-    lcm, driver = open_bus(url), IiwaDriver
-    # In real time, the deputy has ears of its own: beside a real driver it is another process.
-    within, ears = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
+    lcm = open_bus(url)
+    # In real time the monitor has a connection of its own, as next to a real driver, where it is another process.
+    robot_lcm, monitor_lcm = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
     robot = SimulatedIiwa(
-        declared.workcell(), within, driver.period / (1 if rate is None else PLANT_SHARE), directives=directives
+        insertion.workcell(),
+        robot_lcm,
+        IiwaDriver.period / (1 if rate is None else PLANT_STEPS_PER_STATUS),
+        directives=directives,
     )
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
-    SafetyMonitor(type(driver)(ears), robot.controller_plant.plant, safety_limits(robot.controller_plant.plant, driver))
-    if moved is not None:
-        fixture, workpiece = declared.offsets.draw(np.random.default_rng(0), moved)
-        declared.set_part_offsets(robot, simulator.get_mutable_context(), fixture, workpiece)
-    put(lcm if rate is None else ears, driver, declared, robot, simulator.get_mutable_context())
+    plant = robot.controller_plant.plant
+    monitor_driver = IiwaDriver(monitor_lcm)
+    SafetyMonitor(monitor_driver, plant, safety_limits(plant, IiwaDriver))
+    if reset is not None:
+        fixture, workpiece = insertion.offsets.draw(np.random.default_rng(0), reset)
+        insertion.set_part_offsets(robot, simulator.get_mutable_context(), fixture, workpiece)
+    subscribe_part_offsets(lcm if rate is None else monitor_lcm, insertion, robot, simulator.get_mutable_context())
     simulator.Initialize()
     if rate is None:
-        return serve(simulator, within, lcm, driver, seconds, command_timeout) >= seconds
+        return serve_in_lockstep(simulator, robot_lcm, lcm, seconds, command_timeout) >= seconds
     set_realtime_priority()
-
-    def attend() -> None:
-        ears.HandleSubscriptions(0)
-
-    serve_in_real_time(simulator, driver, seconds, attend, rate, say)
+    serve_in_real_time(simulator, seconds, monitor_driver.receive, rate, log)
     return True
+
+
+def run_safety_monitor(url: str, robot: str, task: str, *, log: Callable[[str], None] = print) -> None:
+    """Damp a robot to rest when torque commands stop arriving, until this process is terminated.
+
+    Args:
+        url: Address of the robot's driver; LCM's default if empty.
+        robot: Name of the arm.
+        task: Name of the insertion task whose workpiece the arm carries.
+        log: Function that shows a message.
+
+    Raises:
+        InputError: If the robot, the task or the address is unusable.
+    """
+    driver_type = find_driver(robot)
+    plant = ArmControllerPlant(_insertion_task(task).workcell(), robot).plant
+    driver = driver_type(url)
+    monitor = SafetyMonitor(driver, plant, safety_limits(plant, driver))
+    suffix = "" if set_realtime_priority() else "; without real-time priority"
+    log(f"watching {driver}{suffix}")
+    state = monitor.state
+    while True:
+        driver.receive(1.0)
+        if monitor.state != state:
+            state = monitor.state
+            log(state.name.lower())
+
+
+def _insertion_task(name: str) -> InsertionTask:
+    task = EnvConfig.resolve(name, {}).make_task()
+    if not isinstance(task, InsertionTask):
+        raise InputError(f"{name} is done by no arm with a tool: name an insertion")
+    return task

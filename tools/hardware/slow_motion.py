@@ -1,52 +1,63 @@
-"""From one pose to another at a crawl."""
+"""Slow motions of the arm between pre-flight check, skill and episodes."""
 
 import numpy as np
 
 from guiderail.models.common.units import DEGREE, MM
 
-CRAWL, CRAWL_TURN = 0.02, 0.1  # [m/s], [rad/s]
-BACK, BACK_TURN = 0.01, 0.5  # [m/s], [rad/s]: slower than this nobody needs to go back along a way that was gone
-NEAR, NEAR_TURN = 3.0 * MM, 2.0 * DEGREE  # of where the arm was sent, to be there
-SETTLE = 0.5  # [s] at the end
+SPEED, ANGULAR_SPEED = 0.02, 0.1  # of a slow approach [m/s], [rad/s]
+MIN_SPEED, MIN_ANGULAR_SPEED = 0.01, 0.5  # minimum on the return path; slower segments are skipped [m/s], [rad/s]
+POSITION_TOLERANCE, ANGLE_TOLERANCE = 3.0 * MM, 2.0 * DEGREE  # of a reached pose
+SETTLING_TIME = 0.5  # at the end of an approach [s]
 
 
-def difference(to: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Of two poses, each angle the shorter way, (6,)."""
-    change = to - at
+def pose_difference(target: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return `target` minus `pose`, (6,), each angle in [−π, π)."""
+    change = target - pose
     change[3:] = (change[3:] + np.pi) % (2.0 * np.pi) - np.pi
     return change
 
 
-def distance(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Between two poses [m], and between the farthest of their angles [rad]."""
-    change = difference(one, other)
+def pose_distance(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Return the distance of two poses (6,) [m], and the largest difference of an angle [rad]."""
+    change = pose_difference(a, b)
     return float(np.linalg.norm(change[:3])), float(np.abs(change[3:]).max())
 
 
-def crawl(here: np.ndarray, there: np.ndarray, period: float) -> np.ndarray:
-    """A pose for each period [s], along a straight line to `there`, (6,), and some on which the arm settles, (n, 6)."""
-    away, turned = distance(there, here)
-    moving = int(np.ceil(max(away / CRAWL, turned / CRAWL_TURN) / period)) or 1
-    steps = np.arange(1, moving + round(SETTLE / period))
-    return here + np.minimum(steps / moving, 1.0)[:, None] * difference(there, here)
+def is_near(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return True if two poses (6,) are equal within the tolerances of a reached pose."""
+    distance, angle = pose_distance(a, b)
+    return distance <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE
 
 
-def is_near(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether the arm is where it was sent."""
-    away, turned = distance(one, other)
-    return away <= NEAR and turned <= NEAR_TURN
+def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.ndarray:
+    """Return commands from `pose` to `target`, (6,), along a straight line at `SPEED`, then some to settle.
+
+    Args:
+        pose: First pose, (6,).
+        target: Last pose, (6,).
+        period: Time between commands [s].
+
+    Returns:
+        Poses, (n, 6).
+    """
+    distance, angle = pose_distance(target, pose)
+    moving = int(np.ceil(max(distance / SPEED, angle / ANGULAR_SPEED) / period)) or 1
+    steps = np.arange(1, moving + round(SETTLING_TIME / period))
+    return pose + np.minimum(steps / moving, 1.0)[:, None] * pose_difference(target, pose)
 
 
-def back(way: np.ndarray, period: float) -> list[np.ndarray]:
-    """A pose for each period [s], backwards along a way (n, 6) with a pose for each period, to where it began.
+def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
+    """Return commands backwards along a path, at its own speed but without the segments that are nearly at rest.
 
-    At the pace at which it was gone, but without the time for which the arm stood still or nearly so.
+    Args:
+        path: Poses (n, 6), one per period.
+        period: Time between commands [s].
     """
     poses: list[np.ndarray] = []
-    for pose in way[::-1]:
-        away, turned = distance(pose, poses[-1]) if poses else (np.inf, np.inf)
-        if away >= BACK * period or turned >= BACK_TURN * period:
+    for pose in path[::-1]:
+        distance, angle = pose_distance(pose, poses[-1]) if poses else (np.inf, np.inf)
+        if distance >= MIN_SPEED * period or angle >= MIN_ANGULAR_SPEED * period:
             poses.append(pose.copy())
-    if len(way):
-        poses.append(way[0].copy())
+    if len(path):
+        poses.append(path[0].copy())
     return poses

@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import gc
-import select
-import signal
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any, cast
 
 import gymnasium
@@ -16,74 +11,6 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.meshcat_device import MeshcatDevice
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
-
-PAUSE = "p"
-
-
-class Keys:
-    """Listens without waiting: Enter or Ctrl-C stops the arm, p and Enter pauses it where an episode ends.
-
-    Attributes:
-        wants_pause: whether somebody asked for one; who pauses takes it back.
-    """
-
-    def __init__(self) -> None:
-        self.wants_pause = False
-        self._is_stopped = False
-
-    def stops(self) -> bool:
-        """Whether somebody wants the arm to stop, since this was last taken back."""
-        if not self._is_stopped and sys.stdin.isatty() and select.select([sys.stdin], [], [], 0.0)[0]:
-            if sys.stdin.readline().strip().lower() == PAUSE:
-                self.wants_pause = True
-            else:
-                self._is_stopped = True
-        return self._is_stopped
-
-    def words(self, *, pauses: bool = False) -> str:
-        """What a person is told of them: where nobody can type, Ctrl-C alone; `pauses` where there are episodes."""
-        if not sys.stdin.isatty():
-            return "Ctrl-C stops the arm"
-        return "Enter or Ctrl-C stops the arm" + pauses * ", p and Enter pauses it at the end of an episode"
-
-    def press(self) -> None:
-        """As if Enter had been pressed."""
-        self._is_stopped = True
-
-    def take_back(self) -> None:
-        """Somebody said to go on."""
-        self._is_stopped = False
-
-
-@contextmanager
-def listening() -> Iterator[Keys]:
-    """Keys, and Ctrl-C as one of them; the second Ctrl-C in a row ends the process."""
-    keys = Keys()
-
-    def press(number: int, frame: object) -> None:
-        if keys.stops():
-            raise KeyboardInterrupt
-        keys.press()
-
-    before = signal.signal(signal.SIGINT, press)
-    try:
-        yield keys
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def no_pauses() -> Iterator[None]:
-    """A garbage collection takes longer than a robot waits for a command."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
-        gc.unfreeze()
-
 
 # For each input the gamepad's axis with its sign, and the keys that lower and raise it.
 AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0), (4, 1.0), (5, 1.0))

@@ -9,27 +9,35 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.diagrams.hardware import clock as pace_module
 from guiderail.diagrams.hardware.clock import IntervalHistogram, WallClock
-from guiderail.diagrams.hardware.lcm.driver import HEAD_SIZE, MessageCounter
-from guiderail.diagrams.hardware.lcm.simulated import ACKNOWLEDGED, LockstepClock, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.driver import STATUS_PERIOD
-from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.lcm.driver import HEAD_SIZE, IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import (
+    ACKNOWLEDGED,
+    LockstepClock,
+    SimulatedIiwa,
+    serve_in_lockstep,
+    serve_in_real_time,
+)
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
+
+
+class Statuses(IiwaDriver):
+    status_channel = "STATUS"
 
 
 class Told:
     def __init__(self):
         self.clocks = []
 
-    def tell_time(self, context, clock):
+    def receive(self, context, clock=None):
         self.clocks.append(clock)
 
 
 def test_a_step_for_each_status_and_without_one_after_a_while():
     lcm = DrakeLcm("memq://")
-    pace, told = WallClock(lcm, "STATUS"), Told()
+    pace, told = WallClock(Statuses(lcm)), Told()
     simulator = Simulator(ConstantVectorSource([0.0]))
     pace.begin()
     for number in range(3):
@@ -68,7 +76,7 @@ def test_a_robot_that_speaks_too_often_does_not_hurry_it(monkeypatch, millisecon
 
     monkeypatch.setattr(pace_module.time, "monotonic", lambda: now)
     monkeypatch.setattr(pace_module.time, "sleep", sleep)
-    pace, told = WallClock(Bus(), "STATUS"), Told()
+    pace, told = WallClock(Statuses(Bus())), Told()
     simulator = Simulator(ConstantVectorSource([0.0]))
     pace.begin()
     pace.advance(simulator, told, 400)
@@ -86,7 +94,7 @@ def test_what_happens_at_an_instant_knows_the_clock_of_that_instant():
             self.clock, self.seen = None, []
             self.DeclarePeriodicUnrestrictedUpdateEvent(STATUS_PERIOD, 0.0, self._see)
 
-        def tell_time(self, context, clock):
+        def receive(self, context, clock=None):
             self.clock = context.get_time()
 
         def _see(self, context, state):
@@ -94,25 +102,25 @@ def test_what_happens_at_an_instant_knows_the_clock_of_that_instant():
             return EventStatus.Succeeded()
 
     station = Clocked()
-    WallClock(DrakeLcm("memq://"), "STATUS").advance(Simulator(station), station, 3)
+    WallClock(Statuses(DrakeLcm("memq://"))).advance(Simulator(station), station, 3)
     assert station.seen == [None, 0.0, STATUS_PERIOD]
 
 
 def test_a_slower_clock_is_told_as_such():
     slow, fast = Told(), Told()
     for told, rate in ((slow, 0.25), (fast, 1.0)):
-        pace = WallClock(DrakeLcm("memq://"), "STATUS", rate=rate)
+        pace = WallClock(Statuses(DrakeLcm("memq://")), rate=rate)
         pace.advance(Simulator(ConstantVectorSource([0.0])), told, 2)
     assert slow.clocks[1] - slow.clocks[0] >= 1.5 * STATUS_PERIOD
     assert slow.clocks[0] == pytest.approx(0.25 * fast.clocks[0], rel=0.01)
     for rate in (0.0, 1.1, np.nan):
         with pytest.raises(InputError, match="rate up to 1 of the wall's"):
-            WallClock(DrakeLcm("memq://"), "STATUS", rate=rate)
+            WallClock(Statuses(DrakeLcm("memq://")), rate=rate)
 
 
 def test_a_message_that_is_sent_again_counts_once():
     lcm = DrakeLcm("memq://")
-    messages = MessageCounter(lcm, "STATUS")
+    messages = Statuses(lcm).statuses
     for message in (b"one", b"one", b"two", b"one"):
         lcm.Publish("STATUS", message)
         lcm.HandleSubscriptions(0)
@@ -131,7 +139,7 @@ def test_gaps_are_counted_without_being_kept():
 
 def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
     lcm = DrakeLcm("memq://")
-    messages = MessageCounter(lcm, "STATUS")
+    messages = Statuses(lcm).statuses
     head = bytes(range(16))
     for message in (head + b"a", head + b"b", head[:-1] + b"\x00" + b"b"):
         lcm.Publish("STATUS", message)
@@ -141,7 +149,7 @@ def test_a_status_that_is_sent_again_with_other_torques_is_no_new_one():
 
 def test_in_step_a_status_that_comes_again_is_answered_again_and_is_no_step():
     lcm, words = DrakeLcm("memq://"), []
-    pace, simulator = LockstepClock(lcm, 0.01, "STATUS"), Simulator(ConstantVectorSource([0.0]))
+    pace, simulator = LockstepClock(Statuses(lcm), 0.01), Simulator(ConstantVectorSource([0.0]))
     lcm.Subscribe("STATUS" + ACKNOWLEDGED, words.append)
     pace.begin()
     for number in range(3):
@@ -190,7 +198,7 @@ def test_in_step_it_does_not_matter_who_is_faster():
             heard.append(message)
             if heard.count(message) == wait:
                 step = len(set(heard))
-                lcm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(step, np.full(7, (-1.0) ** step * step)))
+                lcm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(np.full(7, (-1.0) ** step * step), step))
                 lcm.Publish(IiwaDriver.status_channel + ACKNOWLEDGED, message[:HEAD_SIZE])
 
         lcm.Subscribe(IiwaDriver.status_channel, answer)
@@ -205,7 +213,9 @@ def test_in_step_it_does_not_matter_who_is_faster():
 def test_a_word_that_is_none_answers_nothing():
     within, lcm = DrakeLcm("memq://"), DrakeLcm("memq://")
     simulator = Simulator(SimulatedIiwa(BncWorkcell(), within))
-    lcm.Subscribe(IiwaDriver.status_channel, lambda message: lcm.Publish(IiwaDriver.status_channel + ACKNOWLEDGED, b"yes"))
+    lcm.Subscribe(
+        IiwaDriver.status_channel, lambda message: lcm.Publish(IiwaDriver.status_channel + ACKNOWLEDGED, b"yes")
+    )
     simulator.Initialize()
     assert serve_in_lockstep(simulator, within, lcm, 2 * STATUS_PERIOD, 0.01) == 0.0
 
@@ -213,7 +223,7 @@ def test_a_word_that_is_none_answers_nothing():
 @pytest.mark.parametrize(("periods", "says"), [(MAX_MISSED_MESSAGES - 1, False), (MAX_MISSED_MESSAGES + 1, True)])
 def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch, periods, says):
     said, wall = [], [0.0]
-    monkeypatch.setattr("guiderail.diagrams.hardware.clock.time.monotonic", lambda: wall[0])
+    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.simulated.time.monotonic", lambda: wall[0])
 
     def attend():
         attended.append(True)
@@ -221,7 +231,7 @@ def test_a_simulated_robot_that_falls_behind_its_clock_says_so_once(monkeypatch,
 
     attended = []
     simulator = Simulator(ConstantVectorSource([0.0]))
-    serve_in_real_time(simulator, IiwaDriver, 3 * STATUS_PERIOD, attend, 1.0, said.append)
+    serve_in_real_time(simulator, 3 * STATUS_PERIOD, attend, 1.0, said.append)
     assert len(attended) == 3
     assert bool(said) == says
     assert len(said) <= 1

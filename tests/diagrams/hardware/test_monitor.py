@@ -5,9 +5,9 @@ import pytest
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.hardware.driver import safety_limits
 from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
@@ -27,7 +27,7 @@ class Bus:
     def __init__(self, known):
         self.lcm, self.time, self.heard, self.words = DrakeLcm("memq://"), 100.0, [], []
         self.limits = safety_limits(known.plant, IiwaDriver)
-        self.deputy = SafetyMonitor(IiwaDriver(self.lcm), known.plant, self.limits)
+        self.monitor = SafetyMonitor(IiwaDriver(self.lcm), known.plant, self.limits)
         self.lcm.Subscribe("IIWA_COMMAND", self.hear)
         self.lcm.Subscribe(IiwaDriver.heartbeat_channel(), self.words.append)
 
@@ -49,7 +49,7 @@ class Bus:
             self.publish("IIWA_STATUS", message.encode())
 
     def command(self, torque):
-        self.publish("IIWA_COMMAND", IiwaDriver.encode(self.time, np.array(torque)))
+        self.publish("IIWA_COMMAND", IiwaDriver.encode(np.array(torque), self.time))
 
     def publish(self, channel, message):
         self.lcm.Publish(channel, message)
@@ -66,17 +66,17 @@ def test_damps_within_the_limits_where_commands_stop_then_says_no_torque_and_fal
     bus.status(steps=MAX_MISSED_MESSAGES)
     assert bus.heard == []
     bus.status(velocities=10.0 * MOVING, steps=2)
-    assert bus.deputy.duty == MonitorState.DAMPING
+    assert bus.monitor.state == MonitorState.DAMPING
     M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
     decay_time = bus.limits.decay_time
     wanted = -(M @ (10.0 * MOVING)) * (1.0 - np.exp(-PERIOD / decay_time)) / PERIOD
     np.testing.assert_allclose(bus.heard[-1], np.clip(wanted, -np.array(bus.limits.torque), bus.limits.torque))
     assert (np.abs(wanted) > bus.limits.torque).any()
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
-    assert bus.deputy.duty == MonitorState.RESTING
+    assert bus.monitor.state == MonitorState.RESTING
     np.testing.assert_array_equal(bus.heard[-1], 0.0)
     bus.status(steps=20)
-    assert bus.deputy.duty == MonitorState.IDLE
+    assert bus.monitor.state == MonitorState.IDLE
     said = len(bus.heard)
     bus.status(steps=20)
     assert len(bus.heard) == said
@@ -92,7 +92,7 @@ def test_goes_on_to_the_end_where_commands_come_back_and_says_so(known):
     for _ in range(5):
         bus.command([1.0] * 7)
         bus.status()
-    assert bus.deputy.duty == MonitorState.DAMPING
+    assert bus.monitor.state == MonitorState.DAMPING
     assert bus.words[-1][-1] == 1
     assert bus.words[-1] != acting
 
@@ -100,13 +100,13 @@ def test_goes_on_to_the_end_where_commands_come_back_and_says_so(known):
 def test_has_nothing_to_do_where_the_last_command_was_no_torque_or_none_ever_came(known):
     bus = Bus(known)
     bus.status(steps=50)
-    assert bus.deputy.duty == MonitorState.IDLE
+    assert bus.monitor.state == MonitorState.IDLE
     bus.command([1.0] * 7)
     bus.status()
     bus.command([0.0] * 7)
     bus.heard.clear()
     bus.status(steps=50)
-    assert (bus.deputy.duty, bus.heard) == (MonitorState.IDLE, [])
+    assert (bus.monitor.state, bus.heard) == (MonitorState.IDLE, [])
 
 
 def test_what_is_no_sound_message_neither_moves_it_nor_ends_it(known):
@@ -121,7 +121,7 @@ def test_what_is_no_sound_message_neither_moves_it_nor_ends_it(known):
     bus.status(num_joints=3, **{name: [0.0] * 3 for name in lcmt_iiwa_status.__slots__[2:]})
     assert len(bus.words) == said
     bus.status(steps=MAX_MISSED_MESSAGES)
-    assert bus.deputy.duty == MonitorState.DAMPING
+    assert bus.monitor.state == MonitorState.DAMPING
 
 
 def test_a_robot_that_was_started_anew_is_brought_to_rest_at_once(known):
@@ -131,11 +131,11 @@ def test_a_robot_that_was_started_anew_is_brought_to_rest_at_once(known):
     bus.command([1.0] * 7)
     bus.time -= 3.5 * PERIOD
     bus.status()
-    assert bus.deputy.duty == MonitorState.WATCHING
+    assert bus.monitor.state == MonitorState.WATCHING
     bus.heard.clear()
     bus.time = 0.0
     bus.status(velocities=0.1 * MOVING)
-    assert bus.deputy.duty == MonitorState.DAMPING
+    assert bus.monitor.state == MonitorState.DAMPING
     M = known.plant.CalcMassMatrix(known.plant.CreateDefaultContext())
     share = -np.expm1(-PERIOD / bus.limits.decay_time)
     np.testing.assert_allclose(bus.heard[-1], -(M @ (0.1 * MOVING)) * share / PERIOD, rtol=1e-6)
@@ -147,10 +147,10 @@ def test_a_robots_clock_that_goes_back_does_not_make_it_wait(known):
     bus.command([1.0] * 7)
     bus.time = 3.0
     bus.status(steps=MAX_MISSED_MESSAGES + 3)
-    assert bus.deputy.duty == MonitorState.DAMPING
+    assert bus.monitor.state == MonitorState.DAMPING
     bus.time = 1.0
     bus.status(steps=round(bus.limits.damping_time / PERIOD) + 2)
-    assert bus.deputy.duty == MonitorState.RESTING
+    assert bus.monitor.state == MonitorState.RESTING
 
 
 def test_statuses_that_overtake_each_other_do_not_make_it_wait(known):
@@ -160,4 +160,4 @@ def test_statuses_that_overtake_each_other_do_not_make_it_wait(known):
     for _ in range(MAX_MISSED_MESSAGES):
         for ahead in (2, 0):  # the second of two comes first
             bus.status(utime=round((bus.time + ahead * PERIOD) * 1e6))
-    assert bus.deputy.duty == MonitorState.DAMPING
+    assert bus.monitor.state == MonitorState.DAMPING

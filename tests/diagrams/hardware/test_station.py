@@ -10,15 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
+from injections.together import advance
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.diagrams.hardware.lcm.simulated import LockstepClock
-
 from guiderail.diagrams.hardware.driver import find_driver, safety_limits
 from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
-from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.lcm.simulated import LockstepClock, SimulatedIiwa
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
@@ -71,7 +70,7 @@ class OneProcess:
             self._steps += 1
             if robot:
                 self.robot_simulator.AdvanceTo(self._steps * PERIOD)
-            self.simulator.AdvanceTo(self._steps * PERIOD)
+            advance(self.simulator, self.station, self._steps * PERIOD)
             self.torques.append(self["iiwa.torque_commanded"].copy())
 
     def __getitem__(self, port):
@@ -113,7 +112,7 @@ def test_two_processes_on_one_machine(monkeypatch):
         station.get_desired_pose_input_port().FixValue(context, goal)
         station.start(simulator)
         before = station.get_pose_output_port().Eval(context).copy()
-        pace = LockstepClock(lcm, 5.0, IiwaDriver.status_channel)
+        pace = LockstepClock(station.driver, 5.0)
         pace.begin()
         pace.advance(simulator, station, round(1.4 / PERIOD))
         after = station.get_pose_output_port().Eval(context)
@@ -236,11 +235,11 @@ def test_another_station_takes_over_without_letting_go():
     other.get_desired_pose_input_port().FixValue(context, goal)
     both.lcm.Publish("IIWA_STATUS", status(both))
     other.start(simulator)
-    other.copy_state_from(context, both.context)
+    other.copy_state_from(context, both.station, both.context)
     time = both.robot_simulator.get_context().get_time()
     for step in range(1, 40):
         both.robot_simulator.AdvanceTo(time + step * PERIOD)
-        simulator.AdvanceTo(step * PERIOD)
+        advance(simulator, other, step * PERIOD)
         assert (other.get_arm_state_output_port().Eval(context)[0], other.get_fault_output_port().Eval(context)[0]) == (
             2,
             0,
@@ -258,7 +257,7 @@ def test_an_external_torque_has_the_sign_of_what_the_surroundings_do():
         message.joint_torque_external = [1.0] * 7
     np.testing.assert_array_equal(find_driver("iiwa14").decode(iiwa.encode()).external_torque, [1.0] * 7)
     np.testing.assert_array_equal(find_driver("panda").decode(panda.encode()).external_torque, [-1.0] * 7)
-    with pytest.raises(InputError, match="nothing here speaks to a robot"):
+    with pytest.raises(InputError, match="no driver of a robot 'ur5e'"):
         find_driver("ur5e")
 
 
@@ -274,18 +273,20 @@ def test_what_is_sent_stays_below_what_the_driver_stops_at(robot):
 def test_the_full_wrench_at_the_longest_lever_is_clipped_on_the_wrist_alone():
     """With an outstretched tool the impedance's limits would take more than the driver allows on joints 4 to 6."""
     station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")))
-    load = station.load_of_force(station.controller_plant.solve(START, station.controller_plant.posture))
+    load = station.max_torque_shares(station.controller_plant.solve(START, station.controller_plant.posture))
     assert (load[[0, 1, 2, 6]] < 0.7).all()
     assert 1.0 < load[3:6].max() < 1.5
 
 
 def test_no_wrench_within_its_limits_loads_a_joint_more_than_is_read_out():
-    station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1)))
+    station = HardwareStation(
+        WORKCELL, IiwaDriver(DrakeLcm("memq://")), impedance=Impedance(limits=(40.0, 30.0, 20.0, 3, 2, 1))
+    )
     positions = station.controller_plant.solve(START, station.controller_plant.posture)
     J = np.roll(station._jacobian(positions), 3, axis=0)  # the force first
     corners = np.array(list(itertools.product(*((-limit, limit) for limit in (40.0, 30.0, 20.0, 1, 2, 3)))))
     worst = np.abs(corners @ J).max(axis=0) / np.array(station.limits.torque)
-    np.testing.assert_allclose(station.load_of_force(positions), worst)
+    np.testing.assert_allclose(station.max_torque_shares(positions), worst)
 
 
 def test_says_that_no_robot_answers():
@@ -308,15 +309,19 @@ def test_a_deputy_is_heard_in_a_larger_diagram_too():
     simulator = Simulator(builder.Build())
     context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     station.get_desired_pose_input_port().FixValue(context, START)
+    station.receive(simulator.get_mutable_context())
     assert not station.has_safety_monitor(context)
     lcm.Publish(IiwaDriver.heartbeat_channel(), bytes(9))
-    lcm.HandleSubscriptions(0)
-    simulator.AdvancePendingEvents()
+    station.receive(simulator.get_mutable_context())
     assert station.has_safety_monitor(context)
 
 
 def test_all_stations_have_the_same_ports():
-    stations = [GantryStation(WORKCELL), ArmStation(WORKCELL), HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")))]
+    stations = [
+        GantryStation(WORKCELL),
+        ArmStation(WORKCELL),
+        HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://"))),
+    ]
     simulated_only = {"query", "body_poses"}
     robots_own = {"fault", "arm_state"} | {f"iiwa.{name}" for name in ALIASES}
     for station in stations:
@@ -339,6 +344,6 @@ def test_refuses_an_impedance_that_makes_no_sense(wrong):
 def test_a_pandas_commands_say_the_time_on_the_wall():
     """Drake's driver for it drops what is older than a tenth of a second, by that clock."""
     before = time.time_ns() // 1000
-    command = lcmt_panda_command.decode(find_driver("panda").encode(0.005, np.arange(7.0)))
+    command = lcmt_panda_command.decode(find_driver("panda").encode(np.arange(7.0), 0.005))
     assert before <= command.utime <= time.time_ns() // 1000
     assert list(command.joint_torque) == list(range(7))

@@ -1,4 +1,4 @@
-"""A station and a simulated robot at the two ends of a bus on which anything may happen, stepped in turn."""
+"""A station and a simulated robot at the two ends of a faulty bus, stepped in turn."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from drake import lcmt_iiwa_command, lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.hardware.driver import safety_limits
 from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
 from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
@@ -24,38 +24,41 @@ from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
 
 PERIOD = IiwaDriver.period
-STOPPED_WITHIN = 0.05  # [s] of a fault's detection
-STANDSTILL = 0.05  # [rad/s] of the fastest joint, which was up to 1 rad/s fast
-UNSEEN = 0.15  # [rad/s], where it was stopped without a status to go by
-RADIUS, TURN, FREQUENCY = 0.01, 0.15, 1.0  # [m], [rad], [Hz] of the motion during which faults happen
-WORDS = IiwaDriver.heartbeat_channel()
+STOPPED_WITHIN = 0.05  # time from the detection of a fault to standstill [s]
+STANDSTILL = 0.05  # speed of the fastest joint, after up to 1 rad/s before [rad/s]
+STANDSTILL_WITHOUT_STATUS = 0.15  # the same if no status arrived while the arm was stopped [rad/s]
+RADIUS, TURN, FREQUENCY = 0.01, 0.15, 1.0  # of the arm's motion [m], [rad], [Hz]
+HEARTBEAT_CHANNEL = IiwaDriver.heartbeat_channel()
 
 Relay = Callable[[bytes], list[bytes]]
 
 
 def passes(message: bytes) -> list[bytes]:
-    """What a sound bus does."""
+    """Relay a message, as a bus without faults."""
     return [message]
 
 
 @dataclass
-class Seen:
-    """What happened after a fault, as it is seen on the robot's side."""
+class Observation:
+    """Effect of a fault, observed on the robot's side."""
 
-    detected: float | None = None  # [s] after its beginning
+    detected: float | None = None  # time from the fault's begin to its detection [s]
     fault: str = ""
-    fastest: float = 0.0  # [rad/s] of a joint when it was detected
-    after: float = 0.0  # [rad/s], the fastest from `STOPPED_WITHIN` after the detection on
+    fastest: float = 0.0  # speed of the fastest joint at the detection [rad/s]
+    after: float = 0.0  # largest speed from `STOPPED_WITHIN` after the detection [rad/s]
     wrong: list[str] = field(default_factory=list)
 
 
 class Bus:
-    """Both ends, and what lies between them.
+    """Both programs, and the bus between them.
 
     Attributes:
-        on_status, on_command: what the bus does to a message.
-        has_robot, has_controller: whether the two are stepped at all.
-        torques: that arrived at the robot since `torques.clear()`.
+        on_status: Function from a status to the messages that arrive.
+        on_command: Function from a command to the messages that arrive.
+        has_robot: True if the robot is stepped.
+        has_controller: True if the station is stepped.
+        has_safety_monitor: True if heartbeats are relayed.
+        torques: Torques that the robot received since `torques.clear()`.
     """
 
     def __init__(self) -> None:
@@ -66,16 +69,16 @@ class Bus:
         limits = dataclasses.replace(limits, damping_time=0.2, ramp_time=0.1)
         self.limits = np.array(limits.torque)
         self.station = HardwareStation(workcell, IiwaDriver(self.near_station), robot_timeout=1.0, limits=limits)
-        self.deputy = SafetyMonitor(IiwaDriver(self.near_robot), self.robot.controller_plant.plant, limits)
+        self.monitor = SafetyMonitor(IiwaDriver(self.near_robot), self.robot.controller_plant.plant, limits)
         self.on_status = self.on_command = passes
         self.has_robot = self.has_controller = self.has_safety_monitor = True
         self.torques: list[np.ndarray] = []
         self.step = 0
         self._statuses: list[bytes] = []
-        self._words: list[bytes] = []
+        self._heartbeats: list[bytes] = []
         self._commands: list[bytes] = []
         self.near_robot.Subscribe(IiwaDriver.status_channel, self._statuses.append)
-        self.near_robot.Subscribe(WORDS, self._words.append)
+        self.near_robot.Subscribe(HEARTBEAT_CHANNEL, self._heartbeats.append)
         self.near_robot.Subscribe(IiwaDriver.command_channel, self._arrive)
         self.near_station.Subscribe(IiwaDriver.command_channel, self._commands.append)
         self.robot_simulator = self.robot.simulator()
@@ -85,10 +88,10 @@ class Bus:
         self.simulator = Simulator(self.station)
         self.start_controller()
 
-    # Both programs, and that they are started anew.
+    # Start of both programs.
 
     def start_robot(self) -> None:
-        """The robot begins where it was, its clock at zero."""
+        """Start the robot where it was, with its clock at zero."""
         context = self.robot_simulator.get_mutable_context()
         plant = self.robot.plant
         state = plant.GetPositions(plant.GetMyContextFromRoot(context)) if self.step else None
@@ -103,7 +106,7 @@ class Bus:
         self._relay_statuses()
 
     def start_controller(self) -> None:
-        """A program that knows nothing of what was."""
+        """Start the station's program without any earlier state."""
         context = self.simulator.get_mutable_context()
         context.SetTime(0.0)
         self.station.get_desired_pose_input_port().FixValue(context, START)
@@ -113,43 +116,43 @@ class Bus:
         self.station.start(self.simulator)
         self.has_controller, self._station_step = True, 0
 
-    # What is seen.
+    # Observations.
 
     @property
     def velocities(self) -> np.ndarray:
-        """Of the joints, truly, (7,)."""
+        """True joint velocities, (7,) [rad/s]."""
         plant = self.robot.plant
         return plant.GetVelocities(plant.GetMyContextFromRoot(self.robot_simulator.get_context()))
 
     @property
-    def phase(self) -> ArmState:
-        """What the station does."""
+    def arm_state(self) -> ArmState:
+        """The station's arm state."""
         return ArmState(int(self.station.get_arm_state_output_port().Eval(self.simulator.get_context())[0]))
 
     @property
     def fault(self) -> Fault:
-        """What the station says."""
+        """The station's fault."""
         return Fault(int(self.station.get_fault_output_port().Eval(self.simulator.get_context())[0]))
 
     @property
     def is_detected(self) -> bool:
-        """Whether somebody stops the arm now."""
-        is_stopping = self.has_controller and self.phase in (ArmState.DAMPING, ArmState.OFF)
+        """True if the station or the safety monitor is stopping the arm."""
+        is_stopping = self.has_controller and self.arm_state in (ArmState.DAMPING, ArmState.OFF)
         return (
             is_stopping
             or (self.has_controller and self.fault != Fault.NONE)
-            or self.deputy.state > MonitorState.WATCHING
+            or self.monitor.state > MonitorState.WATCHING
         )
 
-    # How time passes.
+    # Time.
 
     def go(self, seconds: float) -> None:
-        """Both for some time."""
+        """Advance both by some time [s]."""
         for _ in range(round(seconds / PERIOD)):
             self.one()
 
     def one(self) -> None:
-        """One period."""
+        """Advance both by a period."""
         self.step += 1
         if self.has_robot:
             self.robot_time += 1
@@ -169,23 +172,23 @@ class Bus:
             self._send(self.near_robot, IiwaDriver.command_channel, self.on_command(message))
 
     def desired(self) -> np.ndarray:
-        """Where the tool is told to be now: on a circle, turning to and fro."""
+        """Return the desired pose: on a circle, turning to and fro."""
         phase = 2.0 * np.pi * FREQUENCY * self.step * PERIOD
         return START + [RADIUS * np.cos(phase), RADIUS * np.sin(phase), 0.0, TURN * np.sin(phase), 0.0, 0.0]
 
     def _relay_statuses(self, settle: bool = True) -> None:
         statuses, self._statuses[:] = list(self._statuses), []
-        words, self._words[:] = list(self._words), []
+        heartbeats, self._heartbeats[:] = list(self._heartbeats), []
         for message in statuses:
             self._send(self.near_station, IiwaDriver.status_channel, self.on_status(message), settle)
-        # What a deputy says goes the same way as the statuses, and is lost with them.
+        # Heartbeats are relayed like the statuses, and are lost with them.
         if self.has_safety_monitor and self.on_status(b""):
-            self._send(self.near_station, WORDS, words[-1:], settle)
+            self._send(self.near_station, HEARTBEAT_CHANNEL, heartbeats[-1:], settle)
 
     def _send(self, lcm: DrakeLcm, channel: str, messages: list[bytes], settle: bool = True) -> None:
         for message in messages:
             lcm.Publish(channel, message)
-            # A program that is held up hears nothing.
+            # A paused program receives nothing.
             if lcm is self.near_robot or (settle and self.has_controller):
                 self._settle(lcm)
 
@@ -200,64 +203,66 @@ class Bus:
             return
         self.torques.append(np.array(command.joint_torque))
 
-    # What is done about it.
+    # Checks.
 
     def run_in(self, seconds: float = 0.15) -> None:
-        """Until the arm follows."""
+        """Run until the arm follows its command, then for some time [s]."""
         for _ in range(round(3.0 / PERIOD)):
-            if self.phase == ArmState.RUNNING and self.fault == Fault.NONE:
+            if self.arm_state == ArmState.RUNNING and self.fault == Fault.NONE:
                 break
-            if self.phase == ArmState.OFF:
-                with contextlib.suppress(InputError):  # while something is wrong still
+            if self.arm_state == ArmState.OFF:
+                with contextlib.suppress(InputError):  # the fault persists
                     self.station.resume(self.simulator.get_mutable_context())
             self.one()
         else:
-            raise AssertionError(f"the arm does not go on: {self.phase.name}, {self.fault.name}")
+            raise AssertionError(f"the arm does not resume: {self.arm_state.name}, {self.fault.name}")
         self.go(seconds)
 
-    def watch(self, seconds: float, mend: Callable[[], None], lasts: float, standstill: float = STANDSTILL) -> Seen:
-        """What comes of a fault that has just begun.
+    def watch(
+        self, seconds: float, repair: Callable[[], None], duration: float, standstill: float = STANDSTILL
+    ) -> Observation:
+        """Observe the effect of a fault that has just begin.
 
         Args:
-            seconds: to watch.
-            mend: ends the fault.
-            lasts: after how long [s].
-            standstill: what counts as such [rad/s].
+            seconds: Time to observe [s].
+            repair: Function that ends the fault.
+            duration: Duration of the fault [s].
+            standstill: Largest joint speed of an arm at rest [rad/s].
         """
-        seen, begun, self.torques = Seen(), self.step, []
-        is_mended = False
-        while (self.step - begun) * PERIOD < seconds:
-            if not is_mended and (self.step - begun) * PERIOD >= lasts - 1e-9:
-                mend()
-                is_mended = True
+        observation, begin, self.torques = Observation(), self.step, []
+        is_repaired = False
+        while (self.step - begin) * PERIOD < seconds:
+            if not is_repaired and (self.step - begin) * PERIOD >= duration - 1e-9:
+                repair()
+                is_repaired = True
             self.one()
-            now, speed = (self.step - begun) * PERIOD, float(np.abs(self.velocities).max())
-            if seen.detected is None and self.is_detected:
-                seen.detected, seen.fastest = now, speed
-                seen.fault = self.fault.name if self.has_controller else "MONITOR_STOP"
-            # A program that was started anew moves the arm again; one that goes on must be told to.
-            is_anew = (
-                self.has_controller and self.phase in (ArmState.RAMPING, ArmState.RUNNING) and not self.is_detected
+            now, speed = (self.step - begin) * PERIOD, float(np.abs(self.velocities).max())
+            if observation.detected is None and self.is_detected:
+                observation.detected, observation.fastest = now, speed
+                observation.fault = self.fault.name if self.has_controller else "MONITOR_STOP"
+            # A restarted program moves the arm again; one that was stopped has to be resumed.
+            is_moving_again = (
+                self.has_controller and self.arm_state in (ArmState.RAMPING, ArmState.RUNNING) and not self.is_detected
             )
             if (
-                seen.detected is not None
+                observation.detected is not None
                 and self.has_robot
-                and not is_anew
-                and now - seen.detected > STOPPED_WITHIN - 1e-9
+                and not is_moving_again
+                and now - observation.detected > STOPPED_WITHIN - 1e-9
             ):
-                seen.after = max(seen.after, speed)
-        if not is_mended:
-            mend()
+                observation.after = max(observation.after, speed)
+        if not is_repaired:
+            repair()
         for torque in self.torques:
             if len(torque) != len(self.limits) or not (np.abs(torque) <= self.limits + 1e-12).all():
-                seen.wrong.append(f"sent {torque}")
-        if seen.after > standstill:
-            seen.wrong.append(f"{seen.after:.3f} rad/s after {STOPPED_WITHIN} s")
-        return seen
+                observation.wrong.append(f"sent {torque}")
+        if observation.after > standstill:
+            observation.wrong.append(f"{observation.after:.3f} rad/s after {STOPPED_WITHIN} s")
+        return observation
 
 
 def changed(message: bytes, **fields: object) -> bytes:
-    """A status with other values."""
+    """Return a status with other values."""
     status = lcmt_iiwa_status.decode(message)
     for name, value in fields.items():
         setattr(status, name, value)

@@ -1,41 +1,39 @@
-"""A program that moves an arm to and fro over a bus, and goes on after every stop as soon as it may: URL RATE."""
+"""Program that moves an arm on a circle and resumes after every stop as soon as possible: URL RATE."""
 
 import contextlib
 import sys
 
 import numpy as np
-from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.clock import WallClock, set_realtime_priority
+from guiderail.diagrams.hardware.clock import WallClock, garbage_collection_disabled, set_realtime_priority
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.sim_driver import START
-from guiderail.tools.teleop.teleoperator import no_pauses
 
 
 def main(url: str, rate: float) -> None:
-    """Until it is killed."""
-    station = HardwareStation(BncWorkcell(), IiwaDriver(DrakeLcm(url)), robot_timeout=60.0)
-    pace = WallClock(station.lcm, station.driver.status_channel, station.period, rate)
+    """Move the arm until the process is killed."""
+    station = HardwareStation(BncWorkcell(), lcm_url=url, robot_timeout=60.0)
+    clock = WallClock(station.driver, station.period, rate)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
     desired = station.get_desired_pose_input_port()
     desired.FixValue(context, START)
     station.start(simulator)
     set_realtime_priority()
-    pace.begin()
-    with no_pauses():
+    clock.begin()
+    with garbage_collection_disabled():
         while True:
             angle = 2.0 * np.pi * context.get_time()
             side = 0.01 * np.array([np.cos(angle), np.sin(angle)])
             desired.FixValue(context, START + [*side, 0.0, 0.15 * np.sin(angle), 0.0, 0.0])
             if station.get_arm_state_output_port().Eval(context)[0] == ArmState.OFF:
-                with contextlib.suppress(InputError):  # while something is wrong still
+                with contextlib.suppress(InputError):  # the fault persists
                     station.resume(context)
-            pace.advance(simulator, station, 1)
+            clock.advance(simulator, station, 1)
 
 
 if __name__ == "__main__":

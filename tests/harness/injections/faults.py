@@ -1,4 +1,4 @@
-"""What can happen on a bus, each with what has to come of it."""
+"""Faults of a bus and of the programs on it, each with its required effect."""
 
 from __future__ import annotations
 
@@ -17,44 +17,51 @@ from .bus import PERIOD, Bus, changed, passes
 TOLERATED, STOPS = (
     (MAX_MISSED_MESSAGES - 2) * PERIOD,
     (MAX_MISSED_MESSAGES + 2) * PERIOD,
-)  # [s]: shorter is borne, longer stops the arm
+)  # a shorter fault is tolerated, a longer one stops the arm [s]
 JOINT_FIELDS = tuple(lcmt_iiwa_status.__slots__[2:])
 MEASURED = ("joint_position_measured", "joint_velocity_estimated", "joint_torque_external")
 
 
 @dataclass(frozen=True)
 class Injection:
-    """A fault: how it begins and ends, how long it lasts [s], and whether it must stop the arm; None where it may.
+    """Fault that is injected.
 
-    Where it must, `says` is what the station calls it, if that is always the same.
+    Attributes:
+        kind: Name of the kind.
+        description: Parameters of the fault, for messages.
+        begin: Function that begins the fault.
+        end: Function that ends it.
+        duration: Duration [s].
+        stops: Whether it must stop the arm; None if it may.
+        fault: The station's fault, if it is always the same.
     """
 
     kind: str
-    words: str
+    description: str
     begin: Callable[[Bus], None]
     end: Callable[[Bus], None]
-    lasts: float
+    duration: float
     stops: bool | None
-    says: Fault | None = None
+    fault: Fault | None = None
 
-    def inject(self, bus: Bus) -> buses.Seen:
-        """Lets it happen to an arm that is moving, checks what comes of it, and that the arm then goes on."""
+    def inject(self, bus: Bus) -> buses.Observation:
+        """Inject the fault while the arm moves; check its effect, and that the arm can resume."""
         bus.run_in()
         self.begin(bus)
-        standstill = buses.UNSEEN if self.kind.startswith("status") else buses.STANDSTILL
-        seen = bus.watch(self.lasts + 0.35, lambda: self.end(bus), self.lasts, standstill)
-        if self.stops is not None and self.stops != (seen.detected is not None):
-            seen.wrong.append("not detected" if self.stops else f"stopped the arm: {seen.fault}")
-        if self.stops and self.says not in (None, bus.fault):
-            seen.wrong.append(f"is called {bus.fault.name}")
+        standstill = buses.STANDSTILL_WITHOUT_STATUS if self.kind.startswith("status") else buses.STANDSTILL
+        observation = bus.watch(self.duration + 0.35, lambda: self.end(bus), self.duration, standstill)
+        if self.stops is not None and self.stops != (observation.detected is not None):
+            observation.wrong.append("not detected" if self.stops else f"stopped the arm: {observation.fault}")
+        if self.stops and self.fault not in (None, bus.fault):
+            observation.wrong.append(f"reported as {bus.fault.name}")
         try:
             bus.run_in(0.05)
         except AssertionError as error:
-            seen.wrong.append(str(error))
-        return seen
+            observation.wrong.append(str(error))
+        return observation
 
 
-def _mended(bus: Bus) -> None:
+def _repair(bus: Bus) -> None:
     bus.on_status = bus.on_command = passes
 
 
@@ -70,13 +77,13 @@ def _at(where: str, relay: Callable[[bytes], list[bytes]]) -> Callable[[Bus], No
 
 
 def lost(where: str, seconds: float) -> Injection:
-    """Nothing arrives for a while."""
+    """Drop all messages for a while."""
     kind = "status stopped" if where == "on_status" else "commands lost"
-    return Injection(kind, f"{seconds} s", _at(where, lambda m: []), _mended, seconds, _must_stop(seconds))
+    return Injection(kind, f"{seconds} s", _at(where, lambda m: []), _repair, seconds, _must_stop(seconds))
 
 
 def delayed(where: str, seconds: float) -> Injection:
-    """Everything arrives late, for a third of a second."""
+    """Delay all messages, for 0.3 s."""
     name = "status" if where == "on_status" else "commands"
     queue: deque[bytes] = deque()
     steps = round(seconds / PERIOD)
@@ -88,43 +95,45 @@ def delayed(where: str, seconds: float) -> Injection:
         return [queue.popleft()] if len(queue) > steps else []
 
     stops = True if seconds >= STOPS else None
-    return Injection(f"{name} delayed", f"{seconds} s", _at(where, relay), _mended, 0.3, stops)
+    return Injection(f"{name} delayed", f"{seconds} s", _at(where, relay), _repair, 0.3, stops)
 
 
 def reordered(where: str, pairs: int) -> Injection:
-    """The later of two arrives first."""
+    """Swap pairs of messages."""
     name = "status" if where == "on_status" else "commands"
-    kept: list[bytes] = []
+    held: list[bytes] = []
 
     def relay(message: bytes) -> list[bytes]:
         if not message:
             return [message]
-        kept.append(message)
-        if len(kept) < 2:
+        held.append(message)
+        if len(held) < 2:
             return []
-        later, sooner = kept.pop(), kept.pop()
+        later, sooner = held.pop(), held.pop()
         return [later, sooner]
 
-    return Injection(f"{name} reordered", f"{pairs} pairs", _at(where, relay), _mended, 2 * pairs * PERIOD, None)
+    return Injection(f"{name} reordered", f"{pairs} pairs", _at(where, relay), _repair, 2 * pairs * PERIOD, None)
 
 
 def duplicated(where: str, seconds: float) -> Injection:
-    """Everything arrives twice, which is no fault."""
+    """Send all messages twice, which must be tolerated."""
     name = "status" if where == "on_status" else "commands"
-    return Injection(f"{name} duplicated", f"{seconds} s", _at(where, lambda m: [m, m]), _mended, seconds, False)
+    return Injection(f"{name} duplicated", f"{seconds} s", _at(where, lambda m: [m, m]), _repair, seconds, False)
 
 
-def replaced(kind: str, words: str, change: Callable[[bytes], bytes], messages: int) -> Injection:
-    """Statuses come as others than they were sent; the first of them must stop the arm."""
+def replaced(kind: str, description: str, change: Callable[[bytes], bytes], messages: int) -> Injection:
+    """Change statuses; the first changed one must stop the arm."""
 
     def relay(message: bytes) -> list[bytes]:
         return [change(message)] if message else [message]
 
-    return Injection(kind, f"{words}, {messages} times", _at("on_status", relay), _mended, messages * PERIOD, True)
+    return Injection(
+        kind, f"{description}, {messages} times", _at("on_status", relay), _repair, messages * PERIOD, True
+    )
 
 
 def not_finite(field: str, joints: list[int], value: float, messages: int) -> Injection:
-    """Numbers that are none."""
+    """Replace numbers with NaN or infinity."""
 
     def change(message: bytes) -> bytes:
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
@@ -136,7 +145,7 @@ def not_finite(field: str, joints: list[int], value: float, messages: int) -> In
 
 
 def resized(joints: int, messages: int) -> Injection:
-    """Another number of joints."""
+    """Change the number of joints."""
 
     def change(message: bytes) -> bytes:
         return changed(message, num_joints=joints, **{name: [0.0] * joints for name in JOINT_FIELDS})
@@ -145,22 +154,22 @@ def resized(joints: int, messages: int) -> Injection:
 
 
 def garbage(rng: np.random.Generator, messages: int) -> Injection:
-    """Bytes: random ones, the message cut off, or with a flipped byte in its head."""
-    how = int(rng.integers(3))
+    """Replace a message by random bytes, truncate it, or flip a byte of its type."""
+    variant = int(rng.integers(3))
     share, noise = float(rng.uniform(0.0, 0.99)), rng.bytes(int(rng.integers(0, 2000)))
 
     def change(message: bytes) -> bytes:
-        if how == 0:
+        if variant == 0:
             return noise
-        if how == 1:
+        if variant == 1:
             return message[: int(share * len(message))]
         return bytes([message[0] ^ 255]) + message[1:]
 
-    return replaced("status garbage", ("noise", "cut off", "another type")[how], change, messages)
+    return replaced("status garbage", ("noise", "cut off", "another type")[variant], change, messages)
 
 
 def jumped(field: str, joint: int, by: float, messages: int) -> Injection:
-    """A joint is suddenly somewhere else, or much faster."""
+    """Let a joint's position or velocity jump."""
 
     def change(message: bytes) -> bytes:
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
@@ -171,7 +180,7 @@ def jumped(field: str, joint: int, by: float, messages: int) -> Injection:
 
 
 def loaded(joint: int, torque: float) -> Injection:
-    """The surroundings load a joint more than is borne."""
+    """Load a joint with more than its limit."""
 
     def change(message: bytes) -> bytes:
         values = list(lcmt_iiwa_status.decode(message).joint_torque_external)
@@ -182,7 +191,7 @@ def loaded(joint: int, torque: float) -> Injection:
 
 
 def clock_jump(seconds: float) -> Injection:
-    """The robot's clock is set, and stays so."""
+    """Set the robot's clock; the end of the fault sets it back, which is another jump."""
 
     def relay(message: bytes) -> list[bytes]:
         if not message:
@@ -190,12 +199,11 @@ def clock_jump(seconds: float) -> Injection:
         return [changed(message, utime=lcmt_iiwa_status.decode(message).utime + round(seconds * 1e6))]
 
     stops = True if abs(seconds) >= STOPS else None
-    # That the clock is set back again is another jump.
-    return Injection("clock jump", f"{seconds} s", _at("on_status", relay), _mended, 0.3, stops)
+    return Injection("clock jump", f"{seconds} s", _at("on_status", relay), _repair, 0.3, stops)
 
 
 def controller_held_up(seconds: float) -> Injection:
-    """The program that commands doesn't run for a while."""
+    """Pause the commanding program."""
 
     def begin(bus: Bus) -> None:
         bus.has_controller = False
@@ -209,7 +217,7 @@ def controller_held_up(seconds: float) -> Injection:
 
 
 def controller_killed(seconds: float) -> Injection:
-    """It is killed, and another one started."""
+    """Kill the commanding program, and start it again."""
 
     def begin(bus: Bus) -> None:
         bus.has_controller = False
@@ -218,7 +226,7 @@ def controller_killed(seconds: float) -> Injection:
 
 
 def robot_killed(seconds: float) -> Injection:
-    """The robot is gone, and comes back with a clock that begins at zero."""
+    """Kill the robot, and start it again with its clock at zero."""
 
     def begin(bus: Bus) -> None:
         bus.has_robot = False
@@ -226,8 +234,8 @@ def robot_killed(seconds: float) -> Injection:
     return Injection("robot killed", f"back after {seconds} s", begin, Bus.start_robot, seconds, True)
 
 
-def deputy_killed(seconds: float) -> Injection:
-    """Nobody stands by any more."""
+def monitor_killed(seconds: float) -> Injection:
+    """Kill the safety monitor, and start it again."""
 
     def begin(bus: Bus) -> None:
         bus.has_safety_monitor = False
@@ -235,11 +243,11 @@ def deputy_killed(seconds: float) -> Injection:
     def end(bus: Bus) -> None:
         bus.has_safety_monitor = True
 
-    return Injection("deputy killed", f"back after {seconds} s", begin, end, seconds, True)
+    return Injection("monitor killed", f"back after {seconds} s", begin, end, seconds, True)
 
 
 def all_kinds(rng: np.random.Generator) -> Iterator[Injection]:
-    """One of each kind, drawn; as many rounds as one wants."""
+    """Yield one injection of each kind with random parameters."""
 
     def duration(longest: float = 5.0) -> float:
         return round(float(np.exp(rng.uniform(np.log(0.01), np.log(longest)))) / PERIOD) * PERIOD
@@ -267,4 +275,4 @@ def all_kinds(rng: np.random.Generator) -> Iterator[Injection]:
     yield controller_held_up(duration(2.0))
     yield controller_killed(duration(1.0) + STOPS)
     yield robot_killed(duration(1.0) + STOPS)
-    yield deputy_killed(duration(1.0) + 2.0 * STOPS)
+    yield monitor_killed(duration(1.0) + 2.0 * STOPS)

@@ -1,32 +1,33 @@
-"""A simulated robot, its deputy and whoever drives it, stepped in turn in one process."""
+"""A simulated robot, its safety monitor and a hardware station, stepped in turn in one process."""
 
-from guiderail.diagrams.hardware.monitor import SafetyMonitor
 from guiderail.diagrams.hardware.driver import safety_limits
 from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
 from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
+from guiderail.diagrams.hardware.monitor import SafetyMonitor
 
 
 class Together:
-    """A pace: steps both in turn; at some step something may happen.
+    """Clock that steps a simulated robot and a station in turn.
 
     Attributes:
-        clock: on the wall [s], where the station is told the time; it passes as the robot's does, and whatever else
-            takes time adds to it.
+        happens: Functions to call by the step.
+        is_silent: True while the robot is not stepped.
+        clock: Wall clock time [s] of the station; None to leave it without one.
     """
 
     clock: float | None = None
 
-    def __init__(self, workcell, lcm, start, deputy=True):
+    def __init__(self, workcell, lcm, start, has_monitor=True):
         self.robot = SimulatedIiwa(workcell, lcm)
         plant = self.robot.controller_plant.plant
-        if deputy:
-            self.deputy = SafetyMonitor(IiwaDriver(lcm), plant, safety_limits(plant, IiwaDriver))
+        if has_monitor:
+            self.monitor = SafetyMonitor(IiwaDriver(lcm), plant, safety_limits(plant, IiwaDriver))
         self.simulator = self.robot.simulator()
         self.robot.set_pose(self.simulator.get_mutable_context(), start)
         self.simulator.Initialize()
         self.step, self.happens, self.is_silent = 0, {}, False
 
-    def on_episode_start(self):
+    def begin(self):
         pass
 
     def advance(self, simulator, station, steps):
@@ -38,6 +39,11 @@ class Together:
                 self.simulator.AdvanceTo(self.step * IiwaDriver.period)
             if self.clock is not None:
                 self.clock += IiwaDriver.period
-                simulator.AdvancePendingEvents()
-                station.receive(simulator.get_mutable_context(), self.clock)
-            simulator.AdvanceTo(start + (step + 1) * IiwaDriver.period)
+            advance(simulator, station, start + (step + 1) * IiwaDriver.period, self.clock)
+
+
+def advance(simulator, station, time, clock=None):
+    """Advance a hardware station to `time` [s] with the newest status, as a clock does."""
+    simulator.AdvancePendingEvents()
+    station.receive(simulator.get_mutable_context(), clock)
+    simulator.AdvanceTo(time)

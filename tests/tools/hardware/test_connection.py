@@ -1,4 +1,4 @@
-"""Whoever stands in for a robot knows the task that is rehearsed."""
+"""The simulated driver imports the modules of the run."""
 
 from contextlib import contextmanager
 
@@ -11,7 +11,7 @@ from guiderail.tools.cli.main import main
 from guiderail.tools.hardware.connection import RobotConnection
 
 MINE = """
-from guiderail.diagrams.tasks.bnc_connector import BncConnector
+from guiderail.diagrams.tasks.bnc_connector.task import BncConnector
 from guiderail.diagrams.tasks.registry import register_task
 
 
@@ -21,9 +21,9 @@ class Mine(BncConnector):
 """
 
 
-def test_a_simulated_robot_imports_what_the_run_does(tmp_path, monkeypatch):
+def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
     file, codes, served = tmp_path / "mine.py", [], []
-    TASKS.get("BncConnector")  # a task that first came into a copy of the list would be gone with it
+    TASKS.get("BncConnector")  # loaded before the registry's entries are copied below
     file.write_text(MINE)
 
     @contextmanager
@@ -31,30 +31,30 @@ def test_a_simulated_robot_imports_what_the_run_does(tmp_path, monkeypatch):
         codes.append(code)
         yield
 
-    def serve(url, seconds, command_timeout, task, **more):
+    def run_sim_driver(url, seconds, command_timeout, task, **options):
         served.append(type(EnvConfig.resolve(task, {}).make_task()).__name__)
         return True
 
-    def wait(url, robot, task, say):
-        serve(url, 0.0, 0.0, task)
+    def run_safety_monitor(url, robot, task, log):
+        run_sim_driver(url, 0.0, 0.0, task)
 
-    monkeypatch.setattr("guiderail.tools.hardware.connection.companion", subprocess_tied_to_parent)
-    monkeypatch.setattr("guiderail.tools.hardware.sim_driver.serve_iiwa", serve)
-    monkeypatch.setattr("guiderail.tools.hardware.safety_monitor.stand_by", wait)
-    with RobotConnection(sim=True).standing_in("mine/Connector", "memq://", [str(file)]):
+    monkeypatch.setattr("guiderail.tools.hardware.connection.subprocess_tied_to_parent", subprocess_tied_to_parent)
+    monkeypatch.setattr("guiderail.tools.hardware.sim_driver.run_sim_driver", run_sim_driver)
+    monkeypatch.setattr("guiderail.tools.hardware.sim_driver.run_safety_monitor", run_safety_monitor)
+    with RobotConnection(sim=True).simulated_driver("mine/Connector", "memq://", [str(file)]):
         pass
     try:
-        for run in (
-            lambda: exec(codes[0], {}),
-            lambda: main(["safety-monitor", "--task", "mine/Connector", "--import", str(file)]),
-        ):
+        for command in (["sim-driver"], ["safety-monitor"], None):
             monkeypatch.setattr(TASKS, "_entries", {**TASKS._entries})
             monkeypatch.setattr("guiderail.tools.environments._IMPORTED", {})
-            TASKS._entries.pop("mine/Connector", None)  # it is another process
+            TASKS._entries.pop("mine/Connector", None)  # as in another process
+            if command is None:
+                exec(codes[0], {})
+                continue
             with pytest.raises(SystemExit) as end:
-                run()
+                main([*command, "--task", "mine/Connector", "--import", str(file)])
             assert end.value.code == 0
     finally:
         gymnasium.registry.pop(environment_id("mine/Connector"), None)
         TASKS._entries.pop("mine/Connector", None)
-    assert served == ["Mine", "Mine"]
+    assert served == ["Mine", "Mine", "Mine"]

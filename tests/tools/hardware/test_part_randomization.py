@@ -1,4 +1,4 @@
-"""A simulated robot's parts are put where a simulation's reset would put them."""
+"""Offsets of the parts in front of a simulated driver are those of a reset in simulation."""
 
 import numpy as np
 from pydrake.lcm import DrakeLcm
@@ -7,25 +7,25 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
 from guiderail.diagrams.hardware.lcm.simulated import SimulatedIiwa
-from guiderail.tools.hardware.part_randomization import PartRandomizer, put
+from guiderail.tools.hardware.part_randomization import PartRandomizer, subscribe_part_offsets
 
 SEED = 30
 
 
-def test_the_same_seed_puts_them_where_a_simulations_resets_do():
+def test_offsets_equal_those_of_simulation_for_the_same_seed():
     task = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
     lcm = DrakeLcm("memq://")
     robot = SimulatedIiwa(task.workcell(), lcm)
     context = robot.CreateDefaultContext()
-    put(lcm, IiwaDriver, task, robot, context)
-    places, rng = PartRandomizer(task, lcm, IiwaDriver, SEED), np.random.default_rng(7)
+    subscribe_part_offsets(lcm, task, robot, context)
+    randomize, rng = PartRandomizer(task, IiwaDriver(lcm), SEED), np.random.default_rng(7)
     simulated = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
     simulated.offsets.draw(np.random.default_rng(SEED), validate_options(simulated.Reset, {}, "a reset"))
     others, jacks = np.random.default_rng(7), []
     plant = robot.plant
     own = plant.GetMyContextFromRoot(context)
     for options in ({}, {"held_out": True}):
-        drawn = places(rng, options)
+        drawn = randomize(rng, options)
         lcm.HandleSubscriptions(0)
         expected = simulated.offsets.draw(others, validate_options(simulated.Reset, options, "a reset"))
         np.testing.assert_array_equal(drawn["jack_offset"], expected[0])

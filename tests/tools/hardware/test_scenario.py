@@ -26,26 +26,26 @@ def written(tmp_path):
     return written
 
 
-def test_one_word_switches_between_a_simulated_robot_and_a_real_one(written):
+def test_scenario_selects_simulated_or_real_robot(written):
     simulated, real = (
-        RobotConnection.in_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
+        RobotConnection.from_scenario(written(f"station: {word}\n{BUS}{DRIVER}")) for word in ("simulation", "hardware")
     )
     assert (simulated.sim, real.sim) == (True, False)
     assert (simulated.robot, real.robot) == ("iiwa14", "iiwa14")
-    assert real.environment("hardware")["lcm_url"] == "udpm://239.255.76.67:7668?ttl=0"
-    # A rehearsal never speaks where a driver may listen.
-    assert simulated.environment("hardware")["lcm_url"] != real.environment("hardware")["lcm_url"]
+    assert real.environment_options("hardware")["lcm_url"] == "udpm://239.255.76.67:7668?ttl=0"
+    # No real driver may receive the messages of a simulated one.
+    assert simulated.environment_options("hardware")["lcm_url"] != real.environment_options("hardware")["lcm_url"]
     with pytest.raises(InputError, match="a bus of its own"):
         RobotConnection(sim=True, lcm_url="udpm://239.255.76.67:7667")
-    assert RobotConnection.in_scenario(None, robot="panda").robot == "panda"
+    assert RobotConnection.from_scenario(None, robot="panda").robot == "panda"
     assert (
-        RobotConnection.in_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot
+        RobotConnection.from_scenario(written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")).robot
         == "panda"
     )
 
 
-def test_the_shipped_one_is_a_rehearsal():
-    assert RobotConnection.in_scenario(SHIPPED).sim
+def test_shipped_scenario_has_a_simulated_driver():
+    assert RobotConnection.from_scenario(SHIPPED).sim
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_the_shipped_one_is_a_rehearsal():
         (BUS + OF_BUS % "desired_kp_gains: [1, 2]", "desired_kp_gains"),
     ],
 )
-def test_refuses_in_a_sentence(written, text, words):
+def test_load_raises_one_sentence_when_invalid(written, text, words):
     with pytest.raises(InputError, match=words) as refused:
         load_scenario(written(text))
     assert "\n" not in str(refused.value)
@@ -73,24 +73,24 @@ def test_refuses_in_a_sentence(written, text, words):
     ("given", "words"),
     [({"robot": "panda"}, "--robot panda"), ({"lcm_url": "udpm://239.255.76.67:7777?ttl=0"}, "--lcm-url udpm")],
 )
-def test_another_robot_or_bus_than_the_files_is_refused(written, given, words):
+def test_connection_raises_when_options_contradict_the_file(written, given, words):
     file = written(f"station: hardware\n{BUS}{DRIVER}")
     with pytest.raises(InputError, match=words):
-        RobotConnection.in_scenario(file, **given)
-    same = RobotConnection.in_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
-    assert same == RobotConnection.in_scenario(file)
+        RobotConnection.from_scenario(file, **given)
+    same = RobotConnection.from_scenario(file, robot="iiwa14", lcm_url="udpm://239.255.76.67:7668?ttl=0")
+    assert same == RobotConnection.from_scenario(file)
 
 
-def test_a_robot_is_the_scenarios_unless_another_one_is_named(written, capsys):
+def test_deploy_uses_robot_of_scenario_and_refuses_another(written, capsys):
     file = written("station: hardware\nmodel_drivers: {panda: !PandaDriver {}}\n")
     for more, words in (([], "not a run"), (["--robot", "iiwa14"], "--robot iiwa14")):
         with pytest.raises(SystemExit) as end:
-            main(["run", str(file.parent), "--scenario", str(file), *more])
+            main(["deploy", str(file.parent), "--scenario", str(file), *more])
         assert end.value.code == 2
         assert words in capsys.readouterr().err
 
 
-def test_directives_say_what_stands_around_a_simulated_robot(written, tmp_path):
+def test_directives_add_surroundings_to_simulated_robot(written, tmp_path):
     box = tmp_path / "box.sdf"
     box.write_text(
         "<sdf version='1.9'><model name='box'><link name='box'><collision name='c'><geometry><box><size>1 1 1</size>"

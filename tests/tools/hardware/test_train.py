@@ -1,7 +1,6 @@
 """Learning on a robot: episodes as motions, both sides of the bus in one process."""
 
 from contextlib import contextmanager
-from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -22,49 +21,57 @@ from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.evaluate import evaluate_on_robot
+from guiderail.tools.hardware.operator import OperatorKeys
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import RobotSession, robot_session
 from guiderail.tools.hardware.sim_driver import START
-from guiderail.tools.hardware.slow_motion import CRAWL
-from guiderail.tools.hardware.train import _learn, train_on_robot
+from guiderail.tools.hardware.slow_motion import SPEED
+from guiderail.tools.hardware.train import _train, train_on_robot
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.teleop.teleoperator import Keys
 
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "fixture_offset": "none", "reward": "shaped", "action_repeat": 5}
 
 
 def make(patch, start, **options):
-    """An environment; `env.pace` is its robot, `env.asked` what go_on was told."""
+    """Return an environment; `env.clock` has its robot, `env.asked` the reasons that were to be confirmed."""
     lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
     patch.setattr(declared, "num_steps", 10)
     with patch.context() as bus:
-        bus.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
+        bus.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", lambda url: lcm)
         station = make_station(declared)
     task = build_task_diagram(declared, station, make_guidance(declared, station))
-    pace, keys, asked = Together(declared.workcell(), lcm, start), Keys(), []
+    clock, keys, asked = Together(declared.workcell(), lcm, start), OperatorKeys(), []
     begin = declared.start_pose(np.random.default_rng(0))
-    elsewhere = station.alike(declared.workcell())
+    transfer_station = station.clone(declared.workcell())
     env = RobotEnv(
-        task, station, elsewhere, begin, pace, action_repeat=5, keys=keys, go_on=asked.append, say=lambda words: None
+        task,
+        station,
+        transfer_station,
+        begin,
+        clock,
+        action_repeat=5,
+        keys=keys,
+        confirm_resume=asked.append,
+        log=lambda text: None,
     )
-    env.pace, env.keys, env.asked, env.begin = pace, keys, asked, begin
+    env.clock, env.keys, env.asked, env.begin = clock, keys, asked, begin
     return env
 
 
 @pytest.fixture(scope="module")
 def shared():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("guiderail.tools.hardware.slow_motion.SETTLE", 0.1)
+        patch.setattr("guiderail.tools.hardware.slow_motion.SETTLING_TIME", 0.1)
         env = make(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
         yield env
 
 
 @pytest.fixture
 def env(shared):
-    shared._try(lambda: None)  # the test before may have left the arm at rest
+    shared._retry_until_ok(lambda: None)  # the test before may have left the arm at rest
     shared.asked.clear()
-    shared.keys.take_back()
+    shared.keys.clear_stop()
     return shared
 
 
@@ -73,7 +80,7 @@ def still(observation):
 
 
 def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
-    assert all(check.is_well for check in env.checks())
+    assert all(check.passed for check in env.preflight.run())
     for index in range(2):
         row = rollout(env, still, index=index)
         assert (row["termination"], row["steps"], env.asked) == ("time_limit", 10, [])
@@ -85,34 +92,37 @@ def test_a_reset_is_a_motion_and_an_episode_what_it_is_elsewhere(env):
 
 
 def test_in_a_rehearsal_a_reset_draws_what_a_simulations_does(env, monkeypatch):
-    monkeypatch.setattr(env, "_places", lambda rng, options: {"drawn": (float(rng.random()), options)})
+    monkeypatch.setattr(env, "_randomize_parts", lambda rng, options: {"drawn": (float(rng.random()), options)})
     _, info = env.reset(seed=3, options={"held_out": True})
     assert info["drawn"] == (float(np.random.default_rng(3).random()), {"held_out": True})
 
 
 def test_episodes_one_after_the_other_leave_a_row_each(env, monkeypatch, tmp_path):
     @contextmanager
-    def there(config, other, *, yes, say):
+    def fake_session(config, connection, *, assume_yes, log):
         assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
         yield RobotSession(env, dict)
 
-    monkeypatch.setattr("guiderail.tools.hardware.evaluate.robot_session", there)
+    monkeypatch.setattr("guiderail.tools.hardware.evaluate.robot_session", fake_session)
     learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
     RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
-    env.keys.wants_pause = True
-    found = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", acting=lambda env: still)
+    env.keys.is_pause_requested = True
+    found = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still)
     assert (found["episodes"], found["success_rate"]) == (2, 0.0)
-    assert (env.asked, env.keys.wants_pause) == (["stop requested by the user"], False)  # after the first, and once
+    assert (env.asked, env.keys.is_pause_requested) == (
+        ["stop requested by the user"],
+        False,
+    )  # after the first, and once
     rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
     assert rows["termination"].tolist() == ["time_limit"] * 2
     with pytest.raises(InputError, match="already exists"):
-        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", acting=lambda env: still)
+        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still)
     with pytest.raises(InputError, match="at least one"):
         evaluate_on_robot(tmp_path, RobotConnection(), 0)
     # Two at once, neither of which has a row yet: nobody replaces the other's.
     elsewhere = tmp_path / "elsewhere"
     with RunFolder(elsewhere).locked(), pytest.raises(InputError, match="another process"):
-        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", acting=lambda env: still, out=elsewhere)
+        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still, out=elsewhere)
     assert not list(elsewhere.glob("*.csv"))
 
 
@@ -130,22 +140,22 @@ def test_what_was_recorded_and_learned_outlasts_an_early_end(env, monkeypatch, t
 
     monkeypatch.setattr(env, "idle", refuse)
     with pytest.raises(InputError, match="not confirmed"):
-        _learn(folder, config, env, waits=True, report=lambda row: None)
+        _train(folder, config, env, waits=True, report=lambda row: None)
     assert "policy.json" not in before[-1]
     assert folder.episodes()["termination"].tolist() == ["time_limit"] * 2
     assert len(read_step_log(folder.steps)) == 20
     assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
-    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.USER_STOP  # at rest
+    assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP  # at rest
 
 
 def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
     env.reset()
     env.step(np.zeros(2))
-    env.keys.press()
+    env.keys.request_stop()
     _, _, _, truncated, info = env.step(np.zeros(2))
     assert (truncated, info["termination"], info["stopped"]) == (True, "stopped", "stop requested by the user")
-    velocities = env.pace.robot.plant.GetVelocities(
-        env.pace.robot.plant.GetMyContextFromRoot(env.pace.simulator.get_context())
+    velocities = env.clock.robot.plant.GetVelocities(
+        env.clock.robot.plant.GetMyContextFromRoot(env.clock.simulator.get_context())
     )
     assert np.abs(velocities).max() < 0.01
     assert env.asked == []
@@ -154,14 +164,16 @@ def test_a_person_cuts_an_episode_short_and_lets_the_arm_go_on(env):
 
 
 def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decision_that_was_cut(monkeypatch):
-    monkeypatch.setattr("guiderail.tools.hardware.slow_motion.SETTLE", 0.1)
+    monkeypatch.setattr("guiderail.tools.hardware.slow_motion.SETTLING_TIME", 0.1)
     env = make(monkeypatch, START, guidance="residual", bound=0.0005)
     decisions = []
 
     def act(observation):
         decisions.append(observation)
         if len(decisions) == 2:
-            env.pace.happens = {env.pace.step + 16: env.keys.press}  # in the decision's fourth of five control steps
+            env.clock.happens = {
+                env.clock.step + 16: env.keys.request_stop
+            }  # in the decision's fourth of five control steps
         return np.full(2, len(decisions) - 1.0)
 
     infos = []
@@ -183,34 +195,34 @@ def test_the_row_of_an_episode_that_was_cut_short_has_the_commands_of_the_decisi
 def ready(monkeypatch):
     """An arm that waits for `robot_session`, which is told to begin; and what a person is asked."""
     lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
-    pace, asked = Together(declared.workcell(), lcm, START), []
+    clock, asked = Together(declared.workcell(), lcm, START), []
 
     @contextmanager
-    def nobody(other, *where):
+    def no_process(connection, *arguments):
         yield
 
-    monkeypatch.setattr("guiderail.diagrams.hardware.station.open_bus", lambda url: lcm)
-    monkeypatch.setattr(RobotConnection, "standing_in", nobody)
-    monkeypatch.setattr(RobotConnection, "paces", lambda other, station: (pace, None))
+    monkeypatch.setattr("guiderail.diagrams.hardware.lcm.driver.open_bus", lambda url: lcm)
+    monkeypatch.setattr(RobotConnection, "simulated_driver", no_process)
+    monkeypatch.setattr(RobotConnection, "clocks", lambda connection, station: (clock, None))
     monkeypatch.setattr("guiderail.tools.hardware.session.set_realtime_priority", lambda: True)
     monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", asked.append)
     config = configure("BncConnector", OPTIONS, seed=0, episodes=1)
-    return pace, asked, lambda: robot_session(config, RobotConnection(), yes=False, say=lambda words: None)
+    return clock, asked, lambda: robot_session(config, RobotConnection(), assume_yes=False, log=lambda text: None)
 
 
-@pytest.mark.parametrize("name", ["start", "deputy", "commands"])
+@pytest.mark.parametrize("name", ["start", "monitor", "commands"])
 def test_what_changes_while_the_person_thinks_is_seen_before_the_arm_moves(ready, monkeypatch, name):
-    pace, _, begin = ready
-    lcm = pace.deputy._lcm
+    clock, _, begin = ready
+    driver = clock.monitor._driver
 
     def change(question):
         if name == "start":
             pose = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
-            pace.robot.set_pose(pace.simulator.get_mutable_context(), pose)
-        elif name == "deputy":
-            monkeypatch.setattr(pace.deputy, "_driver", replace(IiwaDriver, command_channel="ANOTHER"))
+            clock.robot.set_pose(clock.simulator.get_mutable_context(), pose)
+        elif name == "monitor":
+            monkeypatch.setattr(driver, "write_heartbeat", lambda heartbeat: None)
         else:
-            lcm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(1.0, np.zeros(7)))
+            driver.write(np.zeros(7), 1.0)
 
     monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", change)
     with pytest.raises(InputError, match=f"stays where it is: {name}"), begin():
@@ -219,12 +231,12 @@ def test_what_changes_while_the_person_thinks_is_seen_before_the_arm_moves(ready
 
 def test_time_in_which_nobody_moves_the_arm_is_no_gap_between_its_statuses(ready, monkeypatch):
     """Of the person who reads, and of whatever is made before the first reset."""
-    pace, asked, begin = ready
+    clock, asked, begin = ready
     with begin() as robot:
-        assert (len(asked), robot.env._heard.count) == (1, 0)  # nothing was sent yet
-        begun, step = [], pace.step
-        monkeypatch.setattr(pace, "begin", lambda: begun.append(pace.step))
-        robot.env._take_over()
+        assert (len(asked), robot.env._task_station.driver.num_foreign_commands) == (1, 0)  # nothing was sent yet
+        begun, step = [], clock.step
+        monkeypatch.setattr(clock, "begin", lambda: begun.append(clock.step))
+        robot.env._take_control()
         assert begun == [step]
 
 
@@ -232,30 +244,30 @@ def test_an_arm_that_somebody_else_commands_is_left_alone(monkeypatch):
     env = make(monkeypatch, START)
 
     def check():
-        return {one.name: one.is_well for one in env.checks()}["commands"]
+        return {one.name: one.passed for one in env.preflight.run()}["commands"]
 
     assert check()
-    env._elsewhere.lcm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(1.0, np.zeros(7)))
-    env._pass(1)
+    IiwaDriver(env._transfer_station.driver.lcm).write(np.zeros(7), 1.0)
+    env._advance_statuses(1)
     assert not check()
 
 
 def test_a_person_may_take_as_long_as_they_like_to_let_the_arm_go_on(monkeypatch):
     """What is judged then is a status of now: not one from before the question, nor that nobody listened meanwhile."""
     env = make(monkeypatch, START)
-    env.pace.clock = 100.0
+    env.clock.clock = 100.0
 
     def think(words):
         env.asked.append(words)
-        env.pace.clock += 60.0
+        env.clock.clock += 60.0
 
-    env._go_on = think
+    env._confirm_resume = think
     env.reset()
-    env.keys.press()
+    env.keys.request_stop()
     env.step(np.zeros(2))
     env.reset()
     assert env.asked == ["stop requested by the user"]
-    assert env._acting.get_arm_state_output_port().Eval(env._mine)[0] == ArmState.RUNNING
+    assert env._station.get_arm_state_output_port().Eval(env._context)[0] == ArmState.RUNNING
 
 
 def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypatch):
@@ -263,10 +275,10 @@ def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypa
     env = make(monkeypatch, START)
     env.reset()
     env.step(np.zeros(2))
-    env.keys.press()
+    env.keys.request_stop()
     env.step(np.zeros(2))
-    context = env.pace.simulator.get_mutable_context()
-    env.pace.robot.set_pose(context, env.pose + [0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
+    context = env.clock.simulator.get_mutable_context()
+    env.clock.robot.set_pose(context, env.pose + [0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
     places, advance = [], env._advance
 
     def watched():
@@ -276,7 +288,7 @@ def test_an_arm_that_was_moved_by_hand_comes_back_to_its_way_at_a_crawl(monkeypa
     monkeypatch.setattr(env, "_advance", watched)
     env.reset()
     speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / env.task.control_period
-    assert speeds.max() < 2.0 * CRAWL
+    assert speeds.max() < 2.0 * SPEED
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
@@ -290,19 +302,19 @@ def test_what_is_raised_in_the_midst_of_a_step_leaves_an_arm_that_can_be_brought
     with pytest.raises(KeyboardInterrupt):
         env.step(np.ones(2))
     env.rest()
-    assert env._acting.get_fault_output_port().Eval(env._mine)[0] == Fault.USER_STOP
-    plant = env.pace.robot.plant
-    velocities = plant.GetVelocities(plant.GetMyContextFromRoot(env.pace.simulator.get_context()))
+    assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP
+    plant = env.clock.robot.plant
+    velocities = plant.GetVelocities(plant.GetMyContextFromRoot(env.clock.simulator.get_context()))
     assert np.abs(velocities).max() < 0.01
 
 
 def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(env):
     env.reset()
     env.step(np.zeros(2))
-    step = env.pace.step
-    env.pace.happens = {
-        step + 3: lambda: setattr(env.pace, "is_silent", True),
-        step + 30: lambda: setattr(env.pace, "is_silent", False),
+    step = env.clock.step
+    env.clock.happens = {
+        step + 3: lambda: setattr(env.clock, "is_silent", True),
+        step + 30: lambda: setattr(env.clock, "is_silent", False),
     }
     _, _, terminated, truncated, info = env.step(np.zeros(2))
     assert (terminated, truncated, info["termination"], info["is_success"]) == (False, True, "stopped", False)
@@ -316,7 +328,7 @@ def test_a_fault_ends_an_episode_and_the_next_one_begins_from_where_the_arm_is(e
 
 
 def test_what_stops_a_reset_stops_no_more_than_that(env):
-    env.pace.happens = {env.pace.step + 20: env.keys.press}
+    env.clock.happens = {env.clock.step + 20: env.keys.request_stop}
     env.reset()
     assert env.asked == ["stop requested by the user"]
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
@@ -324,13 +336,16 @@ def test_what_stops_a_reset_stops_no_more_than_that(env):
 
 def test_a_success_is_believed_where_the_workpiece_holds_against_a_pull(env, monkeypatch):
     for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
-        one._try(one._take_over)
-        assert one._holds() == holds
+        one._retry_until_ok(one._take_control)
+        assert one._resists_pull() == holds
 
 
 @pytest.mark.parametrize(
     ("task", "options", "words"),
-    [("GridClamp", {}, "nobody wrote down"), ("BncConnector", {"reward": "aligned"}, "a simulation alone knows")],
+    [
+        ("GridClamp", {}, "has no success that a robot can observe"),
+        ("BncConnector", {"reward": "aligned"}, "needs simulation state"),
+    ],
 )
 def test_refuses_what_a_robot_cannot_tell(task, options, words, tmp_path):
     with pytest.raises(InputError, match=words):

@@ -1,4 +1,4 @@
-"""One of each kind of fault on the bus; `make injections` draws hundreds."""
+"""One fault of the bus of each kind; `make injections` injects hundreds."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ INJECTIONS = [
     faults.controller_killed(0.06),
     faults.robot_killed(0.05),
     faults.robot_killed(0.1),
-    faults.deputy_killed(0.1),
+    faults.monitor_killed(0.1),
 ]
 
 
@@ -37,17 +37,18 @@ def bus():
     return Bus()
 
 
-@pytest.mark.parametrize("injection", INJECTIONS, ids=lambda injection: f"{injection.kind}, {injection.words}")
-def test_stops_in_time_within_the_limits_and_goes_on(bus, injection):
-    seen = injection.inject(bus)
-    assert seen.wrong == []
+@pytest.mark.parametrize("injection", INJECTIONS, ids=lambda injection: f"{injection.kind}, {injection.description}")
+def test_station_stops_in_time_and_resumes(bus, injection):
+    observation = injection.inject(bus)
+    assert observation.wrong == []
 
 
-def test_a_fault_that_nobody_finds_would_be_found_here(bus):
-    """What must stop the arm and is borne, and the other way round, is said to be wrong."""
-    borne = faults.duplicated(STATUS, 0.02)
-    must = faults.Injection(borne.kind, borne.words, borne.begin, borne.end, borne.lasts, True)
+def test_injection_reports_a_missed_or_needless_stop(bus):
+    tolerated = faults.duplicated(STATUS, 0.02)
+    must = faults.Injection(
+        tolerated.kind, tolerated.description, tolerated.begin, tolerated.end, tolerated.duration, True
+    )
     assert must.inject(bus).wrong == ["not detected"]
     stopped = faults.resized(3, 1)
-    may_not = faults.Injection(stopped.kind, stopped.words, stopped.begin, stopped.end, stopped.lasts, False)
+    may_not = faults.Injection(stopped.kind, stopped.description, stopped.begin, stopped.end, stopped.duration, False)
     assert may_not.inject(bus).wrong == ["stopped the arm: WRONG_SIZE"]

@@ -1,0 +1,22 @@
+import pytest
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.hardware.clock import WallClock
+from guiderail.diagrams.hardware.lcm import driver as lcm_driver
+from guiderail.diagrams.hardware.lcm.driver import IiwaDriver
+from guiderail.diagrams.hardware.lcm.simulated import LockstepClock, serve_in_lockstep, serve_in_real_time
+from guiderail.models.common.errors import InputError
+
+
+def test_where_a_handler_would_end_the_process_nobody_listens(monkeypatch):
+    monkeypatch.setattr(lcm_driver, "handlers_are_safe", lambda: False)
+    lcm = DrakeLcm("memq://")
+    driver = IiwaDriver(lcm)
+    for begin in (
+        lambda: WallClock(driver),
+        lambda: LockstepClock(driver, 0.01),
+        lambda: serve_in_real_time(None, 0.0, lambda: None),
+        lambda: serve_in_lockstep(None, lcm, lcm, 0.0, 0.0),
+    ):
+        with pytest.raises(InputError, match="interpreter's lock"):
+            begin()

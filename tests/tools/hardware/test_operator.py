@@ -1,0 +1,74 @@
+import gc
+import io
+import os
+import pty
+import signal
+import sys
+from unittest.mock import Mock
+
+import pytest
+
+from guiderail.diagrams.hardware.clock import garbage_collection_disabled
+from guiderail.models.common.errors import InputError
+from guiderail.tools.hardware.operator import OperatorKeys, confirm, operator_keys
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """Yield a function that types at a terminal."""
+    keyboard, screen = pty.openpty()
+    with os.fdopen(screen, "r") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        yield lambda words: os.write(keyboard, words)
+    os.close(keyboard)
+
+
+def test_keys_stop_by_enter_and_pause_by_p(terminal):
+    keys = OperatorKeys()
+    assert not keys.is_stop_requested()
+    terminal(b"p\n")
+    assert (keys.is_stop_requested(), keys.is_pause_requested) == (False, True)
+    terminal(b"\n")
+    assert keys.is_stop_requested()
+    assert keys.is_stop_requested()
+    keys.clear_stop()
+    assert not keys.is_stop_requested()
+
+
+def test_describe_omits_enter_when_input_is_a_pipe(terminal, monkeypatch):
+    assert OperatorKeys().describe() == "Enter or Ctrl-C stops the arm"
+    assert "p and Enter pauses" in OperatorKeys().describe(has_pauses=True)
+    monkeypatch.setattr(sys, "stdin", io.StringIO("\n"))  # a pipe, whose input stops nothing
+    keys = OperatorKeys()
+    assert not keys.is_stop_requested()
+    assert keys.describe(has_pauses=True) == "Ctrl-C stops the arm"
+
+
+def test_ctrl_c_stops_the_arm_then_the_process():
+    before = signal.getsignal(signal.SIGINT)
+    with operator_keys() as keys:
+        signal.raise_signal(signal.SIGINT)
+        assert keys.is_stop_requested()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_garbage_collection_is_off_within_the_block():
+    with garbage_collection_disabled():
+        assert not gc.isenabled()
+    assert gc.isenabled()
+
+
+def test_confirm_raises_without_a_yes_at_a_terminal(monkeypatch):
+    with pytest.raises(InputError, match="--yes"):
+        confirm("So?")
+    monkeypatch.setattr("sys.stdin", type("Terminal", (), {"isatty": lambda self: True})())
+    monkeypatch.setattr("builtins.input", lambda question: "no")
+    with pytest.raises(InputError, match="nothing moves"):
+        confirm("So?")
+    monkeypatch.setattr("builtins.input", Mock(side_effect=EOFError))
+    with pytest.raises(InputError, match="nothing moves"):
+        confirm("So?")
+    monkeypatch.setattr("builtins.input", lambda question: "yes")
+    confirm("So?")
