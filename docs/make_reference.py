@@ -605,8 +605,8 @@ def files() -> str:
         f"## Demonstrations\n\n{paragraphs(inspect.getdoc(Demonstrations.load) or '').split('Raises:')[0]}\n"
         f"{paragraphs(inspect.getdoc(Demonstrations.save) or '').split('Raises:')[0]}\n"
         "An `.npz` that `save` writes has `times` and `outputs` with all samples one after the other, `lengths` with "
-        f"how many each demonstration has, and `names`. At most {limits.MOST_DEMONSTRATIONS} demonstrations, "
-        f"{limits.MOST_NUMBERS:,} numbers and {limits.LARGEST_FILE:,} bytes.\n\n"
+        f"how many each demonstration has, and `names`. At most {limits.MAX_DEMONSTRATIONS} demonstrations, "
+        f"{limits.MAX_NUMBERS:,} numbers and {limits.MAX_FILE_SIZE:,} bytes.\n\n"
         "## Templates and studies\n\n[Template files](templates.md) and [study files](studies.md) are YAML.\n"
     )
     return page

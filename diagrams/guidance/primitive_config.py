@@ -9,7 +9,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains
-from guiderail.models.primitives.lc_ns_kmp import shared_primitive
+from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
 
 HISTORY_SOURCES = ("commanded", "measured")
 
@@ -108,7 +108,7 @@ class PrimitiveConfig:
 
     def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
         """The movement primitive of sKGRL (with history), KGRL (without) or the demonstrations alone."""
-        return shared_primitive(
+        return get_shared_primitive(
             self.reference,
             self.constraints if constrained else LinearConstraints.none(self.num_outputs),
             self.kernel,

@@ -19,7 +19,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 _EXACT = 2**53  # from there on a double skips whole numbers
 
 
-def numbers(values: ArrayLike, what: str) -> np.ndarray:
+def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
     """A new array of doubles that holds exactly the numbers given; `what` names them in messages.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Bounds from demonstrations: in each phase what was shown there, and a margin (the constraints of problem 4.5)."""
+"""Bounds on outputs from demonstrations: the demonstrated range in each phase plus a margin."""
 
 from __future__ import annotations
 
@@ -16,70 +16,67 @@ class DemonstratedBounds:
     """Lower and upper bounds of each output in each phase.
 
     Attributes:
-        names: of the outputs (O,).
-        phases: where each begins, (K,), from 0 to 1.
-        lower, upper: (K, O), infinite where an output is free.
-        fastest: the largest change of each output in a second that was shown, (O,).
+        names: Names of the outputs (O,).
+        phases: Start of each phase (K,), from 0 to 1.
+        lower, upper: Bounds (K, O), infinite where an output is free.
+        max_rates: Largest demonstrated rate of each output (O,) [unit of the output/s].
     """
 
     names: tuple[str, ...]
     phases: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    fastest: np.ndarray
+    max_rates: np.ndarray
 
-    def holds(self, outputs: np.ndarray) -> np.ndarray:
-        """Whether each of N samples (N, O) of a whole motion is inside, (N,)."""
+    def contains(self, outputs: np.ndarray) -> np.ndarray:
+        """Return a mask (N,) of the samples (N, O) of a whole motion that are within the bounds."""
         phase = np.searchsorted(self.phases, np.linspace(0.0, 1.0, len(outputs)), side="right") - 1
         return np.all((outputs >= self.lower[phase]) & (outputs <= self.upper[phase]), axis=1)
 
 
-def demonstrated_bounds(
+def fit_bounds(
     demonstrations: Demonstrations,
     phases: int = 1,
     margin: float = 0.1,
-    least: float = 0.0,
+    min_margin: float = 0.0,
     bounded: Sequence[int] | None = None,
 ) -> DemonstratedBounds:
-    """Bounds that every demonstration keeps.
+    """Compute bounds that every demonstration satisfies.
 
-    A phase's range takes in the samples at its borders, so that who goes from one phase to the next finds a way.
+    The range of a phase includes the samples at its borders, so that the bounds of adjacent phases overlap.
 
     Args:
-        demonstrations: at least one.
-        phases: K, parts of the motion of equal length.
-        margin: on each side, as a part of the range of the phase.
-        least: on each side at least [unit of the output].
-        bounded: numbers of the outputs that are; all unless given.
+        demonstrations: At least one demonstration.
+        phases: Number of phases K, parts of the motion of equal length.
+        margin: Margin on each side, relative to the range of the phase, not negative.
+        min_margin: Smallest margin on each side [unit of the output], not negative.
+        bounded: Indices of the bounded outputs; all by default.
 
     Raises:
-        InputError: if an argument is out of range.
+        InputError: If an argument is out of range.
     """
     common = demonstrations.resampled()
     outputs = np.stack(common.outputs)
     steps = outputs.shape[1]
     if not 1 <= phases <= steps // 2:
         raise InputError(f"there are from 1 to {steps // 2} phases in {steps} samples, not {phases}")
-    if not (np.isfinite([margin, least]).all() and margin >= 0 and least >= 0):
-        raise InputError(f"a margin is no less than zero, not {margin} and {least}")
-    chosen = list(range(outputs.shape[2])) if bounded is None else list(bounded)
-    if not chosen or not all(0 <= one < outputs.shape[2] for one in chosen):
-        raise InputError(f"outputs are numbered from 0 to {outputs.shape[2] - 1}, not {chosen}")
+    if not (np.isfinite([margin, min_margin]).all() and margin >= 0 and min_margin >= 0):
+        raise InputError(f"margins must be finite and not negative, not {margin} and {min_margin}")
+    indices = list(range(outputs.shape[2])) if bounded is None else list(bounded)
+    if not indices or not all(0 <= index < outputs.shape[2] for index in indices):
+        raise InputError(f"outputs are numbered from 0 to {outputs.shape[2] - 1}, not {indices}")
     starts = np.arange(phases) / phases
     lower, upper = (np.full((phases, outputs.shape[2]), inf) for inf in (-np.inf, np.inf))
-    # Between the common clock's instants a sample of one's own may lie further out.
+    # Between the instants of the common clock, an original sample may lie further out.
+    samples = list(zip(demonstrations.times, demonstrations.outputs, strict=True))
     curves = [(np.linspace(0.0, 1.0, steps), y) for y in outputs]
-    curves += [((t - t[0]) / (t[-1] - t[0]), y) for t, y in _as_shown(demonstrations)]
+    curves += [((t - t[0]) / (t[-1] - t[0]), y) for t, y in samples]
     border = 1.5 / (steps - 1)
     for k, start in enumerate(starts):
         end = start + 1.0 / phases
         inside = np.concatenate([y[(at >= start - border) & (at <= end + border)] for at, y in curves])
         low, high = inside.min(axis=0), inside.max(axis=0)
-        room = np.maximum(margin * (high - low), least)
-        lower[k, chosen], upper[k, chosen] = (low - room)[chosen], (high + room)[chosen]
-    changes = [np.abs(np.diff(y, axis=0) / np.diff(t)[:, None]).max(axis=0) for t, y in _as_shown(demonstrations)]
-    return DemonstratedBounds(demonstrations.names, starts, lower, upper, np.max(changes, axis=0))
-
-
-def _as_shown(demonstrations: Demonstrations) -> list[tuple[np.ndarray, np.ndarray]]:
-    return list(zip(demonstrations.times, demonstrations.outputs, strict=True))
+        room = np.maximum(margin * (high - low), min_margin)
+        lower[k, indices], upper[k, indices] = (low - room)[indices], (high + room)[indices]
+    rates = [np.abs(np.diff(y, axis=0) / np.diff(t)[:, None]).max(axis=0) for t, y in samples]
+    return DemonstratedBounds(demonstrations.names, starts, lower, upper, np.max(rates, axis=0))

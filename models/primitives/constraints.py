@@ -1,34 +1,36 @@
-"""Linear inequality constraints g_{n,f}ᵀ ζ^O ≥ c_{n,f} on what a primitive commands (thesis, equation 4.5)."""
+"""Linear inequality constraints g_{n,f}ᵀ ζ^O ≥ c_{n,f} on the output of a primitive (thesis, equation 4.5)."""
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import numbers
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 
 TOLERANCE = 1e-9
-"""The bound that every command keeps, in the unit of a constraint's c (a thousandth of a micrometre for metres)."""
+"""Largest accepted violation of a command, in the unit of a constraint's c (1 nm if that is metres)."""
 
 
 class LinearConstraints:
-    """G y ≥ c, the same at every step or one set a step.
+    """Constraints G y ≥ c, the same at every step or different from step to step.
 
     Attributes:
-        G: (F, O), or (N, F, O) when it differs from step to step.
-        c: (F,) or (N, F).
+        G: Rows g_f, (F, O) or, for each step, (N, F, O).
+        c: Lower bounds, (F,) or (N, F).
     """
 
     def __init__(self, G: np.ndarray, c: np.ndarray):
-        """
+        """Check and store the arrays, which become read-only.
+
         Args:
-            G: (F, O) or (N, F, O), finite; row f is g_f, in 1/unit of the output times the unit of c.
-            c: (F,) or (N, F), finite.
+            G: Rows g_f, (F, O) or (N, F, O), finite [unit of c / unit of the output].
+            c: Lower bounds, (F,) or (N, F), finite.
 
         Raises:
-            InputError: if shapes don't fit, a number is not finite, or no output satisfies all constraints of a step.
+            InputError: If shapes do not match, a number is not finite, or no output satisfies all constraints of a
+                step.
         """
-        self.G, self.c = numbers(G, "G"), numbers(c, "c")
+        self.G, self.c = as_numbers(G, "G"), as_numbers(c, "c")
         if self.G.ndim not in (2, 3) or self.c.shape != self.G.shape[:-1]:
             raise InputError(
                 f"constraints need G of shape (F, O) with c of shape (F,), or (N, F, O) with (N, F), "
@@ -42,12 +44,15 @@ class LinearConstraints:
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike) -> "LinearConstraints":
-        """lower ≤ y ≤ upper, (O,) or (N, O) each; an infinite bound (at every step) is no constraint.
+        """Return the constraints lower ≤ y ≤ upper.
+
+        Args:
+            lower, upper: Bounds, (O,) or (N, O) each. A bound that is infinite at every step is no constraint.
 
         Raises:
-            InputError: if a lower bound exceeds its upper bound, or a bound is NaN or infinite at some steps only.
+            InputError: If a lower bound exceeds its upper bound, or a bound is NaN or infinite at some steps only.
         """
-        lower, upper = _same_shape(numbers(lower, "a lower bound"), numbers(upper, "an upper bound"))
+        lower, upper = _broadcast(as_numbers(lower, "a lower bound"), as_numbers(upper, "an upper bound"))
         if lower.ndim not in (1, 2) or np.isnan(lower).any() or np.isnan(upper).any():
             raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
         if (lower > upper).any():
@@ -71,26 +76,26 @@ class LinearConstraints:
 
     @classmethod
     def none(cls, num_outputs: int) -> "LinearConstraints":
-        """No constraint at all: F = 0."""
+        """Return constraints with F = 0."""
         return cls(np.zeros((0, num_outputs)), np.zeros(0))
 
     @property
     def num_constraints(self) -> int:
-        """F."""
+        """Number of constraints F."""
         return self.G.shape[-2]
 
     @property
     def num_outputs(self) -> int:
-        """O."""
+        """Number of outputs O."""
         return self.G.shape[-1]
 
     @property
     def num_steps(self) -> int | None:
-        """N where constraints differ from step to step, else None."""
+        """Number of steps N if constraints differ from step to step, else None."""
         return self.G.shape[0] if self.G.ndim == 3 else None
 
     def window(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """G (n, F, O) and c (n, F) at the given steps; steps past the end keep the last ones."""
+        """Return G (n, F, O) and c (n, F) at steps (n,); a step past the end has the constraints of the last one."""
         steps = np.asarray(steps)
         if self.G.ndim == 2:
             return np.broadcast_to(self.G, (len(steps), *self.G.shape)), np.broadcast_to(
@@ -100,7 +105,15 @@ class LinearConstraints:
         return self.G[steps], self.c[steps]
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """max over constraints of c − G y, y (O,) [unit of c]: negative is slack, −inf where there is no constraint."""
+        """Compute the maximum over the constraints of c − G y [unit of c].
+
+        Args:
+            output: y (O,).
+            step: Step of the constraints.
+
+        Returns:
+            The violation; a negative one is slack, and −inf is returned without constraints.
+        """
         if self.num_constraints == 0:
             return -np.inf
         if self.G.ndim == 2:
@@ -109,10 +122,10 @@ class LinearConstraints:
         return float((self.c[step] - self.G[step] @ output).max())
 
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
-        """The output (O,) within the constraints of a step that is nearest to `output` (O,).
+        """Compute the output (O,) within the constraints of a step that is nearest to `output` (O,).
 
         Raises:
-            UnsolvableError: if the solver doesn't find it.
+            UnsolvableError: If the solver does not find it.
         """
         output = np.asarray(output, dtype=float)
         if self.violation(output, step) <= 0:
@@ -122,19 +135,19 @@ class LinearConstraints:
         move, _ = solve_least_norm(G * scale[:, None], (c - G @ output) * scale, np.full(len(c), np.inf))
         nearest = output + move
         if not self.violation(nearest, step) <= TOLERANCE:
-            raise UnsolvableError(f"what is nearest is {self.violation(nearest, step):.1e} outside")
+            raise UnsolvableError(f"the nearest output violates a constraint by {self.violation(nearest, step):.1e}")
         return nearest
 
     def _refuse_contradictions(self) -> None:
         if self.num_constraints == 0:
             return
-        from scipy.optimize import linprog  # half a second to import, and who reads a file needs none
+        from scipy.optimize import linprog  # takes half a second, and reading a file does not need it
 
         G = self.G.reshape(-1, *self.G.shape[-2:])
         c = self.c.reshape(-1, self.c.shape[-1])
         flat = np.concatenate([G.reshape(len(G), -1), c], axis=1)
         for step in np.sort(np.unique(flat, axis=0, return_index=True)[1]):
-            # Rows are scaled to unit length: the solver's tolerance is then one on the output itself.
+            # Rows are scaled to unit length, so that the solver's tolerance is a tolerance on the output itself.
             size = np.linalg.norm(G[step], axis=1)
             scale = np.where(size > 0, size, 1.0)
             result = linprog(
@@ -142,7 +155,7 @@ class LinearConstraints:
                 A_ub=-G[step] / scale[:, None],
                 b_ub=-c[step] / scale,
                 bounds=(None, None),
-                # The least that HiGHS takes: a contradiction that is smaller is within what is judged.
+                # The smallest tolerances that HiGHS accepts.
                 options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
             )
             if result.status == 2:
@@ -153,7 +166,7 @@ class LinearConstraints:
                 )
 
 
-def _same_shape(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _broadcast(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     try:
         lower, upper = np.broadcast_arrays(lower, upper)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Demonstrations: what a person showed (thesis, section 2.2.2)."""
+"""Demonstrations: recorded motions to learn from (thesis, section 2.2.2)."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,20 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.arrays import numbers
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.primitives import io as demonstration_files
+from guiderail.models.primitives import io
 
 
 class Demonstrations:
-    """M recordings of O outputs over time, each of its own length and rate.
+    """M recordings of O outputs over time, each with its own length and rate.
 
-    A sample that was recorded twice, the same time with the same outputs, counts once.
+    Repeated samples (same time, same outputs) are dropped.
 
     Attributes:
-        times: M arrays (N_m,), strictly increasing.
+        times: M arrays (N_m,), strictly increasing [s or phase].
         outputs: M arrays (N_m, O).
-        names: O names of the outputs, with their units ("x [m]").
+        names: Names of the O outputs with their units, such as "x [m]".
     """
 
     def __init__(
@@ -28,25 +28,26 @@ class Demonstrations:
         outputs: np.ndarray | Sequence[np.ndarray],
         names: Sequence[str] | None = None,
     ):
-        """
+        """Check and store the recordings.
+
         Args:
-            times: one clock (N,) for all, or M of them (N_m,) [s or phase].
-            outputs: M × (N_m, O).
-            names: of the outputs; "y1", "y2", … unless given.
+            times: One clock (N,) for all demonstrations, or M clocks (N_m,) [s or phase].
+            outputs: M arrays (N_m, O).
+            names: Names of the outputs; "y1", "y2", … by default.
 
         Raises:
-            InputError: if there is no demonstration, one has fewer than two points, shapes or dimensions differ, a
+            InputError: If there is no demonstration, one has fewer than two points, shapes or dimensions differ, a
                 number is not finite, or time does not increase strictly.
         """
-        self.outputs = tuple(numbers(y, f"demonstration {m}") for m, y in enumerate(_listed(outputs, "outputs")))
+        self.outputs = tuple(as_numbers(y, f"demonstration {m}") for m, y in enumerate(_as_list(outputs, "outputs")))
         if not self.outputs:
             raise InputError("there is no demonstration: give at least one")
-        clocks = _listed(times, "times")
+        clocks = _as_list(times, "times")
         if clocks and np.isscalar(clocks[0]):
             clocks = [times] * len(self.outputs)
         if len(clocks) != len(self.outputs):
             raise InputError(f"there are {len(clocks)} time vectors for {len(self.outputs)} demonstrations")
-        self.times = tuple(numbers(t, f"demonstration {m}'s time") for m, t in enumerate(clocks))
+        self.times = tuple(as_numbers(t, f"demonstration {m}'s time") for m, t in enumerate(clocks))
         for m, (t, y) in enumerate(zip(self.times, self.outputs, strict=True)):
             if t.ndim != 1 or y.ndim != 2 or len(t) != len(y):
                 raise InputError(
@@ -67,7 +68,7 @@ class Demonstrations:
                 at = int(np.argmax(t[1:] <= t[:-1])) + 1
                 raise InputError(f"demonstration {m}'s time does not increase at sample {at}: sort or drop samples")
         default = [f"y{o + 1}" for o in range(self.num_outputs)]
-        self.names: tuple[str, ...] = tuple(default if names is None else _listed(names, "names"))
+        self.names: tuple[str, ...] = tuple(default if names is None else _as_list(names, "names"))
         if len(self.names) != self.num_outputs:
             raise InputError(f"there are {len(self.names)} names for {self.num_outputs} outputs")
         for name in self.names:
@@ -75,36 +76,36 @@ class Demonstrations:
                 raise InputError(f"an output can't be named {brief(name)}: use a short text that can be printed")
 
     def _drop_repeated_samples(self) -> None:
-        """A recorder that is faster than its robot logs a sample twice, time and all: that is one sample."""
+        """Drop the copies of a sample that a recorder logs if it runs faster than its robot."""
         times, outputs = [], []
         for t, y in zip(self.times, self.outputs, strict=True):
-            new = np.ones(len(t), dtype=bool)
-            new[1:] = (t[1:] != t[:-1]) | (y[1:] != y[:-1]).any(axis=1)
-            times.append(t[new])
-            outputs.append(y[new])
+            is_new = np.ones(len(t), dtype=bool)
+            is_new[1:] = (t[1:] != t[:-1]) | (y[1:] != y[:-1]).any(axis=1)
+            times.append(t[is_new])
+            outputs.append(y[is_new])
         self.times, self.outputs = tuple(times), tuple(outputs)
 
     @property
     def num_demonstrations(self) -> int:
-        """M."""
+        """Number of demonstrations M."""
         return len(self.outputs)
 
     @property
     def num_outputs(self) -> int:
-        """O."""
+        """Number of outputs O."""
         return self.outputs[0].shape[1]
 
     def resampled(self, num_steps: int | None = None) -> "Demonstrations":
-        """All demonstrations on one uniform clock, by linear interpolation.
+        """Return all demonstrations on one uniform clock, by linear interpolation.
 
-        Each is stretched in time to the mean duration of all: a person is faster once than another time, and what a
-        primitive learns is where, not when. Already on one uniform clock of that length, they are returned unchanged.
+        Each demonstration is scaled in time to the mean duration, because a primitive learns positions and not the
+        different speeds of a demonstrator. Demonstrations that have such a clock already are returned unchanged.
 
         Args:
-            num_steps: N; that of the longest recording unless given.
+            num_steps: Number of steps N, at least 2; that of the longest recording by default.
 
         Raises:
-            InputError: if fewer than two steps are asked for.
+            InputError: If `num_steps` is less than 2.
         """
         num_steps = max(len(t) for t in self.times) if num_steps is None else num_steps
         if num_steps < 2:
@@ -124,42 +125,42 @@ class Demonstrations:
         return Demonstrations(start + duration * phase, outputs, self.names)
 
     def save(self, path: str | Path) -> None:
-        """Writes `.npz` (exact) or `.csv` (one row a sample: demonstration, time, outputs), by the file's ending.
+        """Write an `.npz` or a `.csv` file with one row a sample (demonstration, time, outputs); both are exact.
 
         Raises:
-            InputError: if the ending is neither.
+            InputError: If the file's ending is neither, or the file cannot be written.
         """
         path = Path(path)
-        writer = {".npz": demonstration_files.write_npz, ".csv": demonstration_files.write_csv}.get(path.suffix)
+        writer = {".npz": io.write_npz, ".csv": io.write_csv}.get(path.suffix)
         if writer is None:
             raise InputError(f"cannot write demonstrations to '{path.name}': use the ending .npz or .csv")
         writer(path, self.times, self.outputs, self.names)
 
     @classmethod
     def load(cls, path: str | Path) -> "Demonstrations":
-        """Reads what `save` writes, and what others write.
+        """Read a file that `save` wrote, or one of another program.
 
-        An `.npz` may also hold `times` (N,) or (M, N) with `outputs` (M, N, O). A `.csv` whose first line is `t` (or
-        `time`, `time [s]`) and the outputs' names is one demonstration, and a folder of such files is as many. Time is
-        in seconds. Nothing in a file is ever executed: arrays of Python objects are refused.
+        An `.npz` file may also hold `times` (N,) or (M, N) with `outputs` (M, N, O). A `.csv` file with a first line of
+        `t` (or `time`, `time [s]`) and the outputs' names is one demonstration; a folder of such files is several. Time
+        is in seconds. Arrays of Python objects are refused, so that reading a file never executes code.
 
         Raises:
-            InputError: if there is no such file, it is truncated, damaged or too large, or what it holds are no
+            InputError: If there is no such file, it is truncated, damaged or too large, or it does not hold
                 demonstrations.
         """
         path = Path(path)
-        times, outputs, names = demonstration_files.read(path)
+        times, outputs, names = io.read(path)
         try:
             demonstrations = cls(times, outputs, names)
         except InputError as error:
             raise InputError(f"'{path}': {error}") from error
-        on_one_clock = demonstrations.num_demonstrations * max(map(np.size, demonstrations.outputs))
-        if on_one_clock > 2 * demonstration_files.MOST_NUMBERS:
+        resampled_size = demonstrations.num_demonstrations * max(map(np.size, demonstrations.outputs))
+        if resampled_size > 2 * io.MAX_NUMBERS:
             raise InputError(f"'{path}': one demonstration has far more samples than the others: thin it out")
         return demonstrations
 
 
-def _listed(values: Any, what: str) -> list[Any]:
+def _as_list(values: Any, what: str) -> list[Any]:
     try:
         return list(values)
     except TypeError as error:

@@ -1,4 +1,4 @@
-"""A kernel as explicit features, given what has already been visited."""
+"""Explicit features of a kernel, conditioned on a history."""
 
 from dataclasses import dataclass
 
@@ -7,20 +7,20 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import Kernel
 
-# The history is known to √ρ, the kernel to 1: their ratio is what a double loses digits to. Extended precision costs
-# a millisecond here, once for a whole trajectory, and is what keeps sKGRL accurate at ρ = 1e-10.
+# Conditioning on a history of standard deviation √ρ loses digits in double precision, as the kernel's is 1. Extended
+# precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
 _Extended = np.longdouble
-# A point of which the others leave less than this share of the kernel's variance can't be wished for on its own.
-_TIED = 1e-9
+# Smallest share of the kernel's variance at a point, given the other points, at which the point can have its own action.
+_MIN_INDEPENDENCE = 1e-9
 
 
 @dataclass(frozen=True)
 class WindowFeatures:
-    """What a window's inputs alone determine: y_j = W_j h + (F_j ⊗ I) w, with weights w of unit prior.
+    """Prior of a window, which depends on its inputs alone: y_j = W_j h + (F_j ⊗ I) w, with weights w of unit prior.
 
     Attributes:
-        history_map: W, (H+1, P): how the future follows the history when nothing else is known.
-        features: F, (H+1, r): F Fᵀ is the kernel of the future given the history, r its numerical rank.
+        history_map: W (H+1, P), the map from the history to the prior mean of the future.
+        features: F (H+1, r), where F Fᵀ is the kernel of the future given the history and r its numerical rank.
     """
 
     history_map: np.ndarray
@@ -30,20 +30,19 @@ class WindowFeatures:
 def window_features(
     kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float
 ) -> WindowFeatures:
-    """Conditions the kernel on the history, then factors what is left.
+    """Condition the kernel on the history and factor the rest.
 
-    The history's covariance is ρI, the same for every output, so that conditioning on it is one P×P problem for all
-    outputs together, and it never meets the demonstrations' covariances in one matrix: that is where a dense
-    (K + ħΣ)⁻¹ loses its accuracy.
+    The history's covariance is ρI, the same for every output: conditioning on it is one P×P problem for all outputs. It
+    is not in one matrix with the demonstrations' covariances, where a dense (K + ħΣ)⁻¹ loses its accuracy.
 
     Args:
         kernel: k.
-        history_inputs: (P,) or (P, I), may be empty.
-        future_inputs: (H+1,) or (H+1, I).
-        history_noise: ħρ, positive where there is a history.
+        history_inputs: Inputs of the history, (P,) or (P, I), may be empty.
+        future_inputs: Inputs of the window, (H+1,) or (H+1, I).
+        history_noise: ħρ, positive if there is a history.
 
     Raises:
-        InputError: if that is too small for so long a history.
+        InputError: If `history_noise` is too small for the length of the history.
     """
     history_map, K = _conditioned(kernel, history_inputs, future_inputs, history_noise)
     return WindowFeatures(history_map.astype(float), _pivoted_cholesky(K).astype(float))
@@ -52,27 +51,27 @@ def window_features(
 def window_interpolation(
     kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float, points: np.ndarray
 ) -> np.ndarray:
-    """(H+1, J): what a wish at some of the future points means at all of them, given that the history stays.
+    """Compute the map (H+1, J) that interpolates actions at some future points to all of them, given the history.
 
-    It is K̂ K̲⁻¹ of equation 4.17 with the history conditioned on. The kernel decides what is between the points.
+    It is K̂ K̲⁻¹ of equation 4.17, with the kernel conditioned on the history.
 
     Args:
-        kernel, history_inputs, future_inputs, history_noise: as in `window_features`.
-        points: (J,), different indices of the future inputs.
+        kernel, history_inputs, future_inputs, history_noise: As in `window_features`.
+        points: Different indices (J,) of the future inputs.
 
     Raises:
-        InputError: if points are so near to each other that the kernel ties them together, and K̲ is singular.
+        InputError: If points are so close that K̲ is singular.
     """
     if len(points) == len(future_inputs) and not len(history_inputs):
-        return np.eye(len(points))[:, points]  # wished for everywhere, nothing is in between
+        return np.eye(len(points))[:, points]  # actions at all points: nothing to interpolate
     _, K = _conditioned(kernel, history_inputs, future_inputs, history_noise)
     at = future_inputs[points].astype(_Extended)
     among = kernel(at, at)
-    with np.errstate(invalid="ignore", divide="ignore"):  # of a singular matrix, which is refused
+    with np.errstate(invalid="ignore", divide="ignore"):  # a singular matrix is refused below
         L = _cholesky(among)
-    if not (np.diagonal(L) ** 2 >= _TIED * np.diagonal(among)).all():
+    if not (np.diagonal(L) ** 2 >= _MIN_INDEPENDENCE * np.diagonal(among)).all():
         raise InputError(
-            "null-space actions are so near to each other that this kernel ties them together: leave some out, or "
+            "null-space actions are so close to each other that this kernel cannot separate them: leave some out, or "
             "give a primitive without a history one at every point"
         )
     return _solve_lower(L[::-1, ::-1].T, _solve_lower(L, K[points])[::-1])[::-1].T.astype(float)
@@ -81,12 +80,12 @@ def window_interpolation(
 def _conditioned(
     kernel: Kernel, history_inputs: np.ndarray, future_inputs: np.ndarray, history_noise: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The future's map from the history and its kernel given the history, both in extended precision."""
+    """Return the map from the history to the future, and the kernel given the history, in extended precision."""
     past, future = history_inputs.astype(_Extended), future_inputs.astype(_Extended)
     K = kernel(future, future)
     history_map = np.zeros((len(future), len(past)), dtype=_Extended)
     if len(past):
-        with np.errstate(invalid="ignore", divide="ignore"):  # of a singular matrix, which is refused
+        with np.errstate(invalid="ignore", divide="ignore"):  # a singular matrix is refused below
             L = _cholesky(kernel(past, past) + _Extended(history_noise) * np.eye(len(past), dtype=_Extended))
         if not (np.diagonal(L) > 0).all():
             raise InputError(
@@ -100,13 +99,14 @@ def _conditioned(
 
 
 class KernelBasis:
-    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), on as few of its inputs as span the others."""
+    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on as few inputs as span the others."""
 
     def __init__(self, kernel: Kernel, inputs: np.ndarray):
-        """
+        """Choose the features.
+
         Args:
             kernel: k.
-            inputs: (N, I), which the features must represent to rounding.
+            inputs: Inputs (N, I) that the features represent up to rounding.
         """
         self._kernel = kernel
         self._pivots = np.zeros((0, inputs.shape[1]))
@@ -115,24 +115,24 @@ class KernelBasis:
 
     @property
     def size(self) -> int:
-        """r, the number of features."""
+        """Number of features r."""
         return len(self._pivots)
 
     def features(self, inputs: np.ndarray) -> np.ndarray:
-        """(n, r) at `inputs` (n, I)."""
+        """Compute features (n, r) at `inputs` (n, I)."""
         return self._extended_features(inputs).astype(float)
 
     def residual(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """k(ζ, ζ) − ‖f(ζ)‖² (n,): what the features don't see of inputs (n, I)."""
+        """Compute k(ζ, ζ) − ‖f(ζ)‖² (n,), the variance at inputs (n, I) that their features (n, r) do not represent."""
         prior = np.array([self._kernel(x[None], x[None])[0, 0] for x in inputs])
         return prior - (features**2).sum(axis=1)
 
     def extend(self, inputs: np.ndarray) -> bool:
-        """Adds features until `inputs` (n, I) are represented; True if any were needed."""
+        """Add features until `inputs` (n, I) are represented; return True if any were added."""
         inputs = inputs.astype(_Extended)
         F = self._extended_features(inputs)
         residual = np.array([self._kernel(x[None], x[None])[0, 0] for x in inputs]) - (F**2).sum(axis=1)
-        # Not to rounding, as in a window: a feature of size 1e-7 would multiply weights that no data determines.
+        # Larger than in a window: a feature of size 1e-7 would multiply weights that no data determines.
         tolerance = 1e-15
         before = self.size
         while len(inputs) and residual.max() > tolerance:
@@ -155,7 +155,7 @@ class KernelBasis:
 
 
 def _cholesky(A: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factor in the precision of A (LAPACK has none beyond double)."""
+    """Compute the lower Cholesky factor in the precision of A (LAPACK stops at double)."""
     L = np.zeros_like(A)
     for j in range(len(A)):
         column = A[j:, j] - L[j:, :j] @ L[j, :j]
@@ -164,7 +164,7 @@ def _cholesky(A: np.ndarray) -> np.ndarray:
 
 
 def _solve_lower(L: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """L⁻¹ B by forward substitution, in the precision of the arguments."""
+    """Compute L⁻¹ B by forward substitution, in the precision of the arguments."""
     X = np.array(B)
     for j in range(len(L)):
         X[j] = (X[j] - L[j, :j] @ X[:j]) / L[j, j]
@@ -172,7 +172,7 @@ def _solve_lower(L: np.ndarray, B: np.ndarray) -> np.ndarray:
 
 
 def _pivoted_cholesky(A: np.ndarray) -> np.ndarray:
-    """F (n, r) with F Fᵀ = A up to rounding: the largest remaining diagonal first, until only rounding is left."""
+    """Compute F (n, r) with F Fᵀ = A up to rounding, pivoting on the largest remaining diagonal element."""
     residual = np.array(A.diagonal())
     tolerance = 10 * len(A) * np.finfo(A.dtype).eps
     columns: list[np.ndarray] = []

@@ -1,8 +1,8 @@
-"""Mixture, kernel and regularization that fit what was shown, with nothing set by hand.
+"""Selection of mixture, kernel and regularization by leave-one-out cross-validation.
 
-A kernel that is too wide cuts corners, one that is too narrow forgets that a motion is smooth, and a regularization in
-the wrong unit pulls everything towards zero. All three show where one demonstration is left out and reproduced from the
-others.
+A kernel that is too wide cuts corners, a kernel that is too narrow does not smooth the motion, and a regularization in
+the wrong unit pulls everything towards zero. All three increase the error with which a demonstration is reproduced from
+the others.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
-from guiderail.models.primitives.mixture import fit_mixture, information_criteria, regress
+from guiderail.models.primitives.reference import fit_mixture, information_criteria, regress
 from guiderail.models.primitives.reference import ReferenceTrajectory
 
-#: What counts as staying with the demonstrations: this share of the steps within one standard deviation.
-ENOUGH = 0.95
-# Of the motion's duration: from a third of it, which knows one bend, to a few steps.
+MIN_SHARE = 0.95
+"""Share of the steps within one standard deviation from which a motion follows the demonstrations."""
+# Length scales to try, relative to the motion's duration: from one bend to a few steps.
 _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
-# The outputs' own size in the prior's standard deviations is the square root of these.
+# Values of ħ to try, for outputs of unit size.
 _REGULARIZATIONS = (1.0, 0.1, 0.01)
 _COMPONENTS = (3, 5, 8, 12, 18, 26, 36, 50)
-_EVALUATED = 40  # steps at which a candidate is compared
+_EVALUATED = 40  # number of steps at which candidates are compared
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One kernel and regularization that were tried.
+    """Kernel and regularization with their cross-validation error.
 
     Attributes:
         length_scale: ℓ of the kernel [input].
         lambda_: λ = β.
-        error: RMS distance between left-out demonstrations and what the others reproduce, in standard deviations of
-            the demonstrations, correlations counted; infinite where the motion leaves all of them anyway.
-        worse: how much worse than the best that is, in standard errors over the demonstrations.
-        share: of the steps at which the motion without actions is within one standard deviation of the mean.
+        error: RMS Mahalanobis distance between a left-out demonstration and its reproduction from the others, in
+            standard deviations of the demonstrations; infinite if the motion of all demonstrations already leaves them.
+        worse: Difference from the best candidate's error, in standard errors over the demonstrations.
+        share: Share of the steps at which the motion without actions is within one standard deviation of the mean.
     """
 
     length_scale: float
@@ -53,18 +53,18 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Selection:
-    """What was chosen, and why.
+    """Selected mixture, kernel and regularization.
 
     Attributes:
-        reference: of all demonstrations.
-        components: C of its mixture.
-        kernel: with this λ the widest that reproduces the demonstrations as well as any.
+        reference: Reference of all demonstrations.
+        components: Number of components C of its mixture.
+        kernel: For this λ, the widest kernel within a standard error of the best error.
         length_scale: ℓ of the kernel [input].
-        lambda_, beta: λ and β, the same; the strongest that does.
-        share: of the steps at which the motion without actions is within one standard deviation of the mean.
-        criteria: Bayesian information criterion of each number of components that was tried.
-        candidates: every kernel and regularization that was tried.
-        why: the choice in a few sentences.
+        lambda_, beta: λ = β, the strongest regularization within a standard error of the best error.
+        share: Share of the steps at which the motion without actions is within one standard deviation of the mean.
+        criteria: Bayesian information criterion by number of components.
+        candidates: All candidates.
+        why: Reason for the selection in a few sentences.
     """
 
     reference: ReferenceTrajectory
@@ -79,14 +79,14 @@ class Selection:
     why: str
 
     @property
-    def stays(self) -> bool:
-        """True if the motion without actions stays with the demonstrations."""
-        return self.share >= ENOUGH
+    def is_within_spread(self) -> bool:
+        """True if the motion without actions follows the demonstrations (`share` is at least `MIN_SHARE`)."""
+        return self.share >= MIN_SHARE
 
     def primitive(self, **arguments: Any) -> LcNsKmp:
-        """A primitive with what was chosen; `arguments` are the others of `LcNsKmp`, or replace what was chosen."""
-        chosen = {"kernel": self.kernel, "lambda_": self.lambda_, "beta": self.beta}
-        return LcNsKmp(self.reference, **{**chosen, **arguments})
+        """Build the selected primitive; `arguments` of `LcNsKmp` add to the selection or replace parts of it."""
+        selected = {"kernel": self.kernel, "lambda_": self.lambda_, "beta": self.beta}
+        return LcNsKmp(self.reference, **{**selected, **arguments})
 
 
 def fit(
@@ -102,64 +102,62 @@ def fit(
     floor: float | np.ndarray = 0.0,
     seed: int = 0,
 ) -> Selection:
-    """Chooses components, kernel and regularization by what reproduces a demonstration that was left out.
+    """Select components, kernel and regularization by leave-one-out cross-validation.
 
-    The number of components is the one of least Bayesian information criterion. Kernel and regularization are tried on
-    a grid, relative to the motion's duration and size: of those that reproduce left-out demonstrations as well as the
-    best one does, within a standard error, and that stay within the demonstrations' spread without actions, the
-    strongest regularization is taken, and with it the widest kernel: as smooth as the demonstrations allow.
+    The number of components is the one of least Bayesian information criterion. Kernel and regularization are taken
+    from a grid relative to the motion's duration and size. Candidates qualify if their error is within a standard error
+    of the best one and their motion without actions stays within the demonstrations' spread. Of these, the strongest
+    regularization is selected, and for it the widest kernel: as smooth as the demonstrations allow.
 
     Args:
-        demonstrations: at least three.
-        components, length_scale, lambda_: what is given is taken as it is, and the rest chosen for it.
-        kernel, kernel_parameters: as in `make_kernel`.
-        horizon: H of the primitive that is meant.
-        num_steps, floor, seed: as in `ReferenceTrajectory.from_demonstrations`.
+        demonstrations: At least three demonstrations.
+        components, length_scale, lambda_: Fixed values; the others are selected for them.
+        kernel, kernel_parameters: Name and further parameters of the kernel, as in `make_kernel`.
+        horizon: H of the intended primitive.
+        num_steps, floor, seed: As in `ReferenceTrajectory.from_demonstrations`.
 
     Raises:
-        InputError: if there are fewer than three demonstrations, or they can't be fitted.
+        InputError: If there are fewer than three demonstrations, or they cannot be fitted.
     """
     if demonstrations.num_demonstrations < 3:
         raise InputError(
-            f"leaving one of {demonstrations.num_demonstrations} demonstrations out says nothing: show at least three"
+            f"cross-validation needs at least three demonstrations, and there are {demonstrations.num_demonstrations}: "
+            "record more"
         )
-    shown = demonstrations.resampled(num_steps)
-    if len(shown.times[0]) < 4 * _COMPONENTS[0]:
-        raise InputError(f"a mixture needs at least {4 * _COMPONENTS[0]} steps, not {len(shown.times[0])}")
-    times, outputs = shown.times[0], np.stack(shown.outputs)
-    tried = [components] if components is not None else [c for c in _COMPONENTS if c <= len(times) // 4]
-    criteria = information_criteria(times, outputs, tried, seed)
+    resampled = demonstrations.resampled(num_steps)
+    times, outputs = resampled.times[0], np.stack(resampled.outputs)
+    if len(times) < 4 * _COMPONENTS[0]:
+        raise InputError(f"a mixture needs at least {4 * _COMPONENTS[0]} steps, not {len(times)}")
+    counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(times) // 4]
+    criteria = information_criteria(times, outputs, counts, seed)
     components = min(criteria, key=lambda count: criteria[count])
 
-    reference = ReferenceTrajectory.from_demonstrations(shown, components, seed, floor=floor)
-    without = [_reference(times, np.delete(outputs, m, axis=0), components, seed, floor) for m in range(len(outputs))]
+    reference = ReferenceTrajectory.from_demonstrations(resampled, components, seed, floor=floor)
+    folds = [_reference(times, np.delete(outputs, m, axis=0), components, seed, floor) for m in range(len(outputs))]
     make = partial(make_kernel, kernel, parameters=kernel_parameters)
-    candidates = _tried(reference, without, outputs, horizon, _grid(shown, length_scale, lambda_), make)
-    chosen = _chosen(candidates)
-    length_scale = chosen.length_scale
-    primitive = LcNsKmp(reference, make(length_scale), chosen.lambda_, chosen.lambda_, horizon)
+    candidates = _validate(reference, folds, outputs, horizon, _grid(resampled, length_scale, lambda_), make)
+    selected = _select(candidates)
+    primitive = LcNsKmp(reference, make(selected.length_scale), selected.lambda_, selected.lambda_, horizon)
     share = share_within_spread(primitive)
-    why = _why(components, criteria, chosen, candidates, share, times)
     return Selection(
         reference=reference,
         components=components,
         kernel=primitive.kernel,
-        length_scale=length_scale,
-        lambda_=chosen.lambda_,
-        beta=chosen.lambda_,
+        length_scale=selected.length_scale,
+        lambda_=selected.lambda_,
+        beta=selected.lambda_,
         share=share,
         criteria=criteria,
         candidates=candidates,
-        why=why,
+        why=_explain(components, criteria, selected, candidates, share, times),
     )
 
 
 def share_within_spread(primitive: LcNsKmp) -> float:
-    """The share of steps at which the motion without actions is within one standard deviation of the mean.
+    """Compute the share of steps at which the motion without actions is within one standard deviation of the mean.
 
-    Correlations count: one standard deviation is the ellipsoid of the reference's covariance. With a history, the
-    motion is the one that its own commands lead to, from the first mean on. Below 0.95, the kernel is too wide for what
-    was shown or the regularization too strong: `fit` chooses both.
+    One standard deviation is the ellipsoid of the reference's covariance, correlations included. Below `MIN_SHARE`, the
+    kernel is too wide for the demonstrations or the regularization too strong; `fit` selects both.
     """
     return float(_within(primitive.reference, motion_without_actions(primitive), slice(None)).mean())
 
@@ -167,11 +165,11 @@ def share_within_spread(primitive: LcNsKmp) -> float:
 def estimated_share(
     reference: ReferenceTrajectory, kernel: Kernel, lambda_: float, beta: float, horizon: int = 40
 ) -> float:
-    """About what `share_within_spread` is of a primitive without a history, from forty of its steps.
+    """Estimate `share_within_spread` of a primitive without a history from forty of its steps.
 
     Args:
-        reference: of the primitive.
-        kernel, lambda_, beta, horizon: as in `LcNsKmp`.
+        reference: Reference of the primitive.
+        kernel, lambda_, beta, horizon: As in `LcNsKmp`.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     motion = _motion(reference, kernel, lambda_ + beta, horizon, steps)
@@ -179,7 +177,7 @@ def estimated_share(
 
 
 def motion_without_actions(primitive: LcNsKmp) -> np.ndarray:
-    """(N, O): what a primitive commands step by step if nobody acts, from the first mean on."""
+    """Compute the outputs (N, O) of a primitive without actions; a history starts at the first mean."""
     reference = primitive.reference
     past = np.tile(reference.means[0], (primitive.history, 1))
     motion = np.zeros_like(reference.means)
@@ -193,7 +191,7 @@ def motion_without_actions(primitive: LcNsKmp) -> np.ndarray:
 def _reference(
     times: np.ndarray, outputs: np.ndarray, components: int, seed: int, floor: float | np.ndarray
 ) -> ReferenceTrajectory:
-    """The reference of a part of the demonstrations, which is only compared."""
+    """Return the reference of a part of the demonstrations."""
     means, covariances = regress(fit_mixture(times, outputs, components, seed), times)
     return ReferenceTrajectory(times, means, covariances + np.diag(np.broadcast_to(floor, means.shape[1:]) ** 2))
 
@@ -204,46 +202,45 @@ def _within(reference: ReferenceTrajectory, motion: np.ndarray, steps: Any) -> n
 
 
 def _squared(covariances: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distance (…, n) of errors (…, n, O)."""
+    """Compute squared Mahalanobis distances (…, n) of errors (…, n, O)."""
     whiten = np.linalg.inv(np.linalg.cholesky(covariances))
     return (np.einsum("nij,...nj->...ni", whiten, error) ** 2).sum(axis=-1)
 
 
-def _grid(shown: Demonstrations, length_scale: float | None, lambda_: float | None) -> list[tuple[float, float]]:
-    """Kernels and ħ to try, in the motion's own duration and size, or what was given."""
-    duration = float(shown.times[0][-1] - shown.times[0][0])
-    size = float(np.sqrt((np.stack(shown.outputs) ** 2).mean(axis=(0, 1)).max())) or 1.0
+def _grid(resampled: Demonstrations, length_scale: float | None, lambda_: float | None) -> list[tuple[float, float]]:
+    """Return length scales and ħ to try, relative to the motion's duration and size unless they are fixed."""
+    duration = float(resampled.times[0][-1] - resampled.times[0][0])
+    size = float(np.sqrt((np.stack(resampled.outputs) ** 2).mean(axis=(0, 1)).max())) or 1.0
     lengths = [length * duration for length in _LENGTHS] if length_scale is None else [length_scale]
     strengths = [hbar / size**2 for hbar in _REGULARIZATIONS] if lambda_ is None else [2.0 * lambda_]
     return [(length, hbar) for length in lengths for hbar in strengths]
 
 
-def _tried(
+def _validate(
     reference: ReferenceTrajectory,
-    without: Sequence[ReferenceTrajectory],
+    folds: Sequence[ReferenceTrajectory],
     outputs: np.ndarray,
     horizon: int,
     grid: Sequence[tuple[float, float]],
     make: Callable[[float], Kernel],
 ) -> tuple[Candidate, ...]:
-    """Every kernel and regularization, with how well it reproduces what was left out.
-
-    One whose motion leaves the spread of all demonstrations is not asked what it does without one of them.
-    """
+    """Return all candidates with their errors; one whose motion leaves the spread of all demonstrations has none."""
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     kernels = [make(length_scale) for length_scale, _ in grid]
     motions = [_motion(reference, k, hbar, horizon, steps) for k, (_, hbar) in zip(kernels, grid, strict=True)]
     shares = np.array([_within(reference, motion, steps).mean() for motion in motions])
-    asked = shares >= min(ENOUGH, shares.max())
-    errors = np.full((len(grid), len(without)), np.inf)
-    for i in np.flatnonzero(asked).tolist():
-        for m, part in enumerate(without):
-            motion = _motion(part, kernels[i], grid[i][1], horizon, steps)
+    is_within = shares >= min(MIN_SHARE, shares.max())
+    errors = np.full((len(grid), len(folds)), np.inf)
+    for i in np.flatnonzero(is_within).tolist():
+        for m, fold in enumerate(folds):
+            motion = _motion(fold, kernels[i], grid[i][1], horizon, steps)
             errors[i, m] = _squared(reference.covariances[steps], outputs[m, steps] - motion).mean()
     worse = np.full(len(grid), np.inf)
-    behind = errors[asked] - errors[int(np.argmin(errors.mean(axis=1)))]
-    standard_error = behind.std(axis=1, ddof=1) / np.sqrt(len(without))
-    worse[asked] = np.divide(behind.mean(axis=1), standard_error, out=np.zeros(len(behind)), where=standard_error > 0)
+    excess = errors[is_within] - errors[int(np.argmin(errors.mean(axis=1)))]
+    standard_error = excess.std(axis=1, ddof=1) / np.sqrt(len(folds))
+    worse[is_within] = np.divide(
+        excess.mean(axis=1), standard_error, out=np.zeros(len(excess)), where=standard_error > 0
+    )
     rms = np.sqrt(errors.mean(axis=1) / outputs.shape[-1])
     return tuple(
         Candidate(length_scale, hbar / 2, float(rms[i]), float(worse[i]), float(shares[i]))
@@ -252,7 +249,7 @@ def _tried(
 
 
 def _motion(reference: ReferenceTrajectory, kernel: Kernel, hbar: float, horizon: int, steps: np.ndarray) -> np.ndarray:
-    """(n, O): k* (K + ħΣ)⁻¹ μ of the windows at `steps`, all at once and in plain doubles."""
+    """Compute outputs (n, O), k* (K + ħΣ)⁻¹ μ of the windows at `steps`, in double precision."""
     outputs = reference.num_outputs
     window = np.minimum(steps[:, None] + np.arange(horizon + 1), reference.num_steps - 1)
     clock = reference.inputs(np.arange(horizon + 1))
@@ -266,33 +263,32 @@ def _motion(reference: ReferenceTrajectory, kernel: Kernel, hbar: float, horizon
     return (K[:outputs] @ np.linalg.solve(A, means))[:, :, 0]
 
 
-def _chosen(candidates: Sequence[Candidate]) -> Candidate:
-    """The strongest regularization, and with it the widest kernel, among those that are as good as any."""
-    good = [c for c in candidates if c.worse <= 1.0 and c.share >= ENOUGH]
-    if good:
-        return min(good, key=lambda c: (-c.lambda_, -c.length_scale))
+def _select(candidates: Sequence[Candidate]) -> Candidate:
+    """Return the candidate of strongest regularization, and for it of the widest kernel, among the best ones."""
+    best = [c for c in candidates if c.worse <= 1.0 and c.share >= MIN_SHARE]
+    if best:
+        return min(best, key=lambda c: (-c.lambda_, -c.length_scale))
     return max(candidates, key=lambda c: (c.share, -c.error))
 
 
-def _why(
+def _explain(
     components: int,
     criteria: dict[int, float],
-    chosen: Candidate,
+    selected: Candidate,
     candidates: Sequence[Candidate],
     share: float,
     times: np.ndarray,
 ) -> str:
-    length = chosen.length_scale
+    length = selected.length_scale
     best = min(candidate.error for candidate in candidates)
-    many = len(criteria) > 1
-    said = (
-        f"{components} components {'have the least information criterion of' if many else 'were given, and'} "
-        f"{len(criteria) if many else 'no other'} numbers tried. "
-        f"A kernel as long as {length:.3g}, {length / (times[-1] - times[0]):.1%} of the motion, with "
-        f"λ = β = {chosen.lambda_:.3g} reproduces left-out demonstrations to {chosen.error:.3g} standard deviations, "
-        f"the best of {len(candidates)} tried to {best:.3g}. Without actions {share:.1%} of the steps are within one "
-        "standard deviation of the mean"
+    tried = "have the least information criterion of {} numbers" if len(criteria) > 1 else "are fixed"
+    text = (
+        f"{components} components {tried.format(len(criteria))}. "
+        f"A kernel of length scale {length:.3g}, {length / (times[-1] - times[0]):.1%} of the motion, with "
+        f"λ = β = {selected.lambda_:.3g} reproduces left-out demonstrations to {selected.error:.3g} standard "
+        f"deviations; the best of {len(candidates)} candidates to {best:.3g}. Without actions {share:.1%} of the steps "
+        "are within one standard deviation of the mean"
     )
-    if share >= ENOUGH:
-        return said + ": nothing smoother is as good."
-    return said + f", less than {ENOUGH:.0%}: record more demonstrations, or ones that differ less in their timing."
+    if share >= MIN_SHARE:
+        return text + ": no smoother candidate is as good."
+    return text + f", less than {MIN_SHARE:.0%}: record more demonstrations, or ones that differ less in their timing."

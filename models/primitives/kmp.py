@@ -1,4 +1,4 @@
-"""A kernelized movement primitive at any input, with via-points that come and go (thesis, equations 2.17 and 2.18)."""
+"""Kernelized movement primitive for inputs of any dimension, with via-points (thesis, equations 2.17 and 2.18)."""
 
 from dataclasses import dataclass
 
@@ -11,19 +11,19 @@ from guiderail.models.primitives.kernels import Kernel, SquaredExponential
 
 
 @dataclass(frozen=True)
-class _Data:
+class _Point:
     input: np.ndarray
     mean: np.ndarray
     covariance: np.ndarray
 
 
 class Kmp:
-    """E(ζ) = k*(K + λΣ)⁻¹μ and cov(ζ) = N/λ_c (k** − k*(K + λ_cΣ)⁻¹k*ᵀ), for inputs of any dimension.
+    """Kernelized movement primitive with E(ζ) = k*(K + λΣ)⁻¹μ and cov(ζ) = N/λ_c (k** − k*(K + λ_cΣ)⁻¹k*ᵀ).
 
-    Where `LcNsKmp` looks at a window of a clock, this one knows its whole reference at once: for primitives driven by a
-    state rather than by time, and for via-points. Both are held in the weights of the kernel's features, whose number
-    is the kernel's rank and not the number of points; the factor is the triangle of a QR decomposition, to which a
-    via-point adds O rows. Removing or moving one starts from the reference's own triangle again, never from scratch.
+    `LcNsKmp` solves for a window of a clock; this class uses the whole reference at once, for primitives driven by a
+    state instead of time, and for via-points. The solution is stored as weights of the kernel's features, whose number
+    is the rank of the kernel and not the number of points. The factor is the triangle of a QR decomposition, to which a
+    via-point adds O rows. If a via-point is removed or moved, the update starts from the triangle of the reference.
     """
 
     def __init__(
@@ -35,17 +35,18 @@ class Kmp:
         lambda_: float = 1.0,
         covariance_lambda: float | None = None,
     ):
-        """
+        """Factor the reference.
+
         Args:
-            inputs: (N,) or (N, I): times, or states.
-            means: (N, O).
-            covariances: (N, O, O), positive definite.
-            kernel: k; `SquaredExponential(length_scale=0.5)` unless given.
+            inputs: Times or states, (N,) or (N, I).
+            means: Means (N, O).
+            covariances: Covariances (N, O, O), positive definite.
+            kernel: k; `SquaredExponential(length_scale=0.5)` by default.
             lambda_: λ, positive.
-            covariance_lambda: λ_c, positive; λ unless given.
+            covariance_lambda: λ_c, positive; λ by default.
 
         Raises:
-            InputError: if an argument is out of range or shapes don't fit.
+            InputError: If an argument is out of range or shapes do not match.
         """
         inputs = _rows(inputs)
         means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
@@ -61,72 +62,77 @@ class Kmp:
                 raise InputError(f"{name} must be positive, not {value}")
         self.num_inputs, self.num_outputs = inputs.shape[1], means.shape[1]
         self._reference = [
-            _Data(x, m, _checked(s, "reference")) for x, m, s in zip(inputs, means, covariances, strict=True)
+            _Point(x, m, _check_covariance(s, "reference")) for x, m, s in zip(inputs, means, covariances, strict=True)
         ]
-        self._via: dict[int, _Data] = {}
-        self._next_name = 0
+        self._via: dict[int, _Point] = {}
+        self._next_identifier = 0
         self._lambda, self._covariance_lambda = lambda_, covariance_lambda if covariance_lambda is not None else lambda_
         self._basis = KernelBasis(kernel if kernel is not None else SquaredExponential(), inputs)
         self._factor_reference()
 
     def mean(self, inputs: np.ndarray) -> np.ndarray:
-        """(n, O) at `inputs` (n,) or (n, I): equation 2.17."""
+        """Compute means (n, O) at `inputs` (n,) or (n, I) (equation 2.17)."""
         F = self._basis.features(self._queries(inputs))
         return (F @ self._weights.reshape(-1, self.num_outputs)).reshape(-1, self.num_outputs)
 
     def covariance(self, inputs: np.ndarray) -> np.ndarray:
-        """(n, O, O) at `inputs` (n,) or (n, I): equation 2.18."""
+        """Compute covariances (n, O, O) at `inputs` (n,) or (n, I) (equation 2.18)."""
         queries = self._queries(inputs)
         F = self._basis.features(queries)
-        prior_left = np.maximum(self._basis.residual(queries, F), 0)
+        unexplained = np.maximum(self._basis.residual(queries, F), 0)
         eye = np.eye(self.num_outputs)
         F_bar = np.einsum("nk,oi->noki", F, eye).reshape(len(queries) * self.num_outputs, -1)
         half = solve_triangular(self._covariance_triangle, F_bar.T, trans="T", check_finite=False)
         half = half.T.reshape(len(queries), self.num_outputs, -1)
         points = len(self._reference) + len(self._via)
         posterior = self._covariance_lambda * np.einsum("nor,nir->noi", half, half)
-        return points / self._covariance_lambda * (posterior + prior_left[:, None, None] * eye)
+        return points / self._covariance_lambda * (posterior + unexplained[:, None, None] * eye)
 
     def add_via_point(self, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> int:
-        """The motion shall pass `mean` (O,) at `input_` (I,), as exactly as `covariance` (O, O) says.
+        """Add a via-point.
+
+        Args:
+            input_: Input (I,).
+            mean: Output (O,) that the motion passes through.
+            covariance: Covariance (O, O) of that output, positive definite.
 
         Returns:
-            A name to move or remove it by.
+            An identifier for `move_via_point` and `remove_via_point`.
 
         Raises:
-            InputError: if shapes don't fit, a number is not finite, or the covariance is not positive definite.
+            InputError: If shapes do not match, a number is not finite, or the covariance is not positive definite.
         """
-        name = self._next_name
-        self._via[name] = self._data(input_, mean, covariance)
-        self._next_name += 1
+        identifier = self._next_identifier
+        self._via[identifier] = self._check_point(input_, mean, covariance)
+        self._next_identifier += 1
         self._factor_via_points()
-        return name
+        return identifier
 
-    def move_via_point(self, name: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-        """Moves a via-point in any respect: `mean` (O,), `input_` (I,), `covariance` (O, O).
+    def move_via_point(self, identifier: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
+        """Replace the input, mean and covariance of a via-point, with the arguments of `add_via_point`.
 
         Raises:
-            InputError: as `add_via_point`, or if there is no via-point of that name.
+            InputError: As `add_via_point`, or if there is no such via-point.
         """
-        self._check_name(name)
-        self._via[name] = self._data(input_, mean, covariance)
+        self._check_identifier(identifier)
+        self._via[identifier] = self._check_point(input_, mean, covariance)
         self._factor_via_points()
 
-    def remove_via_point(self, name: int) -> None:
-        """Forgets a via-point.
+    def remove_via_point(self, identifier: int) -> None:
+        """Remove a via-point.
 
         Raises:
-            InputError: if there is none of that name.
+            InputError: If there is no such via-point.
         """
-        self._check_name(name)
-        del self._via[name]
+        self._check_identifier(identifier)
+        del self._via[identifier]
         self._factor_via_points()
 
-    def _check_name(self, name: int) -> None:
-        if name not in self._via:
-            raise InputError(f"there is no via-point {name}: there are {sorted(self._via)}")
+    def _check_identifier(self, identifier: int) -> None:
+        if identifier not in self._via:
+            raise InputError(f"there is no via-point {identifier}: there are {sorted(self._via)}")
 
-    def _data(self, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> _Data:
+    def _check_point(self, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> _Point:
         point, mean = np.atleast_1d(np.asarray(input_, dtype=float)), np.asarray(mean, dtype=float)
         if point.shape != (self.num_inputs,) or mean.shape != (self.num_outputs,):
             raise InputError(
@@ -135,7 +141,9 @@ class Kmp:
             )
         if not (np.isfinite(point).all() and np.isfinite(mean).all()):
             raise InputError("a via-point must be finite")
-        return _Data(point, mean, _checked(np.asarray(covariance, dtype=float), "via-point", self.num_outputs))
+        return _Point(
+            point, mean, _check_covariance(np.asarray(covariance, dtype=float), "via-point", self.num_outputs)
+        )
 
     def _queries(self, inputs: np.ndarray) -> np.ndarray:
         queries = _rows(inputs)
@@ -149,36 +157,36 @@ class Kmp:
         zero = np.zeros(size)
         rows, targets = self._whitened(self._reference)
         self._base = _append(prior[0], zero, rows, targets)
-        same = self._lambda == self._covariance_lambda
-        self._covariance_base = self._base if same else _append(prior[1], zero, rows, targets)
+        is_same = self._lambda == self._covariance_lambda
+        self._covariance_base = self._base if is_same else _append(prior[1], zero, rows, targets)
         self._factor_via_points()
 
     def _factor_via_points(self) -> None:
         via = list(self._via.values())
-        if via and self._basis.extend(np.array([data.input for data in via])):
-            self._factor_reference()  # a via-point beyond the reference needs features that nothing had before
+        if via and self._basis.extend(np.array([point.input for point in via])):
+            self._factor_reference()  # a via-point far from the reference adds features
             return
         rows, targets = self._whitened(via)
         triangle, right = _append(*self._base, rows, targets)
         self._weights = solve_triangular(triangle, right, check_finite=False)
-        same = self._lambda == self._covariance_lambda
-        self._covariance_triangle = triangle if same else _append(*self._covariance_base, rows, targets)[0]
+        is_same = self._lambda == self._covariance_lambda
+        self._covariance_triangle = triangle if is_same else _append(*self._covariance_base, rows, targets)[0]
 
-    def _whitened(self, data: list[_Data]) -> tuple[np.ndarray, np.ndarray]:
-        """Rows Σ^(-1/2)(F ⊗ I) (n·O, r·O) and targets Σ^(-1/2) μ (n·O,)."""
-        if not data:
+    def _whitened(self, points: list[_Point]) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows Σ^(-1/2)(F ⊗ I) (n·O, r·O) and targets Σ^(-1/2) μ (n·O,)."""
+        if not points:
             return np.zeros((0, self._basis.size * self.num_outputs)), np.zeros(0)
-        F = self._basis.features(np.array([point.input for point in data]))
-        whiten = np.linalg.inv(np.linalg.cholesky(np.array([point.covariance for point in data])))
-        rows = np.einsum("nk,noi->noki", F, whiten).reshape(len(data) * self.num_outputs, -1)
-        means = np.array([point.mean for point in data])
+        F = self._basis.features(np.array([point.input for point in points]))
+        whiten = np.linalg.inv(np.linalg.cholesky(np.array([point.covariance for point in points])))
+        rows = np.einsum("nk,noi->noki", F, whiten).reshape(len(points) * self.num_outputs, -1)
+        means = np.array([point.mean for point in points])
         return rows, np.einsum("noi,ni->no", whiten, means).ravel()
 
 
 def _append(
     triangle: np.ndarray, right: np.ndarray, rows: np.ndarray, targets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle, and its right-hand side, of a least-squares problem with more rows."""
+    """Return the triangle and the right-hand side of a least-squares problem with rows appended."""
     if not len(rows):
         return triangle, right
     stacked = np.vstack([np.column_stack([triangle, right]), np.column_stack([rows, targets])])
@@ -192,7 +200,7 @@ def _rows(inputs: np.ndarray) -> np.ndarray:
     return inputs.reshape(-1, 1) if inputs.ndim < 2 else inputs
 
 
-def _checked(covariance: np.ndarray, what: str, outputs: int | None = None) -> np.ndarray:
+def _check_covariance(covariance: np.ndarray, what: str, outputs: int | None = None) -> np.ndarray:
     shape = covariance.shape if outputs is None else (outputs, outputs)
     if covariance.shape != shape or not np.isfinite(covariance).all():
         raise InputError(f"the {what}'s covariance must be finite and of shape {shape}, not {covariance.shape}")

@@ -1,10 +1,10 @@
-"""Linearly constrained null-space kernelized movement primitives (thesis, sections 4.3 and 5.3).
+"""Linearly constrained null-space kernelized movement primitives, LC-NS-KMP (thesis, sections 4.3 and 5.3).
 
-The law, for a window of the P last outputs and the H+1 next reference points, is the solution of problem 4.5: as close
-to the demonstrations as their covariance asks for, pulled by a null-space action at the executed point, passing
-through the history, and inside the linear constraints at every future point. Parts switched off, it is the family's
-other members: without constraints NS-KMP (equation 4.4), with β = 0 LC-KMP (4.2), with neither KMP (2.17), with a
-history sKGRL's primitive (5.1-5.3).
+A prediction solves problem 4.5 for a window of the P last outputs and the H+1 next reference points: as close to the
+demonstrations as their covariance demands, pulled by a null-space action at the executed point, through the history,
+and within the linear constraints at every future point. The other members of the family are special cases: without
+constraints NS-KMP (equation 4.4), with β = 0 LC-KMP (4.2), with neither KMP (2.17), with a history the primitive of
+sKGRL (5.1 to 5.3).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import numbers
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
@@ -29,10 +29,10 @@ from guiderail.models.primitives.window import StepFactor, Window
 
 
 class Prediction:
-    """What a primitive says at one step.
+    """Output of a primitive at one step.
 
     Attributes:
-        output: (O,), what to execute.
+        output: Output to execute (O,).
     """
 
     __slots__ = ("_factor", "_signed", "_v", "_x", "output")
@@ -45,52 +45,53 @@ class Prediction:
         v: np.ndarray | None = None,
         signed: np.ndarray | None = None,
     ):
-        """
+        """Store a prediction.
+
         Args:
-            output: (O,), what to execute.
-            factor: of the step.
-            x: ((P + 1) O,), the history and the null-space action that it was predicted from.
-            v: (r,), the correction, where some constraint had to be enforced.
-            signed: (m,), the solver's multipliers of the correction.
+            output: Output to execute (O,).
+            factor: Factor of the step.
+            x: History and null-space action of the prediction ((P + 1) O,).
+            v: Correction (r,), or None if every constraint is slack.
+            signed: The solver's multipliers of the correction (m,).
         """
         self.output, self._factor, self._x, self._v, self._signed = output, factor, x, v, signed
 
     @property
     def constrained(self) -> bool:
-        """True if some constraint of the window had to be enforced."""
+        """True if a constraint of the window is active."""
         return self._v is not None
 
     @property
     def correction(self) -> np.ndarray | None:
-        """v (r,), the least that keeps the constraints, in units in which `output_sizes` is what it does at most."""
+        """Smallest correction v (r,) that satisfies the constraints; `output_sizes` is its largest effect per norm."""
         return self._v
 
     @property
     def signed_multipliers(self) -> np.ndarray | None:
-        """(m,) of the rows of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower bound."""
+        """Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower bound."""
         return self._signed
 
     @property
     def multipliers(self) -> np.ndarray:
-        """α (H+1, F) ≥ 0, zero where a constraint is slack; computed at each call."""
+        """Multipliers α (H+1, F) ≥ 0, zero where a constraint is slack; computed at each access."""
         if self._signed is None:
             return np.zeros(self._factor.multipliers_shape)
         return self._factor.multipliers(self._signed)
 
     @property
     def trajectory(self) -> np.ndarray:
-        """The whole modified window (H+1, O); computed at each call."""
+        """Modified window (H+1, O); computed at each access."""
         return self._factor.trajectory(self._x, self._v)
 
 
 @dataclass(frozen=True)
 class Modification:
-    """A stretch of a motion as null-space actions at several of its points modify it.
+    """Part of a motion, modified by null-space actions at several of its points.
 
     Attributes:
-        steps: (n,), which steps of the reference these are; steps past its end are there too.
-        trajectory: (n, O), within the constraints.
-        multipliers: α (n, F) ≥ 0, zero where a constraint is slack.
+        steps: Steps of the reference (n,), including steps past its end.
+        trajectory: Outputs (n, O), within the constraints.
+        multipliers: Multipliers α (n, F) ≥ 0, zero where a constraint is slack.
     """
 
     steps: np.ndarray
@@ -99,19 +100,19 @@ class Modification:
 
     @property
     def constrained(self) -> bool:
-        """True if some constraint had to be enforced."""
+        """True if a constraint is active."""
         return bool(self.multipliers.any())
 
 
 class LcNsKmp:
-    """A movement primitive that follows demonstrations, null-space actions and linear constraints.
+    """Movement primitive that follows demonstrations, null-space actions and linear constraints.
 
-    The input is the reference's clock, so that every matrix depends on the step alone: each step is factored when it
-    is first asked for, and a prediction is two small products, plus a QP where a constraint is not slack.
+    The input is the reference's clock, so that every matrix depends on the step alone. Each step is factored at its
+    first use; a prediction is two small products, and a QP only if a constraint is not slack.
 
     Attributes:
-        reference, kernel, lambda_, beta, horizon, history, history_variance, constraints, solver: as given.
-        cached_bytes: what the factored steps take now.
+        reference, kernel, lambda_, beta, horizon, history, history_variance, constraints, solver: Arguments.
+        cached_bytes: Memory of the factored steps [bytes].
     """
 
     def __init__(
@@ -127,22 +128,23 @@ class LcNsKmp:
         solver: str = "daqp",
         cache_bytes: int = 2**29,
     ):
-        """
+        """Check the arguments.
+
         Args:
-            reference: means and covariances of the demonstrations, N steps of O outputs.
-            kernel: k; `SquaredExponential(length_scale=0.5)`, the thesis's, unless given.
-            lambda_: λ, the regularization of problem 4.5, not negative.
-            beta: β, how strongly a null-space action pulls, not negative; λ + β is positive.
-            horizon: H, future points behind the executed one.
-            history: P, past outputs the motion passes through (sKGRL); 0 for none (KGRL).
-            history_variance: ρ [output²], how exactly it does, positive.
-            constraints: G y ≥ c at every future point; none unless given.
+            reference: Means and covariances of the demonstrations, N steps of O outputs.
+            kernel: k; the thesis's `SquaredExponential(length_scale=0.5)` by default.
+            lambda_: Regularization λ of problem 4.5, not negative.
+            beta: Weight β of a null-space action, not negative; λ + β is positive.
+            horizon: Number of future points H after the executed one.
+            history: Number of past outputs P that the motion passes through (sKGRL); 0 for none (KGRL).
+            history_variance: Variance ρ of the past outputs [output²], positive.
+            constraints: Constraints G y ≥ c at every future point; none by default.
             solver: "daqp", "piqp" or "osqp".
-            cache_bytes: how much memory factored steps may take before the oldest is forgotten.
+            cache_bytes: Memory limit of factored steps, after which the oldest is dropped [bytes].
 
         Raises:
-            InputError: if an argument is out of range, sizes don't fit, the problem is too badly scaled to keep a
-                bound of 1e-9, or the history's variance is too small for its length.
+            InputError: If an argument is out of range, sizes do not match, or the history's variance is too small for
+                its length.
         """
         for name, value in (("lambda_", lambda_), ("beta", beta)):
             if not (np.isfinite(value) and value >= 0):
@@ -175,31 +177,31 @@ class LcNsKmp:
         self._whole: StepFactor | None = None
         self._history_shape = (self.history, reference.num_outputs)
         if self.history:
-            self._features(0)  # refuses a history that no step could be conditioned on
+            self._features(0)  # refuses a history that the kernel cannot be conditioned on
 
     @property
     def num_outputs(self) -> int:
-        """O."""
+        """Number of outputs O."""
         return self.reference.num_outputs
 
     @property
     def num_steps(self) -> int:
-        """N; later steps are step N−1 again, so that the end is held."""
+        """Number of steps N; a later step repeats step N−1, which holds the end of the motion."""
         return self.reference.num_steps
 
     def predict(
         self, step: int, null_space_action: np.ndarray | None = None, history: np.ndarray | None = None
     ) -> Prediction:
-        """The output at `step` (equations 4.21 and 5.1).
+        """Compute the output at a step (equations 4.21 and 5.1).
 
         Args:
-            step: n ≥ 0; past the end, the last step.
-            null_space_action: ξ̂ (O,), in the output's units times a gain (see `gains`); zero unless given.
-            history: (P, O), the outputs at step−P … step−1, oldest first; None where P = 0.
+            step: Step n ≥ 0; past the end, the last step.
+            null_space_action: ξ̂ (O,), in the output's units times a gain (see `gains`); zero by default.
+            history: Outputs at step−P … step−1, oldest first, (P, O); None if P = 0.
 
         Raises:
-            InputError: if an argument has the wrong shape or is not finite.
-            UnsolvableError: if no window within the constraints was found: keep the last safe command.
+            InputError: If an argument has the wrong shape or is not finite.
+            UnsolvableError: If no window within the constraints was found; repeat the last safe command.
         """
         if step < 0:
             raise InputError(f"step counts from 0, not {step}")
@@ -215,18 +217,18 @@ class LcNsKmp:
         history: np.ndarray | None = None,
         history_inputs: np.ndarray | None = None,
     ) -> Prediction:
-        """The output at inputs that are not the reference's clock, such as a state: factored here and now.
+        """Compute the output at inputs that are not on the reference's clock, such as a state; nothing is cached.
 
         Args:
-            inputs: (H+1,) or (H+1, I), the executed point's first.
-            means, covariances: (H+1, O) and (H+1, O, O), the reference there.
-            null_space_action, history: (O,) and (P, O), as in `predict`.
-            history_inputs: (P,) or (P, I), where the history was.
+            inputs: Inputs of the window, (H+1,) or (H+1, I), the executed point first.
+            means, covariances: Reference at these inputs, (H+1, O) and (H+1, O, O).
+            null_space_action, history: As in `predict`, (O,) and (P, O).
+            history_inputs: Inputs of the history, (P,) or (P, I).
 
         Raises:
-            InputError: as `predict`, if shapes don't fit, or if constraints differ from step to step: they would need a
-                clock.
-            UnsolvableError: as `predict`.
+            InputError: As `predict`, if shapes do not match, or if the constraints differ from step to step, which
+                requires a clock.
+            UnsolvableError: As `predict`.
         """
         if self.constraints.num_steps is not None:
             raise InputError("constraints that differ from step to step need a clock: use predict")
@@ -246,7 +248,7 @@ class LcNsKmp:
         return self._finish(StepFactor(Window(means, covariances, G, c), features, self.lambda_, self.beta), x)
 
     def _finish(self, factor: StepFactor, x: np.ndarray) -> Prediction:
-        """The prediction of a factored window, corrected where a constraint is not slack."""
+        """Return the prediction of a factored window, corrected if a constraint is not slack."""
         output = factor.output_map @ x
         output += factor.output_offset
         free = factor.constraint_map @ x
@@ -262,21 +264,21 @@ class LcNsKmp:
     def modified_window(
         self, step: int, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None
     ) -> Modification:
-        """The window at `step` under null-space actions at several of its points (equations 4.17 and 4.18).
+        """Compute the window at a step under null-space actions at several of its points (equations 4.17 and 4.18).
 
-        With one action at `step` itself it is the window of `predict` (equation 4.21). Between the points the kernel
-        decides, as the minimum-norm weights do that reach all of the actions. It is factored anew at each call.
+        With one action at `step` itself this is the window of `predict` (equation 4.21). Between the points, actions
+        are interpolated by the minimum-norm weights of the kernel that reach all of them.
 
         Args:
-            step: n ≥ 0, the executed point; past the end, the last step.
-            at: (J,), different steps from n … n+H, in any order.
-            null_space_actions: ξ̂ (J, O), one at each of them.
+            step: Executed point n ≥ 0; past the end, the last step.
+            at: Different steps (J,) from n … n+H, in any order.
+            null_space_actions: ξ̂ (J, O), one for each of these steps.
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: if an argument has the wrong shape, is not finite or no step of the window, or if steps are so
-                near to each other that the kernel ties them together.
-            UnsolvableError: if no window within the constraints was found.
+            InputError: If an argument has the wrong shape, is not finite or is not a step of the window, or if steps
+                are so close that their kernel matrix is singular.
+            UnsolvableError: If no window within the constraints was found.
         """
         if step < 0:
             raise InputError(f"step counts from 0, not {step}")
@@ -287,19 +289,19 @@ class LcNsKmp:
     def modified_trajectory(
         self, at: ArrayLike, null_space_actions: ArrayLike, history: np.ndarray | None = None
     ) -> Modification:
-        """The whole motion under null-space actions at several of its points (equations 4.17 and 4.18).
+        """Compute the whole motion under null-space actions at several of its points (equations 4.17 and 4.18).
 
-        One problem 4.5 over all N steps, where `predict` solves one for each window: smooth over the whole motion, and
-        within the constraints everywhere. It is factored at the first call.
+        This solves one problem 4.5 over all N steps, whereas `predict` solves one for each window: the result is smooth
+        over the whole motion, and within the constraints everywhere. The problem is factored at the first call.
 
         Args:
-            at: (J,), different steps from 0 … N−1, in any order; none for the motion without actions.
-            null_space_actions: ξ̂ (J, O), one at each of them.
-            history: (P, O), the outputs before the first step; None where P = 0.
+            at: Different steps (J,) from 0 … N−1, in any order; none for the motion without actions.
+            null_space_actions: ξ̂ (J, O), one for each of these steps.
+            history: Outputs before the first step, (P, O); None if P = 0.
 
         Raises:
-            InputError: as `modified_window`.
-            UnsolvableError: as `modified_window`.
+            InputError: As `modified_window`.
+            UnsolvableError: As `modified_window`.
         """
         horizon = self.num_steps - 1
         if self._whole is None:
@@ -318,12 +320,12 @@ class LcNsKmp:
         history: np.ndarray | None,
     ) -> Modification:
         x = self._stack(None, history)
-        points = numbers(at, "the steps of null-space actions")
+        points = as_numbers(at, "the steps of null-space actions")
         if points.ndim != 1 or not np.isin(points, np.arange(step, step + horizon + 1)).all():
             raise InputError(f"null-space actions must be at steps among {step} … {step + horizon}: {brief(at)}")
         if len(np.unique(points)) < len(points):
             raise InputError(f"null-space actions must be at different steps, not {brief(at)}")
-        actions = np.atleast_2d(numbers(null_space_actions, "null-space actions"))
+        actions = np.atleast_2d(as_numbers(null_space_actions, "null-space actions"))
         shape = (len(points), self.num_outputs)
         if actions.shape != shape and actions.size + len(points) > 0:
             raise InputError(f"null-space actions at {len(points)} steps have shape {shape}, not {actions.shape}")
@@ -332,8 +334,8 @@ class LcNsKmp:
         actions = actions.reshape(shape)
         past, future = self._inputs(step, horizon)
         indices = points.astype(int) - step
-        wish = window_interpolation(self.kernel, past, future, self._history_noise, indices) @ actions
-        trajectory, signed = factor.modified(x, wish, self._solve)
+        action = window_interpolation(self.kernel, past, future, self._history_noise, indices) @ actions
+        trajectory, signed = factor.modified(x, action, self._solve)
         violation = factor.max_commanded_violation(trajectory)
         if not violation <= TOLERANCE:
             raise UnsolvableError(f"the solver left a violation of {violation:.1e}")
@@ -341,41 +343,41 @@ class LcNsKmp:
         return Modification(np.arange(step, step + horizon + 1), trajectory, alpha)
 
     def linear_response(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The free output of a step, R_h h + N ξ̂ + r: R_h (O, PO), N (O, O), r (O,), where no constraint is active."""
+        """Return R_h (O, PO), N (O, O) and r (O,) of the unconstrained output R_h h + N ξ̂ + r of a step."""
         factor = self._factor(step)
         split = self.history * self.num_outputs
         return factor.output_map[:, :split], factor.output_map[:, split:], factor.output_offset
 
     def free_constraints(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which windows need no correction: map (m, PO+O) of [history, ξ̂], and what it must lie between, (m,) each."""
+        """Return the map (m, PO+O) of [history, ξ̂] and its bounds (m,), within which a window needs no correction."""
         factor = self._factor(step)
         return factor.constraint_map, factor.lower, factor.upper
 
     def output_sizes(self, step: int) -> np.ndarray:
-        """How far a correction of size one can move each output of a step at most, (O,)."""
+        """Return the largest displacement (O,) of a step's output by a correction of norm one."""
         return self._factor(step).output_sizes()
 
     def factor_all(self) -> int:
-        """Factors every step now rather than when first asked for; returns the bytes that takes."""
+        """Factor every step in advance; return their memory [bytes]."""
         for step in range(self.num_steps):
             self._factor(step)
         return self.cached_bytes
 
     def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
-        """x = [history, null-space action], checked."""
+        """Check the arguments and return x = [history, null-space action]."""
         action = np.zeros(self.num_outputs) if null_space_action is None else np.asarray(null_space_action, dtype=float)
         if action.shape != (self.num_outputs,):
             raise InputError(f"a null-space action has shape ({self.num_outputs},), not {action.shape}")
         if self.history == 0:
             if history is not None and np.size(history):
                 raise InputError("this primitive has no history (P = 0): pass None")
-            x = action.copy()  # a prediction's trajectory is computed when it is asked for
+            x = action.copy()  # a `Prediction` uses it later
         else:
             past = np.asarray(history, dtype=float) if history is not None else np.zeros(0)
             if past.shape != self._history_shape:
                 raise InputError(f"the history has shape {self._history_shape}, oldest output first, not {past.shape}")
             x = np.concatenate((past.ravel(), action))
-        # One reduction instead of isfinite().all(): a NaN or an infinity anywhere makes the product not finite.
+        # One reduction instead of isfinite().all(): any NaN or infinity makes the product not finite.
         if not np.isfinite(x @ x):
             raise InputError("history and null-space action must be finite")
         return x
@@ -396,7 +398,7 @@ class LcNsKmp:
 
     @property
     def _history_noise(self) -> float:
-        """ħρ: what the history's covariance weighs against the kernel."""
+        """Weight ħρ of the history's covariance relative to the kernel."""
         return (self.lambda_ + self.beta) * self.history_variance
 
     def _window(self, step: int, horizon: int) -> Window:
@@ -406,49 +408,49 @@ class LcNsKmp:
         return Window(self.reference.means[held], self.reference.covariances[held], G, c)
 
     def _inputs(self, step: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        """The clock at the history (P,), and at the executed point and the horizon behind it (horizon+1,)."""
+        """Return the clock at the history (P,), and at the executed point and the horizon (horizon+1,)."""
         past = self.reference.inputs(np.arange(step - self.history, step))
         return past, self.reference.inputs(np.arange(step, step + horizon + 1))
 
     def _features(self, step: int) -> WindowFeatures:
         if self._shared_features is not None:
             return self._shared_features
-        alike = self.kernel.stationary and self.reference.uniform
-        # All steps' are the first one's, to the last bit: an answer must not depend on what was asked before.
-        past, future = self._inputs(0 if alike else step, self.horizon)
+        can_share = self.kernel.stationary and self.reference.uniform
+        # Shared features are those of step 0 to the last bit: a result must not depend on the order of calls.
+        past, future = self._inputs(0 if can_share else step, self.horizon)
         features = window_features(self.kernel, past, future, self._history_noise)
-        if alike:
+        if can_share:
             self._shared_features = features
         return features
 
 
-# Only while somebody uses one: a primitive's factored steps take megabytes.
-_USED: WeakValueDictionary[tuple[Any, ...], LcNsKmp] = WeakValueDictionary()
+# Weak references: the factored steps of a primitive take megabytes.
+_SHARED: WeakValueDictionary[tuple[Any, ...], LcNsKmp] = WeakValueDictionary()
 
 
-def shared_primitive(
+def get_shared_primitive(
     reference: ReferenceTrajectory, constraints: LinearConstraints, kernel: Kernel, **arguments: Any
 ) -> LcNsKmp:
-    """The primitive of these numbers: the one that is in use, or a new one.
+    """Return the primitive of these arguments that is in use, or a new one.
 
-    A primitive answers the same whatever it was asked before; what it remembers are factored steps. Nobody who gets
-    one from here may change it.
+    Primitives can be shared because their state, the factored steps, does not change results. The caller must not
+    modify the primitive.
 
     Args:
-        reference, constraints: of `LcNsKmp`.
-        kernel: of `LcNsKmp`; kernels that compare equal are the same.
-        arguments: numbers and names, of `LcNsKmp`.
+        reference, constraints: As in `LcNsKmp`.
+        kernel: As in `LcNsKmp`; kernels that compare equal are the same.
+        arguments: Further arguments of `LcNsKmp`, numbers and names.
 
     Raises:
-        InputError: as `LcNsKmp` does.
+        InputError: As `LcNsKmp`.
     """
     arrays = (reference.times, reference.means, reference.covariances, constraints.G, constraints.c)
     digest = hashlib.blake2b(digest_size=16)
     for array in arrays:
         digest.update(repr(array.shape).encode() + np.ascontiguousarray(array, dtype=float).tobytes())
     key = (digest.digest(), kernel, *sorted(arguments.items()))
-    found = _USED.get(key)
-    if found is None:
-        found = LcNsKmp(reference, kernel=kernel, constraints=constraints, **arguments)
-        _USED[key] = found
-    return found
+    primitive = _SHARED.get(key)
+    if primitive is None:
+        primitive = LcNsKmp(reference, kernel=kernel, constraints=constraints, **arguments)
+        _SHARED[key] = primitive
+    return primitive

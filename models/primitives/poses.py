@@ -1,4 +1,4 @@
-"""Poses as outputs of a primitive: six numbers in a target frame, without jumps (thesis, section 4.4.2)."""
+"""Poses as outputs of a primitive: six continuous numbers in a target frame (thesis, section 4.4.2)."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -25,19 +25,19 @@ def pose_outputs(
     orientation: Orientation = "euler_zyx",
     near: np.ndarray | None = None,
 ) -> np.ndarray:
-    """p_TE and R_TE as (N, 6): position [m], then orientation [rad], of the end-effector E in the target frame T.
+    """Compute p_TE and R_TE of the end-effector E in the target frame T as outputs (N, 6) [m, rad].
 
     Args:
-        positions: p_WE (N, 3).
-        quaternions_wxyz: R_WE (N, 4), of any length but zero, of either sign.
+        positions: p_WE (N, 3) [m].
+        quaternions_wxyz: R_WE (N, 4), of either sign and of any length except zero.
         target_position, target_quaternion_wxyz: X_WT, (3,) and (4,).
-        orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", for motions
-            that turn by about a half turn.
-        near: (3,), the orientation numbers that the first sample is continued from; those of least magnitude unless
-            given. Demonstrations of one motion must share a branch, or their mean is meaningless.
+        orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", for rotations
+            of about a half turn.
+        near: Orientation (3,) [rad] that the first sample is continued from; the one of least magnitude by default.
+            Demonstrations of one motion must share a branch, or their mean is meaningless.
 
     Raises:
-        InputError: if shapes don't fit, a quaternion is zero, a number is not finite, or Euler angles go singular.
+        InputError: If shapes do not match, a quaternion is zero, a number is not finite, or Euler angles are singular.
     """
     positions, quaternions = np.asarray(positions, dtype=float), np.asarray(quaternions_wxyz, dtype=float)
     if positions.ndim != 2 or positions.shape[1] != 3 or quaternions.shape != (len(positions), 4):
@@ -49,7 +49,7 @@ def pose_outputs(
     if not (np.isfinite(target_position).all() and np.isfinite(target_quaternion_wxyz).all()):
         raise InputError("the target's pose must be finite")
     if np.linalg.norm(quaternions, axis=1).min() < 1e-6 or np.linalg.norm(target_quaternion_wxyz) < 1e-6:
-        raise InputError("a quaternion of length zero is no orientation")
+        raise InputError("a quaternion of length zero has no orientation")
     R_WT = Rotation.from_quat(target_quaternion_wxyz, scalar_first=True)
     p_TE = R_WT.inv().apply(positions - np.asarray(target_position, dtype=float))
     R_TE = R_WT.inv() * Rotation.from_quat(quaternions, scalar_first=True)
@@ -63,11 +63,11 @@ def pose_outputs(
 
 
 def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "euler_zyx") -> Rotation:
-    """R_TE of the last three numbers of `pose_outputs`.
+    """Return R_TE of the last three outputs of `pose_outputs`.
 
     Args:
-        orientation_numbers: (3,) or (N, 3) [rad].
-        orientation: as in `pose_outputs`.
+        orientation_numbers: Orientation outputs, (3,) or (N, 3) [rad].
+        orientation: As in `pose_outputs`.
     """
     if orientation == "euler_zyx":
         return Rotation.from_euler("ZYX", orientation_numbers)
@@ -82,16 +82,16 @@ def pose_demonstrations(
     target_quaternion_wxyz: np.ndarray | None = None,
     orientation: Orientation = "euler_zyx",
 ) -> Demonstrations:
-    """Recorded end-effector poses as demonstrations of six outputs.
+    """Build demonstrations of six outputs from recorded end-effector poses.
 
     Args:
-        times, positions, quaternions_wxyz: M × (N_m,), (N_m, 3), (N_m, 4), in any common frame W.
-        target_position, target_quaternion_wxyz: X_WT, (3,) and (4,); each demonstration's own last pose unless given,
-            as in the thesis (section 4.4.2).
-        orientation: as in `pose_outputs`.
+        times, positions, quaternions_wxyz: M arrays (N_m,), (N_m, 3) and (N_m, 4), in any common frame W.
+        target_position, target_quaternion_wxyz: X_WT, (3,) and (4,); each demonstration's last pose by default, as in
+            the thesis (section 4.4.2).
+        orientation: As in `pose_outputs`.
 
     Raises:
-        InputError: as `pose_outputs` and `Demonstrations`.
+        InputError: As `pose_outputs` and `Demonstrations`.
     """
     outputs: list[np.ndarray] = []
     for p, q in zip(positions, quaternions_wxyz, strict=True):
@@ -103,19 +103,19 @@ def pose_demonstrations(
 
 
 def _continued(angles: np.ndarray, near: np.ndarray | None) -> np.ndarray:
-    """Angles without jumps of a full turn, on the branch of `near`."""
+    """Remove full-turn jumps from angles (N, 3), on the branch of `near`."""
     angles = np.unwrap(angles, axis=0)
     start = np.zeros(3) if near is None else near
     return angles - 2 * np.pi * np.round((angles[0] - start) / (2 * np.pi))
 
 
 def _continued_vectors(vectors: np.ndarray, near: np.ndarray | None) -> np.ndarray:
-    """Rotation vectors without jumps: each is the equivalent r + 2πk r/‖r‖ nearest to the one before."""
+    """Replace each rotation vector (N, 3) by the equivalent r + 2πk r/‖r‖ nearest to its predecessor."""
     vectors = np.array(vectors)
     last = np.zeros(3) if near is None else near
     for i, r in enumerate(vectors):
         angle = np.linalg.norm(r)
-        # Near zero the axis is the previous one's: the rotation alone does not have one.
+        # A rotation near zero has no axis of its own: use the previous one.
         axis = r / angle if angle > 1e-9 else last / max(float(np.linalg.norm(last)), 1e-300)
         turns = np.round((axis @ last - angle) / (2 * np.pi))
         vectors[i] = last = (angle + 2 * np.pi * turns) * axis

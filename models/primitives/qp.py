@@ -1,9 +1,12 @@
-"""The quadratic program of a constrained primitive in least-norm form, and who solves it.
+"""Quadratic program of a constrained primitive in least-norm form, and its solvers.
 
-Of the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = ḠᵀSḠ, the Hessian is rank-deficient and badly scaled
-(largest eigenvalue 6e-6 for a connector), which costs a first-order solver the very millimetres it is there to guard.
-With S = L Lᵀ the same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄: an identity Hessian, and rows that can be scaled
-to unit length, so that a solver's tolerance is one on the output itself.
+In the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = ḠᵀSḠ, the Hessian is rank-deficient and badly scaled
+(largest eigenvalue 6e-6 for a connector): a first-order solver misses the bound by up to millimetres. With S = L Lᵀ the
+same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity, and its rows can be scaled to unit
+length, so that a solver's tolerance is a tolerance on the output itself.
+
+`qpsolvers` does not replace the adaptors: it has one-sided rows only, which doubles them (DAQP takes 1.8 times as long),
+and it has no second tolerance, no margin and no check of an inaccurate result.
 """
 
 from collections.abc import Callable
@@ -13,14 +16,14 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 
-OPENED = (1e-10, 1e-9)
-"""Parts of the greatest correction that bounds are opened by, in turn, until a solver finds something between them."""
+RELAXATIONS = (1e-10, 1e-9)
+"""Amounts by which bounds are relaxed in turn until a solver succeeds, relative to the largest correction."""
 
 Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class UnsolvableError(RuntimeError):
-    """No solution within the solver's tolerance: the caller must fall back to its last safe command."""
+    """Error of a problem without a solution within tolerance; the caller must repeat its last safe command."""
 
 
 def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -28,7 +31,7 @@ def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
 
     size = rows.shape[1]
     problem = _identity(size), np.zeros(size), rows, upper, lower, np.zeros(len(rows), dtype=np.int32)
-    # The tighter the tolerance the nearer a degenerate problem is to cycling: ask for less only then.
+    # A degenerate problem can cycle at a tight tolerance: retry with a looser one.
     for tolerance in (1e-12, 1e-10):
         v, _, flag, info = daqp.solve(*problem, primal_tol=tolerance)
         if flag >= 1:
@@ -47,7 +50,7 @@ def _piqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
     solver.settings.eps_abs = solver.settings.eps_rel = 1e-13
     solver.setup(_identity(size), np.zeros(size), None, None, rows, lower, upper, None, None)
     status = solver.solve()
-    # Out of iterations it may still be good enough.
+    # A result at the iteration limit may still be accurate enough.
     inside = status.name == "PIQP_MAX_ITER_REACHED" and _is_inside(rows @ solver.result.x, lower, upper)
     if not (inside or status.name == "PIQP_SOLVED"):
         raise UnsolvableError(f"PIQP ended with {status.name}")
@@ -59,7 +62,7 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
     from scipy import sparse
 
     size = rows.shape[1]
-    # A first-order solver meets a bound up to its tolerance: asked for a little more than the bound, it keeps it.
+    # A first-order solver satisfies a bound up to its tolerance: with a margin it satisfies the bound itself.
     margin = np.minimum(1e-8, (upper - lower) / 4)
     solver = osqp.OSQP()
     solver.setup(
@@ -75,7 +78,7 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
         max_iter=20_000,
     )
     result = solver.solve(raise_error=False)
-    # Inaccurate, or out of iterations, it may still be good enough.
+    # An inaccurate result, or one at the iteration limit, may still be accurate enough.
     solved = result.info.status_val == 1
     if not solved and not (result.info.status_val in (2, 7) and _is_inside(rows @ result.x, lower, upper)):
         raise UnsolvableError(f"OSQP ended with '{result.info.status}'")
@@ -83,7 +86,7 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
 
 
 def _is_inside(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Nearly: whoever asked checks the command itself against the bound."""
+    """Return True if the bounds hold up to 1e-6; the caller checks the command itself against the bounds."""
     return bool((values >= lower - 1e-6).all() and (values <= upper + 1e-6).all())
 
 
@@ -104,42 +107,42 @@ def find_solver(name: str) -> Solver:
 def solve_least_norm(
     rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: Solver = _daqp
 ) -> tuple[np.ndarray, np.ndarray]:
-    """min ½‖v‖² subject to lower ≤ rows v ≤ upper.
+    """Solve min ½‖v‖² subject to lower ≤ rows v ≤ upper.
 
     Args:
         rows: (m, r), rows of unit length (or zero).
         lower, upper: (m,), ±inf where there is no bound; at least one of them excludes v = 0.
-        solver: one of `SOLVERS`.
+        solver: One of `SOLVERS`.
 
     Returns:
-        v (r,), and the multipliers (m,): v = −rowsᵀ multipliers, positive where `upper` is active, negative where
+        v (r,), and the multipliers (m,) with v = −rowsᵀ multipliers: positive where `upper` is active, negative where
         `lower` is.
 
     Raises:
-        UnsolvableError: if the solver finds no solution.
+        UnsolvableError: If the solver finds no solution.
     """
-    # The problem is homogeneous: at unit scale the solver's absolute tolerance is a relative one.
+    # The problem is homogeneous: at unit scale the solver's absolute tolerance is relative to the correction.
     scale = max(lower.max(), -upper.min())
     lower, upper = lower / scale, upper / scale
     try:
         v, multipliers = solver(rows, lower, upper)
     except UnsolvableError:
-        v, multipliers = _solve_opened(rows, lower, upper, solver)
+        v, multipliers = _solve_relaxed(rows, lower, upper, solver)
     return scale * v, scale * multipliers
 
 
-def _solve_opened(
+def _solve_relaxed(
     rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: Solver
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same between bounds that are a little further apart.
+    """Solve the problem with relaxed bounds.
 
-    Many rows of bounds that leave a point and no room, as of an output that may not move, are equations to a solver
-    that contradict each other in their last digits. Whoever asked checks what comes of it against the bounds.
+    Bounds with no room between them, such as those of an output that must not move, are equations to a solver, and many
+    rows of them contradict each other in their last digits. The caller checks the result against the bounds.
     """
-    *tried, last = OPENED
-    for opened in tried:
+    *first, last = RELAXATIONS
+    for relaxation in first:
         with suppress(UnsolvableError):
-            return solver(rows, lower - opened, upper + opened)
+            return solver(rows, lower - relaxation, upper + relaxation)
     return solver(rows, lower - last, upper + last)
 
 
@@ -147,5 +150,5 @@ _identities: dict[int, np.ndarray] = {}
 
 
 def _identity(size: int) -> np.ndarray:
-    """A shared identity: a QP of every control step needs one, and making it costs as much as solving."""
+    """Return a shared identity matrix: building one for each QP costs as much as solving it."""
     return _identities.setdefault(size, np.eye(size))

@@ -1,43 +1,58 @@
-"""The reference trajectory: what demonstrations have in common, and how sure they are of it (thesis, 2.2.3-2.2.5)."""
+"""Reference trajectory: the mean and covariance of demonstrations over time (thesis, sections 2.2.3 to 2.2.5).
+
+scikit-learn fits the Gaussian mixture; this module adds its initialization and the regression on time.
+"""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from guiderail.models.common.arrays import numbers
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel
-from guiderail.models.primitives.mixture import fit_mixture, regress
 
-# Below this, relative to a covariance's own largest variance, a direction is singular in double precision.
+# Importing scikit-learn takes over a second, and reading a file does not need it.
+if TYPE_CHECKING:
+    from sklearn.mixture import GaussianMixture
+
+# Smallest eigenvalue of a correlation matrix that is regular in double precision.
 _SINGULAR = 1e-13
+# Variance added to every component, relative to the data's own: EM needs it where demonstrations coincide.
+_REGULARIZATION = 1e-6
+_MAX_COMPONENTS = 20
+VIA_POINT_VARIANCE = 1e-4  # relative to the kernel's own: contradicting via-points are averaged to this accuracy
 
 
 class ReferenceTrajectory:
-    """Means and covariances of O outputs at N instants: T_r = {μ̂_n, Σ̂_n} (thesis, 2.2.7).
+    """Means and covariances of O outputs at N instants, T_r = {μ̂_n, Σ̂_n} (thesis, 2.2.7).
 
     Attributes:
-        times: (N,), increasing.
-        means: (N, O).
-        covariances: (N, O, O), symmetric positive definite.
+        times: Times (N,), increasing [s or phase].
+        means: Means (N, O) [unit of the output].
+        covariances: Covariances (N, O, O), symmetric positive definite [unit²].
+        uniform: True if all time steps are equal up to rounding.
     """
 
     def __init__(self, times: np.ndarray, means: np.ndarray, covariances: np.ndarray):
-        """
+        """Check and store the arrays, which become read-only.
+
         Args:
-            times: (N,), strictly increasing [s or phase], at least two.
-            means: (N, O) [unit of the output].
-            covariances: (N, O, O) [unit²].
+            times: Times (N,), strictly increasing, at least two [s or phase].
+            means: Means (N, O) [unit of the output].
+            covariances: Covariances (N, O, O) [unit²].
 
         Raises:
-            InputError: if shapes don't fit, a number is not finite, times don't increase, or a covariance is not
+            InputError: If shapes do not match, a number is not finite, times do not increase, or a covariance is not
                 symmetric or not positive definite.
         """
-        self.times, self.means = numbers(times, "times"), numbers(means, "means")
-        self.covariances = numbers(covariances, "covariances")
+        self.times, self.means = as_numbers(times, "times"), as_numbers(means, "means")
+        self.covariances = as_numbers(covariances, "covariances")
         if self.times.ndim != 1 or len(self.times) < 2:
             raise InputError(f"a reference trajectory needs at least two times of shape (N,), not {self.times.shape}")
         n = len(self.times)
@@ -53,10 +68,9 @@ class ReferenceTrajectory:
             raise InputError("the reference's times must increase strictly")
         self._check_covariances()
         for values in (self.times, self.means, self.covariances):
-            values.setflags(write=False)  # skills and environments of a process share it
+            values.setflags(write=False)  # environments of a process share it
         step = (self.times[-1] - self.times[0]) / (n - 1)
         grid = self.times[0] + step * np.arange(n)
-        #: True if all time steps are the same up to rounding.
         self.uniform = bool(np.abs(self.times - grid).max() <= 1e-12 * np.abs(self.times).max())
 
     @classmethod
@@ -68,18 +82,18 @@ class ReferenceTrajectory:
         num_steps: int | None = None,
         floor: float | np.ndarray = 0.0,
     ) -> ReferenceTrajectory:
-        """A Gaussian mixture of (time, output), regressed on time (equation 2.12 and GMR).
+        """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR).
 
         Args:
-            demonstrations: M of them; resampled onto one clock where theirs differ.
-            components: C; chosen by the Bayesian information criterion unless given.
-            seed: of the mixture's initialization.
-            num_steps: N; as many as the longest demonstration has unless given.
-            floor: a standard deviation [unit of the output], (O,) or scalar, that is added to every covariance: what a
-                sensor resolves or a controller holds, where demonstrations agree better than that.
+            demonstrations: Demonstrations, resampled to one clock if theirs differ.
+            components: Number of components C; chosen by the Bayesian information criterion by default.
+            seed: Seed of the mixture's initialization.
+            num_steps: Number of steps N; that of the longest demonstration by default.
+            floor: Standard deviation, (O,) or scalar, added to every covariance [unit of the output]: the resolution of
+                a sensor or a controller, where demonstrations agree better than that.
 
         Raises:
-            InputError: if an argument is out of range, or the demonstrations leave a covariance singular.
+            InputError: If an argument is out of range, or a covariance is singular.
         """
         demonstrations = demonstrations.resampled(num_steps)
         times, outputs = demonstrations.times[0], np.stack(demonstrations.outputs)
@@ -92,21 +106,21 @@ class ReferenceTrajectory:
 
     @property
     def num_steps(self) -> int:
-        """N."""
+        """Number of steps N."""
         return len(self.times)
 
     @property
     def num_outputs(self) -> int:
-        """O."""
+        """Number of outputs O."""
         return self.means.shape[1]
 
     @property
     def standard_deviations(self) -> np.ndarray:
-        """(N, O) [unit of the output]."""
+        """Standard deviations (N, O) [unit of the output]."""
         return np.sqrt(np.einsum("noo->no", self.covariances))
 
     def inputs(self, steps: np.ndarray) -> np.ndarray:
-        """Times (n,) [s] at any steps (n,): before the first and after the last, the clock goes on as it does there."""
+        """Return times (n,) [s] at steps (n,); the clock is extrapolated before the first and after the last step."""
         last = self.num_steps - 1
         inside = self.times[np.clip(steps, 0, last)]
         before = np.minimum(steps, 0) * (self.times[1] - self.times[0])
@@ -120,7 +134,7 @@ class ReferenceTrajectory:
         if asymmetry[worst] > 1e-9 * size[worst]:
             raise InputError(f"the covariance at step {worst} is not symmetric")
         self.covariances = (self.covariances + self.covariances.transpose(0, 2, 1)) / 2
-        # Outputs may have very different units; correlation has none, and is what singular means.
+        # Singularity is tested on correlations: outputs may have very different units.
         deviations = np.sqrt(np.maximum(np.einsum("noo->no", self.covariances), 0))
         bad = (deviations <= 0).any(axis=1)
         scaled = self.covariances / np.where(bad[:, None, None], 1, deviations[:, :, None] * deviations[:, None, :])
@@ -132,21 +146,18 @@ class ReferenceTrajectory:
             )
 
 
-EXACTNESS = 1e-4  # variance of a via-point, as a part of the kernel's own: how far several that disagree are averaged
-
-
 def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel: Kernel) -> ReferenceTrajectory:
-    """The reference with a mean that passes through via-points; its covariances stay.
+    """Displace the mean of a reference so that it passes through via-points; the covariances do not change.
 
-    The displacement between via-points is the mean of a Gaussian process that is zero far from all of them.
+    The displacement is the mean of a Gaussian process, which is zero far from all via-points.
 
     Args:
-        reference: what was demonstrated.
-        points: for each via-point its step and its output, 1 + O numbers, one after another.
+        reference: Reference of the demonstrations.
+        points: The step and the output of each via-point, 1 + O numbers, one via-point after another.
         kernel: Covariance of the process.
 
     Raises:
-        InputError: if these are not rows of a step and O finite numbers, or there is no such step.
+        InputError: If `points` are not rows of a step and O finite numbers, or there is no such step.
     """
     size = 1 + reference.num_outputs
     if len(points) % size or not np.isfinite(points).all():
@@ -159,6 +170,143 @@ def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel
         raise InputError(f"a via-point's step is a whole number from 0 to {reference.num_steps - 1}")
     at = steps.astype(int)
     times = reference.times
-    K = kernel(times[at], times[at]) + EXACTNESS * np.eye(len(at))
+    K = kernel(times[at], times[at]) + VIA_POINT_VARIANCE * np.eye(len(at))
     displacement = kernel(times, times[at]) @ np.linalg.solve(K, rows[:, 1:] - reference.means[at])
     return ReferenceTrajectory(times, reference.means + displacement, reference.covariances)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Joint Gaussian mixture of (time, outputs), in units of the data's own standard deviations.
+
+    Attributes:
+        weights: Weights of the components (C,).
+        means: Means (C, 1 + O).
+        covariances: Covariances (C, 1 + O, 1 + O).
+        center: Mean of the data (1 + O,) [s, unit of the output].
+        scale: Standard deviations of the data (1 + O,) [s, unit of the output].
+    """
+
+    weights: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
+    center: np.ndarray
+    scale: np.ndarray
+
+
+def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, seed: int) -> Mixture:
+    """Fit C components to M demonstrations by expectation maximization, initialized with C equal slices of time.
+
+    With this initialization the components stay in order along the motion. With a random one, several of them share a
+    wide region and blur a narrow one.
+
+    Args:
+        times: Common clock (N,) [s].
+        outputs: Outputs (M, N, O).
+        components: Number of components C. By default the one of least Bayesian information criterion among 1 to 20,
+            where the search stops once two numbers in a row are not better than the best before.
+        seed: Seed of scikit-learn's generator.
+
+    Raises:
+        InputError: If there are fewer points than the components need.
+    """
+    _, center, scale = _standardize(times, outputs)
+    candidates = [components] if components is not None else range(1, min(_MAX_COMPONENTS, len(times) // 2) + 1)
+    best, _ = min(_fit_candidates(times, outputs, candidates, seed).values(), key=lambda fit: fit[1])
+    return Mixture(best.weights_, best.means_, best.covariances_, center, scale)
+
+
+def information_criteria(
+    times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
+) -> dict[int, float]:
+    """Compute the Bayesian information criterion of mixtures by number of components; less is better.
+
+    Args:
+        times, outputs, seed: As in `fit_mixture`.
+        candidates: Increasing numbers of components; the search stops once two in a row are not better than the best
+            before.
+
+    Raises:
+        InputError: If there are fewer points than the components need.
+    """
+    return {count: criterion for count, (_, criterion) in _fit_candidates(times, outputs, candidates, seed).items()}
+
+
+def _fit_candidates(
+    times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
+) -> dict[int, tuple[GaussianMixture, float]]:
+    """Return mixtures and their criteria by number of components, until two in a row are not better."""
+    for count in candidates:
+        if not 1 <= count <= len(times) // 2:
+            raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")
+    data, _, _ = _standardize(times, outputs)
+    phase = np.tile(np.arange(len(times)), len(outputs)) / len(times)  # of each sample, from 0 to below 1
+    fits: dict[int, tuple[GaussianMixture, float]] = {}
+    for count in candidates:
+        mixture = _fit(data, phase, count, seed)
+        fits[count] = mixture, float(mixture.bic(data))
+        criteria = [criterion for _, criterion in fits.values()]
+        if len(criteria) > 2 and min(criteria[-2:]) > min(criteria[:-2]):
+            break
+    return fits
+
+
+def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute Gaussian mixture regression on time.
+
+    Conditioned on time, each component is a line with a constant covariance. The result is the mean and the covariance
+    of their mixture, weighted by the likelihood of the time under each component.
+
+    Args:
+        mixture: Mixture of (time, outputs).
+        times: Times (N,) [s].
+
+    Returns:
+        Means (N, O) and covariances (N, O, O).
+    """
+    offset = (times[:, None] - mixture.center[0]) / mixture.scale[0] - mixture.means[:, 0]  # (N, C)
+    variance, across = mixture.covariances[:, 0, 0], mixture.covariances[:, 1:, 0]
+    log = np.log(mixture.weights) - 0.5 * (np.log(variance) + offset**2 / variance)
+    weights = np.exp(log - log.max(axis=1, keepdims=True))  # without underflow far from every component
+    weights /= weights.sum(axis=1, keepdims=True)
+    slopes = across / variance[:, None]
+    lines = mixture.means[:, 1:] + offset[..., None] * slopes  # (N, C, O)
+    within = mixture.covariances[:, 1:, 1:] - slopes[:, :, None] * across[:, None, :]
+    means = np.einsum("nc,nco->no", weights, lines)
+    apart = lines - means[:, None, :]
+    covariances = np.einsum("nc,cop->nop", weights, within) + np.einsum("nc,nco,ncp->nop", weights, apart, apart)
+    covariances = (covariances + covariances.transpose(0, 2, 1)) / 2
+    scale = mixture.scale[1:]
+    return means * scale + mixture.center[1:], covariances * scale[:, None] * scale
+
+
+def _standardize(times: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return samples (M·N, 1 + O) of time and outputs, standardized, with their center and scale (1 + O,)."""
+    data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
+    center, deviation = data.mean(axis=0), data.std(axis=0)
+    # The deviation of a constant output is a rounding error of its mean.
+    moves = deviation > 1e-12 * np.abs(data).max(axis=0)
+    scale = np.where(moves, deviation, 1.0)
+    return (data - center) / scale, center, scale
+
+
+def _fit(data: np.ndarray, phase: np.ndarray, components: int, seed: int) -> GaussianMixture:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+
+    label = np.minimum((phase * components).astype(int), components - 1)
+    parts = [data[label == c] for c in range(components)]
+    floor = 10 * _REGULARIZATION * np.eye(data.shape[1])
+    mixture = GaussianMixture(
+        components,
+        reg_covar=_REGULARIZATION,
+        max_iter=300,
+        random_state=seed,
+        weights_init=np.full(components, 1 / components),
+        means_init=np.array([part.mean(axis=0) for part in parts]),
+        precisions_init=np.array([np.linalg.inv(np.cov(part.T) + floor) for part in parts]),
+    )
+    with warnings.catch_warnings():
+        # EM that starts near its optimum is accurate enough long before scikit-learn's tolerance is met.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return mixture.fit(data)

@@ -1,4 +1,4 @@
-"""One step of an LC-NS-KMP: everything that depends on the window alone, computed once."""
+"""Factored optimization problem of one window of an LC-NS-KMP."""
 
 from dataclasses import dataclass
 
@@ -8,18 +8,18 @@ from scipy.linalg import solve_triangular
 from guiderail.models.primitives.features import WindowFeatures
 from guiderail.models.primitives.qp import Solver, solve_least_norm
 
-# Directions of the constraint rows (of unit length) below this are rounding: they would only make the QP larger.
+# Smallest singular value of the unit constraint rows, relative to the largest; smaller ones are rounding errors.
 _NEGLIGIBLE = 1e-13
 
 
 @dataclass(frozen=True)
 class Window:
-    """What is known about the executed point (the first) and the horizon behind it.
+    """Reference and constraints at the executed point, which comes first, and at the horizon after it.
 
     Attributes:
-        means: (H+1, O).
-        covariances: (H+1, O, O), positive definite.
-        G, c: (H+1, F, O) and (H+1, F), constraints G y ≥ c.
+        means: Reference means (H+1, O).
+        covariances: Reference covariances (H+1, O, O), positive definite.
+        G, c: Constraints G y ≥ c, (H+1, F, O) and (H+1, F).
     """
 
     means: np.ndarray
@@ -30,9 +30,9 @@ class Window:
 
 @dataclass(frozen=True)
 class _Solution:
-    """The whole window as a function of x = [history, null-space action], where no constraint is active.
+    """Solution of the unconstrained window as a function of x = [history, null-space action].
 
-    y = L (latent_mean + latent_map x) + direct_map history, and a correction v moves it by L v.
+    The window is y = L (latent_mean + latent_map x) + direct_map history; a correction v adds L v.
     """
 
     whiten: np.ndarray  # Σ^(-1/2), (H+1, O, O)
@@ -43,29 +43,38 @@ class _Solution:
     direct_map: np.ndarray
 
     def rows(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The map (n, PO+O) and the offset (n,) that give the rows `at` of y from x."""
+        """Return the map (n, PO+O) and the offset (n,) from x to the rows `at` of y."""
         map_ = self.L[at] @ self.latent_map
         map_[:, : self.direct_map.shape[1]] += self.direct_map[at]
         return map_, self.L[at] @ self.latent_mean
 
 
 class StepFactor:
-    """The factored problem 4.5 of one window, in terms of x = [history, null-space action].
+    """Factored problem 4.5 of one window, as a function of x = [history, null-space action].
 
-    With y = W̄h + F̄w for weights w of unit prior, problem 4.5 is a regularized least-squares problem in w; its QR
-    factor gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ directly, without ever forming Σ⁻¹ or K⁻¹ (equation 4.12, read in weights).
-    The window is then linear in x, and the executed point and the constrained directions are rows of it. Only those
-    rows are kept: the rest of the window is solved for again when somebody wants to look at it.
+    With y = W̄h + F̄w for weights w of unit prior, problem 4.5 is a regularized least-squares problem in w. Its QR factor
+    gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ directly, without forming Σ⁻¹ or K⁻¹ (equation 4.12 in terms of weights). The window
+    is linear in x; the executed point and the constrained directions are rows of it. Only those rows are stored: the
+    rest of the window is solved for again on request.
 
     Attributes:
-        output_map, output_offset: (O, PO+O) and (O,), the executed point from x.
-        constraint_map, lower, upper: (m, PO+O), (m,), (m,): constrained directions from x, and their bounds, each in
-            units of how far its direction can move.
-        constraint_rows: (m, r), unit rows that a correction v moves those directions by.
-        correction_map: (O, r), what v does to the executed point.
+        output_map, output_offset: Map (O, PO+O) and offset (O,) from x to the executed point.
+        constraint_map: Map (m, PO+O) from x to the constrained directions, each scaled by the inverse of its largest
+            displacement.
+        lower, upper: Bounds (m,) of the constrained directions, less their offset and scaled alike.
+        constraint_rows: Unit rows (m, r), the map from a correction v to the constrained directions.
+        correction_map: Map (O, r) from a correction v to the executed point.
     """
 
     def __init__(self, window: Window, features: WindowFeatures, lambda_: float, beta: float):
+        """Factor the problem.
+
+        Args:
+            window: Reference and constraints.
+            features: Kernel of the window's inputs, given the history.
+            lambda_: λ of problem 4.5.
+            beta: β of problem 4.5.
+        """
         self._window, self._features, self._hbar, self._beta = window, features, lambda_ + beta, beta
         outputs = window.means.shape[1]
         solution = self._solve()
@@ -82,7 +91,7 @@ class StepFactor:
         R = np.linalg.qr(np.vstack([whitened, np.sqrt(self._hbar) * np.eye(rank * outputs)]), mode="r")
         eye = np.eye(outputs)
         F_bar = np.einsum("jk,oi->joki", F, eye).reshape(steps * outputs, rank * outputs)
-        # Lw = Σ^(-1/2) L. L follows from the features, not from Σ^(1/2) Lw: the former is exact where Σ is tiny.
+        # L is computed from the features and not as Σ^(1/2) Lw: the former is exact where Σ is tiny.
         L = solve_triangular(R, F_bar.T, trans="T", check_finite=False).T
         Lw = solve_triangular(R, whitened.T, trans="T", check_finite=False).T
         # Data terms: L Lᵀ Σ⁻¹ μ of the means, and W̄ − L Lᵀ Σ⁻¹ W̄ of the history.
@@ -125,22 +134,26 @@ class StepFactor:
         self.correction_map = solution.L[:outputs] @ self._basis
 
     def correct(self, free: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray]:
-        """The least-norm correction v of a window whose constrained directions come out as `free` (m,).
+        """Compute the least-norm correction of a window.
+
+        Args:
+            free: Constrained directions of the unconstrained window, `constraint_map @ x`, (m,).
+            solver: Solver of the least-norm problem.
 
         Returns:
-            v (r,), such that the executed point moves by `correction_map @ v`, and the solver's multipliers (m,).
+            The correction v (r,), which moves the executed point by `correction_map @ v`, and the multipliers (m,).
 
         Raises:
-            UnsolvableError: if the solver finds none.
+            UnsolvableError: If the solver finds no solution.
         """
         return solve_least_norm(self.constraint_rows, self.lower - free, self.upper - free, solver)
 
     def output_sizes(self) -> np.ndarray:
-        """How far a correction of size one can move each output of the executed point at most, (O,)."""
+        """Return the largest displacement (O,) of the executed point by a correction of norm one."""
         return np.linalg.norm(self._solve().L[: self._window.means.shape[1]], axis=1)
 
     def multipliers(self, signed: np.ndarray) -> np.ndarray:
-        """α (H+1, F) ≥ 0 of the solver's (m,), which are positive at an upper and negative at a lower bound."""
+        """Return α (H+1, F) ≥ 0 for multipliers (m,) that are positive at an upper and negative at a lower bound."""
         directions, first, second = self._directions
         signed = (signed * self._scale).reshape(-1, len(directions))
         alpha = np.zeros(self.multipliers_shape)
@@ -149,11 +162,11 @@ class StepFactor:
         return alpha
 
     def violation(self, output: np.ndarray) -> float:
-        """max(c − G y) of an output (O,) at the executed point; there is at least one constraint."""
+        """Return max(c − G y) of an output (O,) at the executed point; at least one constraint must exist."""
         return float((self._window.c[0] - self._window.G[0] @ output).max())
 
     def trajectory(self, x: np.ndarray, v: np.ndarray | None) -> np.ndarray:
-        """The whole window (H+1, O), corrected by v if given."""
+        """Return the whole window (H+1, O), corrected by v if it is given."""
         solution = self._solve()
         latent = solution.latent_mean + solution.latent_map @ x
         if v is not None:
@@ -161,56 +174,56 @@ class StepFactor:
         y = solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]
         return y.reshape(self._window.means.shape)
 
-    def modified(self, x: np.ndarray, wish: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray | None]:
-        """The window under null-space actions at several points: equation 4.18 with its multipliers of 4.17.
+    def modified(self, x: np.ndarray, action: np.ndarray, solver: Solver) -> tuple[np.ndarray, np.ndarray | None]:
+        """Compute the window under null-space actions at several points (equation 4.18, multipliers of 4.17).
 
         Args:
-            x: [history, null-space action], the action zero.
-            wish: (H+1, O), what the actions ask for at every point, K̂ K̲⁻¹ ξ̂ given the history.
-            solver: for the constraints.
+            x: [history, null-space action] with a null-space action of zero.
+            action: Actions interpolated to every point of the window, K̂ K̲⁻¹ ξ̂ given the history, (H+1, O).
+            solver: Solver of the least-norm problem.
 
         Returns:
-            The window (H+1, O), and the solver's multipliers (m,), None where every constraint is slack.
+            The window (H+1, O), and the solver's multipliers (m,) or None if every constraint is slack.
 
         Raises:
-            UnsolvableError: if the solver finds no correction.
+            UnsolvableError: If the solver finds no correction.
         """
         solution = self._solve()
-        # β/ħ (K̂ − K A K̂) K̲⁻¹ ξ̂: what is wished for, less what the demonstrations' covariance does not let through.
-        whitened = np.einsum("joi,ji->jo", solution.whiten, wish).ravel()
-        pull = self._beta / self._hbar * (wish - (solution.L @ (solution.Lw.T @ whitened)).reshape(wish.shape))
+        # β/ħ (K̂ − K A K̂) K̲⁻¹ ξ̂: the projection of the actions into the null space of the demonstrations.
+        whitened = np.einsum("joi,ji->jo", solution.whiten, action).ravel()
+        projected = action - (solution.L @ (solution.Lw.T @ whitened)).reshape(action.shape)
+        pull = self._beta / self._hbar * projected
         latent = solution.latent_mean + solution.latent_map @ x
-        y = (solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]).reshape(wish.shape) + pull
+        y = (solution.L @ latent + solution.direct_map @ x[: solution.direct_map.shape[1]]).reshape(action.shape) + pull
         along = np.einsum("jmo,jo->jm", self._window.G[:, self._directions[0]], pull).ravel() * self._scale
         free = self.constraint_map @ x + along
         if (free >= self.lower).all() and (free <= self.upper).all():
             return y, None
         v, signed = self.correct(free, solver)
-        return y + (solution.L @ (self._basis @ v)).reshape(wish.shape), signed
+        return y + (solution.L @ (self._basis @ v)).reshape(action.shape), signed
 
     def max_commanded_violation(self, trajectory: np.ndarray) -> float:
-        """max(c − G y) over a whole window (H+1, O); −inf where there is no constraint."""
-        short = self._window.c - np.einsum("nfo,no->nf", self._window.G, trajectory)
-        return float(short.max(initial=-np.inf))
+        """Return max(c − G y) over a whole window (H+1, O), −inf without constraints."""
+        missing = self._window.c - np.einsum("nfo,no->nf", self._window.G, trajectory)
+        return float(missing.max(initial=-np.inf))
 
     @property
     def multipliers_shape(self) -> tuple[int, int]:
-        """(H+1, F)."""
+        """Shape (H+1, F) of `multipliers`."""
         return self._window.c.shape
 
     @property
     def nbytes(self) -> int:
-        """What keeping this step costs [bytes]."""
+        """Memory of the stored arrays [bytes]."""
         arrays = (*vars(self).values(), self._window.means, self._window.covariances)
         return sum(value.nbytes for value in arrays if isinstance(value, np.ndarray))
 
 
 def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which rows of G (n, F, O) are each other's negative at every step: a box then costs one row a side pair.
+    """Pair the rows of G (n, F, O) that are each other's negative at every step, as the two sides of a box are.
 
     Returns:
-        For each direction: the row of G that it is, the row whose bound is its lower bound, and the row whose bound is
-        its upper bound (−1: none).
+        For each direction: its row of G, the row of its lower bound, and the row of its upper bound (−1: no bound).
     """
     directions, first, second = [], [], []
     taken: set[int] = set()

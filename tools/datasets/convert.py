@@ -11,7 +11,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.io import MOST_NUMBERS
+from guiderail.models.primitives.io import MAX_NUMBERS
 from guiderail.tools.datasets.formats.csv_layouts import read_csv_files
 from guiderail.tools.datasets.formats.lerobot import INFO, read_lerobot, write_lerobot
 from guiderail.tools.datasets.formats.recorded import Recorded, from_zero
@@ -68,8 +68,8 @@ def import_recording(
     if rate is not None:
         demonstrations = _at_rate(demonstrations, rate)
     numbers = sum(len(t) + y.size for t, y in zip(demonstrations.times, demonstrations.outputs, strict=True))
-    if numbers > MOST_NUMBERS:
-        raise InputError(f"{source} holds {numbers} numbers, and a file {MOST_NUMBERS}: give --rate to resample them")
+    if numbers > MAX_NUMBERS:
+        raise InputError(f"{source} holds {numbers} numbers, and a file {MAX_NUMBERS}: give --rate to resample them")
     demonstrations.save(out)
     return (
         {"out": str(out), "from": kind}
@@ -105,9 +105,9 @@ def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"--rate is samples in a second and must be positive, not {rate}")
     samples = sum(float(t[-1] - t[0]) * rate for t in demonstrations.times)
-    if samples * (1 + demonstrations.num_outputs) > MOST_NUMBERS:
+    if samples * (1 + demonstrations.num_outputs) > MAX_NUMBERS:
         raise InputError(
-            f"--rate {rate:g} makes {samples:.3g} samples, and a file holds {MOST_NUMBERS} numbers: give a lower one"
+            f"--rate {rate:g} makes {samples:.3g} samples, and a file holds {MAX_NUMBERS} numbers: give a lower one"
         )
     times, outputs = [], []
     for t, y in zip(demonstrations.times, demonstrations.outputs, strict=True):

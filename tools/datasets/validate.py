@@ -10,7 +10,7 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
-from guiderail.models.primitives.fit import ENOUGH, estimated_share
+from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
 from guiderail.tools.datasets.paths import ENDINGS, is_there, load_demonstrations
 from guiderail.tools.files import check_picture
 
@@ -35,7 +35,7 @@ def leaves_demonstrations(task: str, environment: Mapping[str, Any]) -> str | No
     values = config.options
     chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
     share = estimated_share(declared.reference(), kernel_from_options(values), **chosen)
-    if share >= ENOUGH:
+    if share >= MIN_SHARE:
         return None
     return (
         f"without actions, {share:.0%} of the steps stay within a standard deviation of the demonstrations: let "
@@ -95,7 +95,7 @@ def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
     floor = _variance_floor(np.concatenate(demonstrations.outputs))
     chosen = fit(demonstrations, floor=floor)
     share = share_within_spread(LcNsKmp(chosen.reference))
-    verdict = "follows the demonstrations" if share >= ENOUGH else "LEAVES the demonstrations: use these values"
+    verdict = "follows the demonstrations" if share >= MIN_SHARE else "LEAVES the demonstrations: use these values"
     return {
         "components": chosen.components,
         "length_scale": float(f"{chosen.length_scale:.4g}"),

@@ -5,8 +5,8 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential
-from guiderail.models.primitives.fit import ENOUGH, estimated_share, fit, motion_without_actions, share_within_spread
-from guiderail.models.primitives.mixture import information_criteria
+from guiderail.models.primitives.fit import MIN_SHARE, estimated_share, fit, motion_without_actions, share_within_spread
+from guiderail.models.primitives.reference import information_criteria
 from oracles.handwriting import LETTERS, correlated, write
 
 
@@ -24,14 +24,14 @@ PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 @pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
 def test_a_letter_stays_within_what_was_shown(letter, page):
     selection = fit(write(letter, count=4, steps=60, **page))
-    assert selection.stays
-    assert selection.share == share_within_spread(selection.primitive()) >= ENOUGH
+    assert selection.is_within_spread
+    assert selection.share == share_within_spread(selection.primitive()) >= MIN_SHARE
     assert f"{selection.components} components have the least information criterion" in selection.why
 
 
 def test_the_letter_with_most_corners_stays_within_the_recordings_own_deviation():
     shown = write("B", count=5, steps=100)
-    assert share_of_what_was_shown(shown, motion_without_actions(fit(shown).primitive())) >= ENOUGH
+    assert share_of_what_was_shown(shown, motion_without_actions(fit(shown).primitive())) >= MIN_SHARE
 
 
 @pytest.fixture(scope="module")
@@ -49,8 +49,8 @@ def test_outputs_that_differ_together_are_reproduced_together(together, selectio
     outputs = np.stack(together.outputs)
     apart = outputs - outputs.mean(axis=0)
     assert np.corrcoef(apart.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
-    assert selection.stays
-    assert share_of_what_was_shown(together, motion_without_actions(selection.primitive())) >= ENOUGH
+    assert selection.is_within_spread
+    assert share_of_what_was_shown(together, motion_without_actions(selection.primitive())) >= MIN_SHARE
 
 
 def test_what_was_chosen_is_among_what_was_tried_and_nothing_smoother_is_as_good(selection):
@@ -58,9 +58,9 @@ def test_what_was_chosen_is_among_what_was_tried_and_nothing_smoother_is_as_good
         c for c in selection.candidates if (c.length_scale, c.lambda_) == (selection.length_scale, selection.lambda_)
     )
     assert chosen.worse <= 1
-    assert chosen.share >= ENOUGH
+    assert chosen.share >= MIN_SHARE
     for other in selection.candidates:
-        if other.worse <= 1 and other.share >= ENOUGH:
+        if other.worse <= 1 and other.share >= MIN_SHARE:
             assert (-other.lambda_, -other.length_scale) >= (-chosen.lambda_, -chosen.length_scale)
     assert min(c.worse for c in selection.candidates) == 0
     assert selection.beta == selection.lambda_
@@ -91,7 +91,7 @@ def test_other_arguments_of_the_primitive_are_passed_on(selection):
     primitive = selection.primitive(history=3, history_variance=1e-5, lambda_=7.0)
     assert (primitive.history, primitive.lambda_, primitive.beta) == (3, 7.0, selection.beta)
     assert primitive.reference is selection.reference
-    assert share_within_spread(selection.primitive(history=3, history_variance=1e-6)) >= ENOUGH
+    assert share_within_spread(selection.primitive(history=3, history_variance=1e-6)) >= MIN_SHARE
 
 
 def hook(steps=60, deviation=0.05):

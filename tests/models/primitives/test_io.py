@@ -57,12 +57,12 @@ GOOD = {"times": npy("<f8", (4,), T.tobytes()), "outputs": npy("<f8", (1, 4, 2),
         ({"outputs": npy("<f8", "(1, 4, 3)", Y.tobytes())}, "not what it holds"),
         ({"outputs": npy("<f8", "(1, 4, 1)", Y.tobytes())}, "not what it holds"),
         ({"outputs": npy("<f8", "(1000000000, 0, 2)")}, "empty"),
-        ({"outputs": npy("<f8", "(1, 4.0, 2)", Y.tobytes())}, "claims the shape"),
+        ({"outputs": npy("<f8", "(1, 4.0, 2)", Y.tobytes())}, "header of 'outputs'"),
         ({"outputs": npy("<f8", "(1, True, 8)", Y.tobytes())}, "claims the shape"),
-        ({"outputs": npy("<f8", "8", Y.tobytes())}, "no header"),
-        ({"outputs": npy("<f8", "(" * 300, Y.tobytes())}, "no header"),
-        ({"outputs": npy("<f8", "(1, 4, 2), 'shape': __import__('os')", Y.tobytes())}, "no header"),
-        ({"outputs": npy("<f8", "(1, 4, 2)" + " " * 2000, Y.tobytes())}, "header"),
+        ({"outputs": npy("<f8", "8", Y.tobytes())}, "header of 'outputs'"),
+        ({"outputs": npy("<f8", "(" * 300, Y.tobytes())}, "header of 'outputs'"),
+        ({"outputs": npy("<f8", "(1, 4, 2), 'shape': __import__('os')", Y.tobytes())}, "header of 'outputs'"),
+        ({"outputs": npy("<f8", "(1, 4, 2)" + " " * 2000, Y.tobytes())}, "header of 'outputs'"),
         ({"outputs": npy("<f8", (1, 4, 2), Y.tobytes(), version=b"\x09\x00")}, "no array"),
         ({"outputs": b"\x93NUMPY"}, "no array"),
         ({"outputs": b""}, "no array"),
@@ -216,7 +216,7 @@ def test_time_in_another_unit_than_seconds_is_refused(clock, tmp_path):
     said = refused(tmp_path / "d.csv")
     assert "time is in seconds" in said
     assert clock in said
-    assert "guiderail import" in said
+    assert "guiderail dataset import" in said
 
 
 def test_a_folder_is_as_many_demonstrations_as_it_has_files(tmp_path):

@@ -190,7 +190,7 @@ def test_past_the_end_the_window_is_the_last_ones():
         ([10], [[np.inf, 1.0]], "finite"),
         ([10], [["a", "b"]], "numbers"),
         ([10], [[1j, 1.0]], "numbers"),
-        (np.arange(10, 25), np.ones((15, 2)), "ties them together"),
+        (np.arange(10, 25), np.ones((15, 2)), "cannot separate them"),
     ],
 )
 def test_refuses(at, actions, said):

@@ -3,7 +3,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
-from guiderail.models.primitives.mixture import Mixture, fit_mixture, regress
+from guiderail.models.primitives.reference import Mixture, fit_mixture, regress
 
 
 def hourglass(num=9, n=120, seed=0):

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
-from guiderail.models.primitives.lc_ns_kmp import shared_primitive
+from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
 
 STEPS = 30
 KERNEL = SquaredExponential(0.5)
@@ -22,26 +22,26 @@ def box(half=0.9):
 
 
 def test_the_same_numbers_are_one_primitive_while_somebody_uses_it():
-    first = shared_primitive(reference(), box(), KERNEL, history=2, lambda_=6)
-    assert shared_primitive(reference(), box(), KERNEL, lambda_=6.0, history=2) is first
+    first = get_shared_primitive(reference(), box(), KERNEL, history=2, lambda_=6)
+    assert get_shared_primitive(reference(), box(), KERNEL, lambda_=6.0, history=2) is first
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        lambda: shared_primitive(reference(1.1), box(), KERNEL, history=2),
-        lambda: shared_primitive(reference(), box(0.8), KERNEL, history=2),
-        lambda: shared_primitive(reference(), box(), SquaredExponential(0.4), history=2),
-        lambda: shared_primitive(reference(), box(), KERNEL, history=3),
-        lambda: shared_primitive(reference(), box(), KERNEL, history=2, solver="osqp"),
+        lambda: get_shared_primitive(reference(1.1), box(), KERNEL, history=2),
+        lambda: get_shared_primitive(reference(), box(0.8), KERNEL, history=2),
+        lambda: get_shared_primitive(reference(), box(), SquaredExponential(0.4), history=2),
+        lambda: get_shared_primitive(reference(), box(), KERNEL, history=3),
+        lambda: get_shared_primitive(reference(), box(), KERNEL, history=2, solver="osqp"),
     ],
 )
 def test_any_other_number_makes_another(other):
-    assert other() is not shared_primitive(reference(), box(), KERNEL, history=2)
+    assert other() is not get_shared_primitive(reference(), box(), KERNEL, history=2)
 
 
 def test_it_answers_as_one_that_nobody_else_uses():
-    shared = shared_primitive(reference(), box(), KERNEL, history=2)
+    shared = get_shared_primitive(reference(), box(), KERNEL, history=2)
     past, action = np.array([[0.0, 0.0], [0.01, 0.01]]), np.array([3.0, -2.0])
     shared.predict(7, -action, past)  # what was asked before does not matter
     own = LcNsKmp(reference(), kernel=KERNEL, constraints=box(), history=2)
@@ -49,13 +49,13 @@ def test_it_answers_as_one_that_nobody_else_uses():
 
 
 def test_what_nobody_uses_is_not_kept():
-    from guiderail.models.primitives.lc_ns_kmp import _USED
+    from guiderail.models.primitives.lc_ns_kmp import _SHARED
 
-    shared_primitive(reference(1.7), box(), KERNEL)
+    get_shared_primitive(reference(1.7), box(), KERNEL)
     gc.collect()
-    assert not [primitive for primitive in _USED.values() if primitive.reference.means[-1, 1] == 1.7]
+    assert not [primitive for primitive in _SHARED.values() if primitive.reference.means[-1, 1] == 1.7]
 
 
 def test_what_a_primitive_refuses_is_refused():
     with pytest.raises(InputError, match="lambda_"):
-        shared_primitive(reference(), box(), KERNEL, lambda_=-1.0)
+        get_shared_primitive(reference(), box(), KERNEL, lambda_=-1.0)

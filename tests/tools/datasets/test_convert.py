@@ -256,7 +256,7 @@ def test_more_samples_than_a_file_holds_are_refused(rate, tmp_path):
 
 def test_what_could_not_be_read_again_is_not_written(tmp_path, monkeypatch):
     write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
-    monkeypatch.setattr("guiderail.tools.datasets.convert.MOST_NUMBERS", 15)
+    monkeypatch.setattr("guiderail.tools.datasets.convert.MAX_NUMBERS", 15)
     with pytest.raises(InputError, match=r"16 numbers.*--rate"):
         import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
     assert not (tmp_path / "a.npz").exists()
