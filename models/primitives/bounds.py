@@ -34,7 +34,7 @@ class DemonstratedBounds:
         return np.all((outputs >= self.lower[phase]) & (outputs <= self.upper[phase]), axis=1)
 
 
-def fit_bounds(
+def compute_bounds(
     demonstrations: Demonstrations,
     phases: int = 1,
     margin: float = 0.1,

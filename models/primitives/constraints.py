@@ -47,7 +47,8 @@ class LinearConstraints:
         """Return the constraints lower ≤ y ≤ upper.
 
         Args:
-            lower, upper: Bounds, (O,) or (N, O) each. A bound that is infinite at every step is no constraint.
+            lower: Lower bounds, (O,) or (N, O); −inf at every step is no constraint.
+            upper: Upper bounds, (O,) or (N, O); inf at every step is no constraint.
 
         Raises:
             InputError: If a lower bound exceeds its upper bound, or a bound is NaN or infinite at some steps only.

@@ -10,7 +10,7 @@ from guiderail.models.primitives.kernels import Kernel
 # Conditioning on a history of standard deviation √ρ loses digits in double precision, as the kernel's is 1. Extended
 # precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
 _Extended = np.longdouble
-# Smallest share of the kernel's variance at a point, given the other points, at which the point can have its own action.
+# Smallest share of the kernel's variance at a point, given the other points, with which it can have its own action.
 _MIN_INDEPENDENCE = 1e-9
 
 
@@ -56,7 +56,10 @@ def window_interpolation(
     It is K̂ K̲⁻¹ of equation 4.17, with the kernel conditioned on the history.
 
     Args:
-        kernel, history_inputs, future_inputs, history_noise: As in `window_features`.
+        kernel: k.
+        history_inputs: As in `window_features`.
+        future_inputs: As in `window_features`.
+        history_noise: As in `window_features`.
         points: Different indices (J,) of the future inputs.
 
     Raises:

@@ -18,8 +18,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
-from guiderail.models.primitives.reference import fit_mixture, information_criteria, regress
-from guiderail.models.primitives.reference import ReferenceTrajectory
+from guiderail.models.primitives.reference import ReferenceTrajectory, fit_mixture, information_criteria, regress
 
 MIN_SHARE = 0.95
 """Share of the steps within one standard deviation from which a motion follows the demonstrations."""
@@ -111,10 +110,15 @@ def fit(
 
     Args:
         demonstrations: At least three demonstrations.
-        components, length_scale, lambda_: Fixed values; the others are selected for them.
-        kernel, kernel_parameters: Name and further parameters of the kernel, as in `make_kernel`.
+        components: Number of components C; selected by default.
+        kernel: Name of the kernel.
+        length_scale: ℓ of the kernel [input]; selected by default.
+        kernel_parameters: Further parameters of the kernel, as in `make_kernel`.
+        lambda_: λ = β; selected by default.
         horizon: H of the intended primitive.
-        num_steps, floor, seed: As in `ReferenceTrajectory.from_demonstrations`.
+        num_steps: As in `ReferenceTrajectory.from_demonstrations`.
+        floor: As in `ReferenceTrajectory.from_demonstrations`.
+        seed: As in `ReferenceTrajectory.from_demonstrations`.
 
     Raises:
         InputError: If there are fewer than three demonstrations, or they cannot be fitted.
@@ -169,7 +173,10 @@ def estimated_share(
 
     Args:
         reference: Reference of the primitive.
-        kernel, lambda_, beta, horizon: As in `LcNsKmp`.
+        kernel: As in `LcNsKmp`.
+        lambda_: As in `LcNsKmp`.
+        beta: As in `LcNsKmp`.
+        horizon: As in `LcNsKmp`.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     motion = _motion(reference, kernel, lambda_ + beta, horizon, steps)

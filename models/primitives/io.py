@@ -2,7 +2,7 @@
 
 Reading takes bounded time and memory for any content, and never executes code. NumPy's reader allocates what a header
 claims; headers are therefore checked here against the size of the array before it is read. CSV files are read by the
-strict reader of the standard library, because `pandas.read_csv` fills short rows and accepts text after a closing quote.
+standard library's strict reader: `pandas.read_csv` fills short rows and accepts text after a closing quote.
 """
 
 import csv

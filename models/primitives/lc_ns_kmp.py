@@ -221,8 +221,10 @@ class LcNsKmp:
 
         Args:
             inputs: Inputs of the window, (H+1,) or (H+1, I), the executed point first.
-            means, covariances: Reference at these inputs, (H+1, O) and (H+1, O, O).
-            null_space_action, history: As in `predict`, (O,) and (P, O).
+            means: Reference means at these inputs (H+1, O).
+            covariances: Reference covariances at these inputs (H+1, O, O).
+            null_space_action: ξ̂ (O,), as in `predict`.
+            history: (P, O), as in `predict`.
             history_inputs: Inputs of the history, (P,) or (P, I).
 
         Raises:
@@ -437,7 +439,8 @@ def get_shared_primitive(
     modify the primitive.
 
     Args:
-        reference, constraints: As in `LcNsKmp`.
+        reference: As in `LcNsKmp`.
+        constraints: As in `LcNsKmp`.
         kernel: As in `LcNsKmp`; kernels that compare equal are the same.
         arguments: Further arguments of `LcNsKmp`, numbers and names.
 

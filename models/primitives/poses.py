@@ -30,7 +30,8 @@ def pose_outputs(
     Args:
         positions: p_WE (N, 3) [m].
         quaternions_wxyz: R_WE (N, 4), of either sign and of any length except zero.
-        target_position, target_quaternion_wxyz: X_WT, (3,) and (4,).
+        target_position: p_WT (3,) [m].
+        target_quaternion_wxyz: R_WT (4,).
         orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", for rotations
             of about a half turn.
         near: Orientation (3,) [rad] that the first sample is continued from; the one of least magnitude by default.
@@ -85,9 +86,11 @@ def pose_demonstrations(
     """Build demonstrations of six outputs from recorded end-effector poses.
 
     Args:
-        times, positions, quaternions_wxyz: M arrays (N_m,), (N_m, 3) and (N_m, 4), in any common frame W.
-        target_position, target_quaternion_wxyz: X_WT, (3,) and (4,); each demonstration's last pose by default, as in
-            the thesis (section 4.4.2).
+        times: M arrays (N_m,) [s].
+        positions: p_WE, M arrays (N_m, 3) [m], in any common frame W.
+        quaternions_wxyz: R_WE, M arrays (N_m, 4).
+        target_position: p_WT (3,) [m]; each demonstration's last position by default (thesis, section 4.4.2).
+        target_quaternion_wxyz: R_WT (4,); each demonstration's last orientation by default.
         orientation: As in `pose_outputs`.
 
     Raises:

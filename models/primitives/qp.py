@@ -5,8 +5,8 @@ In the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = �
 same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity, and its rows can be scaled to unit
 length, so that a solver's tolerance is a tolerance on the output itself.
 
-`qpsolvers` does not replace the adaptors: it has one-sided rows only, which doubles them (DAQP takes 1.8 times as long),
-and it has no second tolerance, no margin and no check of an inaccurate result.
+`qpsolvers` does not replace the adaptors: its rows are one-sided, which doubles them (DAQP takes 1.8 times as long), and
+it has no second tolerance, no margin and no check of an inaccurate result.
 """
 
 from collections.abc import Callable
@@ -111,7 +111,8 @@ def solve_least_norm(
 
     Args:
         rows: (m, r), rows of unit length (or zero).
-        lower, upper: (m,), ±inf where there is no bound; at least one of them excludes v = 0.
+        lower: Lower bounds (m,), −inf for none; at least one bound excludes v = 0.
+        upper: Upper bounds (m,), inf for none.
         solver: One of `SOLVERS`.
 
     Returns:

@@ -222,9 +222,11 @@ def information_criteria(
     """Compute the Bayesian information criterion of mixtures by number of components; less is better.
 
     Args:
-        times, outputs, seed: As in `fit_mixture`.
+        times: Common clock (N,) [s].
+        outputs: Outputs (M, N, O).
         candidates: Increasing numbers of components; the search stops once two in a row are not better than the best
             before.
+        seed: Seed of scikit-learn's generator.
 
     Raises:
         InputError: If there are fewer points than the components need.

@@ -11,7 +11,7 @@ import yaml
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.part.file import Bounds, PartTaskFile, read_task_file, write_task_file
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.bounds import DemonstratedBounds, fit_bounds
+from guiderail.models.primitives.bounds import DemonstratedBounds, compute_bounds
 from guiderail.tools.datasets.paths import check_new, is_there, load_demonstrations
 from guiderail.tools.files import check_picture, check_writable, write_atomically
 
@@ -50,7 +50,7 @@ def fit_bounds(
         check_new(out, "file")
         check_writable(out)
     demonstrations = load_demonstrations(file)
-    bounds = fit_bounds(demonstrations, phases, margin, min_margin, outputs)
+    bounds = compute_bounds(demonstrations, phases, margin, min_margin, outputs)
     values = as_values(bounds)
     # The task's bounds are written last, once they are valid: a picture can be drawn again.
     task_file = None if task is None else _with_bounds(task, values)

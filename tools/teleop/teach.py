@@ -29,7 +29,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.bounds import fit_bounds
+from guiderail.models.primitives.bounds import compute_bounds
 from guiderail.tools.datasets.paths import check_new
 
 PATH = "/guiderail/force"
@@ -320,7 +320,7 @@ class Teaching:
         for n, pose in enumerate(mean):
             self._port().FixValue(context, pose)
             self.simulator.AdvanceTo((n + 1) * self._period)
-        bounds = fit_bounds(demonstrations)
+        bounds = compute_bounds(demonstrations)
         return {
             "demonstrations": len(self.kept),
             "at the target": sum(one is True for one in self.succeeded),

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.bounds import fit_bounds
+from guiderail.models.primitives.bounds import compute_bounds
 
 
 def shown():
@@ -15,7 +15,7 @@ def shown():
 
 @pytest.mark.parametrize("phases", [1, 3, 7])
 def test_every_demonstration_keeps_them(phases):
-    bounds = fit_bounds(shown(), phases, margin=0.0)
+    bounds = compute_bounds(shown(), phases, margin=0.0)
     for outputs in shown().outputs:
         assert bounds.contains(outputs).all()
 
@@ -23,37 +23,37 @@ def test_every_demonstration_keeps_them(phases):
 def test_a_demonstration_whose_samples_are_not_uniform_keeps_them_too():
     t = np.array([0.0, 0.1, 0.13, 0.16, 1.0, 1.2, 1.7, 2.0])
     peak = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -2.0, 0.0])
-    bounds = fit_bounds(Demonstrations(t, [peak[:, None], np.zeros((8, 1))]), 2, margin=0.0)
+    bounds = compute_bounds(Demonstrations(t, [peak[:, None], np.zeros((8, 1))]), 2, margin=0.0)
     np.testing.assert_array_equal(bounds.upper[:, 0], [1.0, 0.0])
     assert bounds.lower[1, 0] == -2.0
 
 
 def test_more_phases_are_tighter():
-    room = [np.mean(b.upper - b.lower) for b in (fit_bounds(shown(), k) for k in (1, 2, 4, 8))]
+    room = [np.mean(b.upper - b.lower) for b in (compute_bounds(shown(), k) for k in (1, 2, 4, 8))]
     assert sorted(room, reverse=True) == room
     assert room[-1] < 0.4 * room[0]
 
 
 def test_the_margin_is_a_part_of_the_range_and_no_less_than_the_least():
-    tight = fit_bounds(shown(), margin=0.0)
-    wide = fit_bounds(shown(), margin=0.25)
+    tight = compute_bounds(shown(), margin=0.0)
+    wide = compute_bounds(shown(), margin=0.25)
     size = tight.upper - tight.lower
     np.testing.assert_allclose(wide.upper - tight.upper, 0.25 * size)
     np.testing.assert_allclose(tight.lower - wide.lower, 0.25 * size)
-    np.testing.assert_allclose(fit_bounds(shown(), margin=0.0, min_margin=5.0).upper - tight.upper, 5.0)
+    np.testing.assert_allclose(compute_bounds(shown(), margin=0.0, min_margin=5.0).upper - tight.upper, 5.0)
 
 
 def test_a_free_output_has_none():
-    bounds = fit_bounds(shown(), 2, bounded=[1])
+    bounds = compute_bounds(shown(), 2, bounded=[1])
     assert np.isinf(bounds.lower[:, 0]).all()
     assert np.isfinite(bounds.upper[:, 1]).all()
 
 
 def test_the_fastest_change_is_in_the_demonstrations_own_time():
-    np.testing.assert_allclose(fit_bounds(shown()).max_rates[0], 1.1, rtol=1e-9)
+    np.testing.assert_allclose(compute_bounds(shown()).max_rates[0], 1.1, rtol=1e-9)
 
 
 @pytest.mark.parametrize("arguments", [{"phases": 0}, {"phases": 99}, {"margin": -1.0}, {"bounded": [2]}])
 def test_nonsense_is_refused(arguments):
     with pytest.raises(InputError):
-        fit_bounds(shown(), **arguments)
+        compute_bounds(shown(), **arguments)
