@@ -23,6 +23,7 @@ from .diagrams.tasks.registry import register_task as register_task
 from .diagrams.tasks.task import Task as Task
 from .diagrams.tasks.task import Threshold as Threshold
 from .models.common.errors import InputError as InputError
+from .models.policy import Policy as Policy
 from .models.primitives import Demonstrations as Demonstrations
 from .models.primitives import Kmp as Kmp
 from .models.primitives import LcNsKmp as LcNsKmp
@@ -31,10 +32,20 @@ from .models.primitives import Matern52 as Matern52
 from .models.primitives import ReferenceTrajectory as ReferenceTrajectory
 from .models.primitives import SquaredExponential as SquaredExponential
 from .models.primitives import register_kernel as register_kernel
+from .models.robots.robot import Robot as Robot
+from .models.robots.robot import register_robot as register_robot
 from .models.templates import SharedControlTemplate as SharedControlTemplate
 from .models.templates import load_template as load_template
 from .systems.episode_monitor import TerminationTerm as TerminationTerm
 from .systems.policy_system import PolicySystem as PolicySystem
 from .systems.reward_system import RewardTerm as RewardTerm
+from .tools.evaluation.rollout import Callback as Callback
+from .tools.evaluation.rollout import Transition as Transition
+from .tools.evaluation.rollout import rollout as rollout
+from .tools.learning.learner import Learner as Learner
+from .tools.learning.learner import LearnerConfig as LearnerConfig
+from .tools.learning.learner import register_learner as register_learner
+from .tools.learning.train import Run as Run
+from .tools.learning.train import train as train
 
 __version__: str

@@ -104,6 +104,32 @@ def test_it_is_trained_resumed_and_evaluated(lab, trained):
     assert found["max_commanded_violation"] <= 1e-9
 
 
+def test_a_setting_of_its_learner_is_validated(lab):
+    words = ("train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "1")
+    guiderail(lab, *words, "--set", "deviation=0.1", "--out", "careful")
+    assert "deviation: 0.1" in (lab.folder / "careful" / "config.yaml").read_text()
+    for setting, sentence in (
+        ("deviation=-1", "learner's deviation cannot be '-1'"),
+        ("deviaton=1", "did you mean deviation?"),
+        ("learning_rate=0.1", "peglab_hill_climbing has no setting 'learning_rate'"),
+    ):
+        assert sentence in guiderail(lab, *words, "--set", setting, "--out", "refused", code=2)
+    said = guiderail(lab, *words, "--preset", "tqc_contact", "--out", "refused", code=2)
+    assert "settings that peglab_hill_climbing does not have: leave --preset out" in said
+
+
+def test_the_python_api_trains_it(lab):
+    code = (
+        "import guiderail\n"
+        "settings = {'algorithm': 'peglab_hill_climbing', 'episodes': 2, 'width': 0.2}\n"
+        "run = guiderail.train('peglab/Slot', 'kgrl', out='api', **settings)\n"
+        "print(len(run.episodes), run.config.preset, run.config.environment['width'], run.policy.description['task'])"
+    )
+    assert lab("-c", code).split() == ["2", "None", "0.2", "peglab/Slot"]
+    code = "import guiderail; print(guiderail.Policy.load('api').description['task'])"
+    assert lab("-c", code).strip() == "peglab/Slot"
+
+
 def test_it_is_replayed(lab, trained):
     guiderail(lab, "visualize", "run", "--episodes", "1", "--html", "page.html")
     assert "peglab/Slot" in (lab.folder / "page.html").read_text()

@@ -1,44 +1,29 @@
-"""What a lab brings along: a task with a world of its own, a kind of guidance, and a learner, in one installed file."""
+"""Package of a lab: a task with its own workcell, a guidance and a learner with its own settings, in one file."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from pydantic import Field
+from pydantic.dataclasses import dataclass
 from pydrake.systems.framework import Context, Diagram
 
-from guiderail import (
-    FunctionGuidance,
-    Guidance,
-    LinearConstraints,
-    ObservationTerm,
-    Options,
-    PriorKnowledge,
-    ReferenceTrajectory,
-    RewardTerm,
-    Station,
-    Task,
-    TerminationTerm,
-    register_guidance,
-    register_task,
-)
+import guiderail as gr
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
-from guiderail.models.policy import FORMAT, Policy
-from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.learner import Learner, register_learner
+from guiderail.models.policy import FORMAT
 
 NUM_STEPS, PERIOD = 80, 0.02
 
 
-class SlotOptions(Options):
-    """Of the slot."""
+class SlotOptions(gr.Options):
+    """Options of the slot."""
 
     width: float = Field(0.14, ge=0.05, le=0.3, description="of the slot [m]")
 
 
-@register_task("peglab/Slot")
-class Slot(Task):
-    """Through a slot and on to a goal that two demonstrations never quite reach."""
+@gr.register_task("peglab/Slot")
+class Slot(gr.Task):
+    """Task of passing a slot to a goal that the demonstrations do not reach."""
 
     workcell_kind = "plane"
     Options = SlotOptions
@@ -53,74 +38,83 @@ class Slot(Task):
         gap = (middle - self.options.width / 2, middle + self.options.width / 2)
         return PassageGeometry(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=gap)
 
-    def reference(self) -> ReferenceTrajectory:
+    def reference(self) -> gr.ReferenceTrajectory:
         phase = np.linspace(0.0, 1.0, NUM_STEPS)
         means = np.column_stack([np.full(NUM_STEPS, 0.35), 0.1 + 0.8 * phase])
         covariances = np.tile(0.04**2 * np.eye(2), (NUM_STEPS, 1, 1))
-        return ReferenceTrajectory(PERIOD * np.arange(NUM_STEPS), means, covariances)
+        return gr.ReferenceTrajectory(PERIOD * np.arange(NUM_STEPS), means, covariances)
 
-    def constraints(self) -> LinearConstraints:
-        return LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
+    def constraints(self) -> gr.LinearConstraints:
+        return gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
 
-    def observation_terms(self) -> Sequence[ObservationTerm]:
-        return (ObservationTerm("phase"), ObservationTerm("pose", 0.5, 0.5))
+    def observation_terms(self) -> Sequence[gr.ObservationTerm]:
+        return (gr.ObservationTerm("phase"), gr.ObservationTerm("pose", 0.5, 0.5))
 
-    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+    def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
         goal = np.array(self.workcell().goal)
-        return [RewardTerm("nearness", {"pose": 2}, lambda pose: -float(np.linalg.norm(pose - goal)))]
+        return [gr.RewardTerm("nearness", {"pose": 2}, lambda pose: -float(np.linalg.norm(pose - goal)))]
 
-    def termination_terms(self) -> list[TerminationTerm]:
-        return [TerminationTerm("success", {"pose": 2}, self.workcell().at_goal)]
+    def termination_terms(self) -> list[gr.TerminationTerm]:
+        return [gr.TerminationTerm("success", {"pose": 2}, self.workcell().at_goal)]
 
     def reset(
-        self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
+        self, station: gr.Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
         start = np.array([0.35, 0.1]) + (0.01 if options.held_out else 0.002) * rng.standard_normal(2)
         station.set_pose(context, start)
         return {"start": start}
 
 
-class OffsetOptions(Options):
-    """Of the guidance."""
+class OffsetOptions(gr.Options):
+    """Options of the guidance."""
 
     reach: float = Field(0.05, gt=0, description="how far a full action leads from where the robot is [m]")
 
 
-@register_guidance("peglab_offset", label="offset", options=OffsetOptions)
-def offset(known: PriorKnowledge) -> Guidance:
-    """Commands the measured pose and what the policy adds."""
-    return FunctionGuidance(known, lambda action, pose, wrench: pose + known.options["reach"] * action, action_size=2)
+@gr.register_guidance("peglab_offset", label="offset", options=OffsetOptions)
+def offset(known: gr.PriorKnowledge) -> gr.Guidance:
+    """Command the measured pose plus the action."""
+    return gr.FunctionGuidance(
+        known, lambda action, pose, wrench: pose + known.options["reach"] * action, action_size=2
+    )
 
 
-@register_learner("peglab_hill_climbing")
-class HillClimbing(Learner):
-    """Keeps the best linear policy so far, and tries a neighbour of it in each episode."""
+@dataclass(frozen=True)
+class HillClimbingConfig(gr.LearnerConfig):
+    deviation: float = Field(0.3, gt=0)  # standard deviation of a step in the parameters
 
-    def __init__(self, preset: Any, env: Any, *, seed: int, **unused: Any):
-        self.space = env.action_space
+
+@gr.register_learner("peglab_hill_climbing")
+class HillClimbing(gr.Learner):
+    """Hill climbing: keep the best linear policy so far, and try a neighbor of it in each episode."""
+
+    Config = HillClimbingConfig
+
+    def __init__(self, config: HillClimbingConfig, env: Any, *, seed: int, **unused: Any):
+        self.config, self.space = config, env.action_space
         self.rng = np.random.default_rng(seed)
         self.best = np.zeros((self.space.shape[0], env.observation_space.shape[0] + 1))
         self.score, self.tried, self.total = -np.inf, self.best, 0.0
 
     def on_episode_start(self) -> None:
-        self.tried = self.best + 0.3 * self.rng.standard_normal(self.best.shape)
+        self.tried = self.best + self.config.deviation * self.rng.standard_normal(self.best.shape)
         self.total = 0.0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         return np.tanh(self.tried @ np.append(observation, 1.0)).astype(np.float32)
 
-    def on_step(self, decision: Transition) -> None:
-        self.total += decision.reward
+    def on_step(self, transition: gr.Transition) -> None:
+        self.total += transition.reward
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         if self.total > self.score:
             self.best, self.score = self.tried, self.total
         return {}
 
-    def policy(self, description: Mapping[str, Any]) -> Policy:
+    def policy(self, description: Mapping[str, Any]) -> gr.Policy:
         limits = {"action_low": self.space.low.tolist(), "action_high": self.space.high.tolist()}
         layer = (self.best[:, :-1].astype(np.float32), self.best[:, -1].astype(np.float32))
-        return Policy([layer], {"format": FORMAT, "pool": 1, "squash": "tanh", **limits, **description})
+        return gr.Policy([layer], {"format": FORMAT, "pool": 1, "squash": "tanh", **limits, **description})
 
     def has_diverged(self) -> bool:
         return not np.isfinite(self.best).all()
