@@ -46,7 +46,7 @@ class NonFiniteCounter(EnvCallback):
 
     def on_step(self, transition: Transition) -> None:
         """Count those in observation and reward."""
-        self._count += int(np.sum(~np.isfinite(transition.following))) + (not np.isfinite(transition.reward))
+        self._count += int(np.sum(~np.isfinite(transition.next_observation))) + (not np.isfinite(transition.reward))
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return `not_finite`, including those of the trace."""

@@ -167,7 +167,8 @@ def test_what_it_learned_is_a_plain_diagram(lab, trained):
 
 def test_a_file_that_is_not_installed_serves_too(lab):
     (lab.folder / "mine.py").write_text(
-        "from guiderail import register_task\nfrom guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n\n"
+        "from guiderail import register_task\n"
+        "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n\n"
         "@register_task('mine/Passage')\nclass Mine(NarrowPassage):\n    num_steps = 40\n"
     )
     guiderail(

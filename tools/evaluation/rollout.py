@@ -21,10 +21,10 @@ class Transition:
     """Action of an episode and its outcome.
 
     Attributes:
-        observation: Observation before the action.
-        action: Action.
+        observation: Observation before the action, of the shape of the observation space.
+        action: Action, of the shape of the action space.
         reward: Reward.
-        following: Observation after the action.
+        next_observation: Observation after the action, of the same shape.
         terminated: True if the task ended the episode.
         truncated: True if the episode ended for another reason.
         info: `info` of the environment's step.
@@ -33,7 +33,7 @@ class Transition:
     observation: np.ndarray
     action: np.ndarray
     reward: float
-    following: np.ndarray
+    next_observation: np.ndarray
     terminated: bool
     truncated: bool
     info: Mapping[str, Any]

@@ -279,7 +279,7 @@ class OffPolicyLearner(Learner):
         phases of a skill apart; it is not the time left.
         """
         infos = [{"TimeLimit.truncated": transition.truncated and not transition.terminated}]
-        observation, following = transition.observation, transition.following
+        observation, following = transition.observation, transition.next_observation
         action = self.model.policy.scale_action(np.asarray(transition.action)[None])[0]
         if np.ndim(observation) == 3:  # an image; Stable-Baselines3 expects channels first
             observation, following = np.moveaxis(observation, -1, 0), np.moveaxis(following, -1, 0)

@@ -224,7 +224,7 @@ class PipelinedLearner(Learner):
 
 
 # Fields of a transition that a learner uses.
-_STORED = ("observation", "action", "reward", "following", "terminated", "truncated")
+_STORED = ("observation", "action", "reward", "next_observation", "terminated", "truncated")
 
 
 class SpacesOnlyEnv(gymnasium.Env):

@@ -72,11 +72,10 @@ class OffsetOptions(gr.Options):
 
 
 @gr.register_guidance("peglab_offset", label="offset", options=OffsetOptions)
-def offset(known: gr.PriorKnowledge) -> gr.Guidance:
+def offset(prior: gr.PriorKnowledge) -> gr.Guidance:
     """Command the measured pose plus the action."""
-    return gr.FunctionGuidance(
-        known, lambda action, pose, wrench: pose + known.options["reach"] * action, action_size=2
-    )
+    reach = prior.options["reach"]
+    return gr.FunctionGuidance(prior, lambda action, pose, wrench: pose + reach * action, action_size=2)
 
 
 @dataclass(frozen=True)

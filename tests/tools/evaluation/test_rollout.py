@@ -31,7 +31,7 @@ def test_observers_see_an_episode_from_its_beginning_to_its_end():
     assert (first, last) == ("begin", "end")
     assert [decision.is_last for decision in decisions] == [False] * (len(decisions) - 1) + [True]
     for before, after in itertools.pairwise(decisions):
-        assert before.following is after.observation
+        assert before.next_observation is after.observation
     assert row["decisions"] == len(decisions) == -(-row["steps"] // 2)
     assert row["return"] == sum(decision.reward for decision in decisions)
     assert list(row) == [*(c.name for c in COLUMNS), "reward_goal_distance", "decisions"]
