@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
-from guiderail.diagrams.envs.env import RECORDED, SAID
+from guiderail.diagrams.envs.env import RECORDED_SIGNALS, INFO_KEYS
 from guiderail.diagrams.envs.observation import Observation, affine
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
@@ -238,7 +238,7 @@ def build_task_diagram(
         "command_timed_out": station.get_command_timed_out_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
-    taken = {*exported, *SAID, *RECORDED}
+    taken = {*exported, *INFO_KEYS, *RECORDED_SIGNALS}
     for name in reward.term_names:
         if name in taken:
             raise InputError(
@@ -374,7 +374,7 @@ def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
             raise InputError(
                 f"reset of {task.name} returns what it drew by name, {{}} where it drew nothing, not {brief(drawn)}"
             )
-        if taken := [name for name in drawn if name in SAID]:
+        if taken := [name for name in drawn if name in INFO_KEYS]:
             raise InputError(
                 f"reset of {task.name} can call nothing that it drew {taken[0]!r}, which info says of every task: "
                 "give it another name"

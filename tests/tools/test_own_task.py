@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.envs.env import RECORDED, SAID
+from guiderail.diagrams.envs.env import RECORDED_SIGNALS, INFO_KEYS
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
@@ -185,14 +185,14 @@ def test_what_is_observed_is_centred_and_scaled_entry_by_entry():
     np.testing.assert_allclose(seen, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", [*SAID, *RECORDED, "observation", "pose", "desired_pose"])
+@pytest.mark.parametrize("name", [*INFO_KEYS, *RECORDED_SIGNALS, "observation", "pose", "desired_pose"])
 def test_no_reward_term_takes_the_place_of_a_safety_number(name):
     declare(reward_terms=lambda self, num_actions: [RewardTerm(name, {"pose": 2}, self.reward)])
     with pytest.raises(InputError, match=f"no reward term of lab/Own can be called {name!r}"):
         make_env("lab/Own", guidance="kmp")
 
 
-@pytest.mark.parametrize("name", SAID)
+@pytest.mark.parametrize("name", INFO_KEYS)
 def test_nothing_that_a_reset_draws_takes_the_place_of_a_safety_number(name):
     declare(reset=lambda self, *given: {name: -9.0})
     env = make_env("lab/Own", guidance="kmp")
