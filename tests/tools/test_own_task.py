@@ -136,7 +136,7 @@ def test_settings_of_another_guidance_are_no_mistake():
             {"termination_terms": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
             "the condition 'success' of lab/Own is called with .*, pose, and takes position",
         ),
-        ({"reset": lambda self, *given: None}, "reset of lab/Own returns what it drew by name, {} .*, not None"),
+        ({"reset": lambda self, *given: None}, "reset of lab/Own must return the sampled values by name, {} .*, not None"),
     ],
 )
 def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, says):
@@ -148,8 +148,8 @@ def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, 
 @pytest.mark.parametrize(
     ("observed", "says"),
     [
-        ((), "the observation of lab/Own is of nothing: let observation_terms"),
-        ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is of nothing"),
+        ((), "the observation of lab/Own is empty: let observation_terms"),
+        ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is empty"),
         (
             (ObservationTerm("pose", scale=0.0),),
             "the scale of the observed signal 'pose' of lab/Own divides it, .* be 0.0",
@@ -196,7 +196,7 @@ def test_no_reward_term_takes_the_place_of_a_safety_number(name):
 def test_nothing_that_a_reset_draws_takes_the_place_of_a_safety_number(name):
     declare(reset=lambda self, *given: {name: -9.0})
     env = make_env("lab/Own", guidance="kmp")
-    with pytest.raises(InputError, match=f"reset of lab/Own can call nothing that it drew {name!r}"):
+    with pytest.raises(InputError, match=f"reset of lab/Own returns a value named {name!r}, which is reserved"):
         env.reset(seed=0)
 
 
