@@ -1,0 +1,1 @@
+"""Gymnasium environments: configuration, assembly of the diagram, observation, trace and views."""

@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.envs.cameras import Camera, add_camera, add_meshcat
-from guiderail.diagrams.envs.env import RECORDED_SIGNALS, INFO_KEYS
+from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.observation import Observation, affine
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
@@ -93,7 +93,7 @@ def _refuse_half_turns(means: np.ndarray) -> None:
     if furthest > np.pi - HALF_TURN_MARGIN:
         raise InputError(
             f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and what this station measures jumps by a full "
-            f"turn at 180°: draw the target's frame turned, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
+            f"turn at 180°: rotate the target's frame, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
         )
 
 
@@ -252,7 +252,7 @@ def build_task_diagram(
     for name in reward.term_names:
         if name in taken:
             raise InputError(
-                f"no reward term of {task.name} can be called {name!r}, which is reserved in every task: give it another name"
+                f"no reward term of {task.name} can be called {name!r}, which is reserved: give it another name"
             )
         exported[name] = reward.get_term_output_port(name)
     # Outputs that only this guidance has, such as the state of a template.
@@ -382,11 +382,11 @@ def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
         )
         if not isinstance(drawn, Mapping):
             raise InputError(
-                f"reset of {task.name} must return the sampled values by name, {{}} if there are none, not {brief(drawn)}"
+                f"reset of {task.name} must return the sampled values by name, {{}} if none, not {brief(drawn)}"
             )
         if taken := [name for name in drawn if name in INFO_KEYS]:
             raise InputError(
-                f"reset of {task.name} returns a value named {taken[0]!r}, which is reserved in info: give it another name"
+                f"reset of {task.name} returns a value named {taken[0]!r}, which is reserved: give it another name"
             )
         return {**drawn, **station.disturb(context, rng)}
 

@@ -101,8 +101,8 @@ def add_camera(
         InputError: If this machine lacks the library that renders without a display.
     """
     check_rendering()
-    # Mesa renders with one LLVM, and Triton, a dependency of PyTorch with CUDA, has another: if Triton's is loaded second,
-    # the process ends in a segmentation fault. PyTorch imports it with its compiler.
+    # Mesa renders with one LLVM, and Triton, a dependency of PyTorch with CUDA, has another: if Triton's is loaded
+    # second, the process ends in a segmentation fault. PyTorch imports Triton with its compiler.
     with suppress(ImportError):
         import_module("triton")
     renderer = _PICTURE_RENDERER if is_picture else _OBSERVATION_RENDERER

@@ -98,9 +98,7 @@ class GuidedEnv(DrakeGymEnv):
             InputError: If `action_repeat` is not a positive integer, or the task cannot be rendered in this mode.
         """
         if isinstance(action_repeat, bool) or not isinstance(action_repeat, int | np.integer) or action_repeat < 1:
-            raise InputError(
-                f"action_repeat is the number of control steps of an action: give an integer from 1, not {action_repeat}"
-            )
+            raise InputError(f"action_repeat is the number of control steps of an action, from 1, not {action_repeat}")
         diagram = task.diagram
         _check_view(task, render_mode)
         view = None if render_mode != "human" or task.query is None else View(task.query)
@@ -135,7 +133,8 @@ class GuidedEnv(DrakeGymEnv):
         self._reward_port = diagram.GetOutputPort("reward")
         self._term_ports = [(name, diagram.GetOutputPort(name)) for name in task.reward_terms]
         self._termination_port = diagram.GetOutputPort("termination")
-        self._recorded = [(name, diagram.GetOutputPort(name)) for name in RECORDED_SIGNALS if diagram.HasOutputPort(name)]
+        recorded = filter(diagram.HasOutputPort, RECORDED_SIGNALS)
+        self._recorded = [(name, diagram.GetOutputPort(name)) for name in recorded]
         self._force_port = diagram.GetOutputPort("contact_force")
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
         self._pose_port = diagram.GetOutputPort("pose")

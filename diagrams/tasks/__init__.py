@@ -1,0 +1,1 @@
+"""Tasks: one folder each, with its options, rewards, workcell and scripted policies."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.envs.env import RECORDED_SIGNALS, INFO_KEYS
+from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.tasks.registry import TASKS, register_task
@@ -136,7 +136,10 @@ def test_settings_of_another_guidance_are_no_mistake():
             {"termination_terms": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
             "the condition 'success' of lab/Own is called with .*, pose, and takes position",
         ),
-        ({"reset": lambda self, *given: None}, "reset of lab/Own must return the sampled values by name, {} .*, not None"),
+        (
+            {"reset": lambda self, *given: None},
+            "reset of lab/Own must return the sampled values by name, {} .*, not None",
+        ),
     ],
 )
 def test_a_wrong_term_condition_or_reset_is_named_at_the_first_step(attributes, says):
