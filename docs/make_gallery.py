@@ -24,7 +24,7 @@ from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment, task_named
-from guiderail.tools.evaluation.baselines import BaselinePolicy, make_baseline, still, uniform_random
+from guiderail.tools.evaluation.baselines import BaselinePolicy, make_baseline, uniform_random, zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.learning.train import start_or_resume
@@ -240,7 +240,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "passage_learned": (
         lambda: [
-            Panel("before: demonstration alone", "NarrowPassage", {"guidance": "skgrl"}, still, says=_obstacle),
+            Panel("before: demonstration alone", "NarrowPassage", {"guidance": "skgrl"}, zero_policy, says=_obstacle),
             Panel(
                 f"after {LEARNING_EPISODES} episodes, sKGRL",
                 "NarrowPassage",
@@ -254,7 +254,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "connector": (
         lambda: [
-            Panel("the demonstration alone", "BncConnector", {"guidance": "kgrl"}, still),
+            Panel("the demonstration alone", "BncConnector", {"guidance": "kgrl"}, zero_policy),
             Panel(
                 "KGRL, a rule by hand", "BncConnector", {"guidance": "kgrl"}, make_baseline("BncConnector", "scripted")
             ),
@@ -283,9 +283,9 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
     ),
     "parts": (
         lambda: [
-            Panel("a bayonet: demonstration", partial(_onboarded, "bayonet"), _beside(0.0), still),
-            Panel("the same, socket 1.5 mm beside", partial(_onboarded, "bayonet"), _beside(0.0015), still),
-            Panel("a snap-fit: demonstration", partial(_onboarded, "snap_fit"), _beside(0.0), still),
+            Panel("a bayonet: demonstration", partial(_onboarded, "bayonet"), _beside(0.0), zero_policy),
+            Panel("the same, socket 1.5 mm beside", partial(_onboarded, "bayonet"), _beside(0.0015), zero_policy),
+            Panel("a snap-fit: demonstration", partial(_onboarded, "snap_fit"), _beside(0.0), zero_policy),
         ],
         SQUARE,
         8,

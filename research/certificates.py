@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.certify import certify_skill
-from guiderail.tools.evaluation.evaluate import cached
+from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.tables import write_table
 from research.command import Parser, print_result, run_program
 
@@ -91,7 +91,7 @@ def certify_skills(out: Path, declaration: Declaration) -> dict[str, Any]:
         folder = out / "certificates" / name
         content = json.dumps([skill.model_dump(), declaration.attack], sort_keys=True).encode()
         file = folder / f"row-{hashlib.sha256(content).hexdigest()[:8]}.csv"
-        rows.append(cached(file, partial(_certify, skill, folder, declaration.attack)))
+        rows.append(load_or_compute(file, partial(_certify, skill, folder, declaration.attack)))
         rows[-1].insert(0, "skill", name)
     table = pd.concat(rows, ignore_index=True)
     result: dict[str, Any] = {

@@ -23,8 +23,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects.insertion import HISTORY_VARIANCE
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import always
-from guiderail.tools.evaluation.evaluate import cached
+from guiderail.tools.evaluation.baselines import constant_policy
+from guiderail.tools.evaluation.cache import load_or_compute
 from guiderail.tools.evaluation.metrics import jerk, summary
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.tables import write_table
@@ -161,7 +161,7 @@ def smoothness(
         parts = [method.name, outputs, f"{action_scale:g}", str(episodes), str(seed)]
         file = out / "methods" / ("-".join(parts).replace(" ", "_") + ".csv")
         settings: dict[str, Any] = {"episodes": episodes, "action_scale": action_scale, "seed": seed}
-        table = cached(file, lambda: pd.DataFrame(measure(method, OUTPUTS[outputs], quiet, **settings)))  # noqa: B023
+        table = load_or_compute(file, lambda: pd.DataFrame(measure(method, OUTPUTS[outputs], quiet, **settings)))  # noqa: B023
         rows += table.to_dict("records")
     for row in rows:  # compared with uniform random actions through KGRL at the same place
         kgrl = next(one for one in rows if one["method"] == "KGRL" and one["place"] == row["place"])
@@ -178,7 +178,7 @@ def smoothness(
 def quiet_commands() -> np.ndarray:
     """Return the commands of the demonstrations without actions, (N, 6)."""
     env: Any = make_environment(TASK, {"guidance": "kmp", "action_repeat": 1, "fixture_offset": "none"})
-    rollout(env, always(env, np.zeros(env.action_space.shape)), seed=0, options={"offset": OUT_OF_REACH})
+    rollout(env, constant_policy(env, np.zeros(env.action_space.shape)), seed=0, options={"offset": OUT_OF_REACH})
     commands = env.unwrapped.trace.commanded.copy()
     env.close()
     return commands

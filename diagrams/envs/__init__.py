@@ -1,1 +1,0 @@
-"""Gymnasium environments: configuration, assembly of the diagram, observation, trace and views."""

@@ -1,4 +1,4 @@
-"""Station that is driven along a given motion and recorded, for demonstrations, benchmarks and tests of physics."""
+"""A station that is driven along a given motion and recorded: for demonstrations, benchmarks and tests of physics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_f
 
 
 class DrivenStation:
-    """Station whose commands come from a system with a (6,) output, are held for a control period, and recorded."""
+    """A station whose commands come from anything with a (6,) output, are held for a control period, and recorded."""
 
     def __init__(
         self,
@@ -26,14 +26,13 @@ class DrivenStation:
         num_samples: int,
         add_to_builder: Callable[[DiagramBuilder, Station], None] | None = None,
     ):
-        """Construct the diagram and its simulator.
-
+        """
         Args:
-            station: Station; it becomes part of the diagram.
-            source: System whose first output is the desired pose, such as a trajectory, an input device or a policy.
-            num_samples: Largest number of control periods to record.
-            add_to_builder: Function of the builder and the station that is called before the diagram is built, to add
-                a camera or a visualizer.
+            station: what is driven; it becomes part of this diagram.
+            source: a system whose first output is the desired pose: a trajectory, a person's input device, a policy.
+            num_samples: how many control periods the recorder has room for.
+            add_to_builder: called with the builder and the station before the diagram is built, to add a camera or a
+                visualizer.
         """
         builder = DiagramBuilder()
         self.station = builder.AddNamedSystem("station", station)
@@ -53,21 +52,21 @@ class DrivenStation:
 
     @property
     def context(self) -> Context:
-        """Root context."""
+        """The root context."""
         return self.simulator.get_mutable_context()
 
     @property
     def plant_context(self) -> Context:
-        """Context of the plant."""
+        """The plant's context."""
         return self.station.plant.GetMyMutableContextFromRoot(self.context)
 
     def start(self, pose: np.ndarray) -> None:
-        """Put the tool centre at rest at `pose`, (6,), and initialize; call it before `run`."""
+        """Puts the tool centre at rest at `pose`, (6,); call it before `run`."""
         self.station.set_pose(self.context, pose)
         self.simulator.Initialize()
 
     def run(self, num_steps: int | None = None) -> Recording:
-        """Advance `num_steps` control periods, by default all that can be recorded, and return the recording."""
+        """Advances by control periods, all there is room for unless given, and returns what was recorded."""
         recorder_context = self.recorder.GetMyContextFromRoot(self.context)
         done = int(self.recorder.get_num_recorded_output_port().Eval(recorder_context)[0])
         last = self._num_samples if num_steps is None else done + num_steps
@@ -77,21 +76,14 @@ class DrivenStation:
 
 
 def along(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
-    """Return straight lines between `poses` (N, 6) at `times` (N,), which end at rest."""
+    """Straight lines between `poses` (N, 6) at `times` (N,), and at rest thereafter."""
     return TrajectorySource(PiecewisePolynomial.FirstOrderHold(np.asarray(times), np.asarray(poses).T))
 
 
 def drive_along(
     station: Station, times: np.ndarray, poses: np.ndarray, prepare=None
 ) -> tuple[DrivenStation, Recording]:
-    """Drive a station along poses and return it with the recording.
-
-    Args:
-        station: Station.
-        times: Times of the poses, (N,) [s].
-        poses: Poses, (N, 6).
-        prepare: Function of the plant and its context that is called before the start.
-    """
+    """Drives a station from the first pose to the last; `prepare` is called with the plant and its context before."""
     times, poses = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     if prepare is not None:

@@ -1,4 +1,4 @@
-"""Guidance between a policy's action and the commanded pose."""
+"""Guidance: what stands between a policy's action and the pose that a robot is commanded."""
 
 import lazy_loader
 

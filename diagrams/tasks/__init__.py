@@ -1,1 +1,0 @@
-"""Tasks: one folder each, with its options, rewards, workcell and scripted policies."""

@@ -20,7 +20,7 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.environments import check_environment, make_environment
-from guiderail.tools.evaluation.baselines import BASELINES, Choose
+from guiderail.tools.evaluation.baselines import BASELINES, BaselineFactory
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import Callback, EnvCallback, Transition, rollout
 from guiderail.tools.evaluation.step_log import StepLog
@@ -96,7 +96,7 @@ class Campaign:
     cases: Sequence[Case]
     limits: Mapping[str, float]
     make_callback: Callable[[gymnasium.Env], Callback] | None = None
-    actions: Mapping[str, Choose] = field(default_factory=lambda: ACTIONS)
+    actions: Mapping[str, BaselineFactory] = field(default_factory=lambda: ACTIONS)
     frames: Frames | None = nominal_frames
 
 

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring.scripted import scripted_pour
 from guiderail.models.common.poses import pose_to_transform
-from guiderail.tools.evaluation.baselines import Choose, bang_bang, uniform_random
+from guiderail.tools.evaluation.baselines import BaselineFactory, bang_bang, uniform_random
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn
 from research.action_fuzzing.campaign import Campaign, Case
@@ -84,7 +84,7 @@ ADVERSARIES: dict[str, PolicyMaker] = {
 }
 
 
-def _three_inputs(make: PolicyMaker) -> Choose:
+def _three_inputs(make: PolicyMaker) -> BaselineFactory:
     """Return an adversary of the template's three inputs; where there are six velocities, full deflection."""
     return lambda rng, size: make(rng) if size == 3 else bang_bang(rng, size)
 

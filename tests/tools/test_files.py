@@ -8,7 +8,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.datasets.record import record
+from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import check_seed
 from guiderail.tools.files import LOCK, check_page, check_picture, check_writable, remove_parts
 from guiderail.tools.learning.run_folder import RunFolder
@@ -47,7 +47,7 @@ def test_a_seed_that_no_environment_takes_is_refused(seed, bead_run, tmp_path):
     for refused in (
         lambda: check_seed(seed),
         lambda: EpisodeSpec.of_run(bead_run, seed=seed),
-        lambda: record(bead_run, tmp_path / "x.npz", seed=seed),
+        lambda: evaluate(bead_run, save=tmp_path / "x.npz", seed=seed),
     ):
         with pytest.raises(InputError, match=f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}"):
             refused()
@@ -57,7 +57,7 @@ def test_a_recording_is_refused_before_an_episode_is_run(bead_run, tmp_path, mon
     (tmp_path / "file").touch()
     monkeypatch.setattr(Policy, "load", lambda path: pytest.fail("it goes on"))
     with pytest.raises(InputError, match="cannot be written"):
-        record(bead_run, tmp_path / "file" / "x.npz")
+        evaluate(bead_run, save=tmp_path / "file" / "x.npz")
 
 
 @pytest.fixture

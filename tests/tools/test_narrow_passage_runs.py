@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 from safetensors.numpy import load_file
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.record import record
 from guiderail.tools.datasets.validate import validate_demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
@@ -88,7 +88,7 @@ def test_the_replay_is_one_page_that_needs_nothing_else(trained):
     assert "https://" not in page.partition("<body>")[0]
 
 
-def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, monkeypatch):
+def test_image_has_the_format_of_its_ending(trained, tmp_path, monkeypatch):
     watched = camera.record_frames(EpisodeSpec.of_run(trained.path), camera.ROWS * camera.COLUMNS)
     monkeypatch.setattr(camera, "record_frames", lambda *_: watched)  # once for both
     for ending, magic in ((".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")):
@@ -101,6 +101,19 @@ def test_a_film_is_a_picture_in_the_format_that_is_asked_for(trained, tmp_path, 
         assert image[..., :3].std() / image.max() > 0.05  # it is not blank
 
 
+@pytest.mark.parametrize("ending", [".webp", ".gif"])
+def test_video_is_an_animation_in_real_time(ending, trained, tmp_path):
+    row = camera.write_video(tmp_path / f"video{ending}", EpisodeSpec.of_run(trained.path))
+    with Image.open(tmp_path / f"video{ending}") as video:
+        assert video.n_frames > 10
+        durations = []
+        for frame in range(video.n_frames - 1):
+            video.seek(frame)
+            video.load()
+            durations.append(video.info["duration"])
+    assert abs(1e-3 * sum(durations) - 0.02 * row["steps"]) < 0.2 * 0.02 * row["steps"]
+
+
 def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
     with pytest.raises(InputError, match="no station 'arm': choose one of plane"):
         write_page(tmp_path / "replay.html", EpisodeSpec.of_run(trained.path, {"station": "arm"}))
@@ -109,12 +122,11 @@ def test_what_cannot_be_shown_is_refused_and_leaves_nothing(trained, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_policy_does_can_be_demonstrated_again(trained, tmp_path):
-    file = record(trained.path, tmp_path / "again.npz", episodes=2)
+def test_saved_episodes_can_be_used_as_demonstrations(trained, tmp_path):
+    file = tmp_path / "again.npz"
+    assert evaluate(trained.path, episodes=2, save=file)["saved"] == 2
     assert Demonstrations.load(file).num_demonstrations == 2
     assert validate_demonstrations(file)["demonstrations"] == 2
-    with pytest.raises(InputError, match="already exists"):
-        record(trained.path, file, episodes=2)
 
 
 def test_a_tube_keeps_its_radius_along_the_path():

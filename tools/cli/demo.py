@@ -12,7 +12,7 @@ from rich.console import Console
 from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import still
+from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.files import write_atomically
@@ -103,7 +103,7 @@ def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     env.reset(seed=config.seed)
     tables = [
         pd.DataFrame([rollout(env, act, Paths(env), index=i, seed=SEED + i, held_out=True) for i in range(HELD_OUT)])
-        for act in (still(env), Policy.load(out))
+        for act in (zero_policy(env), Policy.load(out))
     ]
     env.close()
     return tables[0], tables[1]

@@ -14,16 +14,28 @@ from guiderail.tools.cli.output import print_message, print_result, to_json
 
 @cli.command("evaluate runs/passage --episodes 100 --json")
 def evaluate(
-    run: cli.Run,
+    subject: Annotated[
+        str,
+        argument(
+            "Folder of a run; or the folder of a policy, with --task; or a task, with --policy: {tasks}.",
+            "RUN|POLICY|TASK",
+        ),
+    ],
     episodes: Annotated[int, option("Number of held-out episodes.")] = 100,
     seed: cli.Seed = 1_000_000,
+    task: Annotated[str | None, option("Task that a POLICY is evaluated in: {tasks}.", choices="tasks")] = None,
+    policy: Annotated[
+        str | None,
+        option("Policy that is evaluated in a TASK, or on hardware instead of the run's: scripted, {baselines}."),
+    ] = None,
     env: cli.Env = None,
     station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
     baselines: cli.Baselines = None,
     resample_offsets: cli.Offsets = False,
-    policy: Annotated[
-        str | None, option("Hardware: baseline policy that acts instead of the run's: scripted, {baselines}.")
+    save: Annotated[
+        Path | None, option("Write the successful episodes as demonstrations, .npz or .csv; the file must not exist.")
     ] = None,
+    signal: Annotated[str, option("Poses that --save writes: commanded or measured.")] = "commanded",
     lcm_url: cli.LcmUrl = None,
     robot: cli.Robot = None,
     sim: cli.Sim = False,
@@ -34,6 +46,7 @@ def evaluate(
     out: Annotated[
         Path | None, option("Hardware: folder of the table of episodes.  [default: hardware in the run]")
     ] = None,
+    imports: cli.TaskImports = None,
     as_json: cli.Json = False,
 ) -> None:
     """Evaluate a policy on held-out episodes, together with baseline policies.
@@ -44,28 +57,46 @@ def evaluate(
     """
     environment = cli.parse_environment(env, station=station, robot=robot, lcm_url=lcm_url)
     if cli.is_hardware(environment.get("station")):
-        if baselines is not None or resample_offsets or environment.keys() - {"station", "robot", "lcm_url"}:
+        given = environment.keys() - {"station", "robot", "lcm_url"} or task or baselines or save
+        if given or resample_offsets:
             raise InputError(
-                "on hardware one policy is evaluated in the run's own environment: leave --baselines, "
-                "--resample-offsets and --env out"
+                "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "
+                "--save and --resample-offsets out"
             )
         connection = cli.hardware_arguments(environment, sim=sim, synchronous=synchronous, rate=rate)
         station = str(environment["station"])
-        print_result(_evaluate_on_hardware(run, episodes, policy, station, connection, scenario, yes, out), as_json)
+        result = _evaluate_on_hardware(Path(subject), episodes, policy, station, connection, scenario, yes, out)
+        print_result(result, as_json)
         return
-    cli.refuse_hardware_options(
-        sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes, out=out, policy=policy
-    )
-    from guiderail.tools.evaluation.evaluate import evaluate as evaluate_run
+    cli.refuse_hardware_options(sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes, out=out)
+    name = cli.find_task(subject, imports)[0]
+    if policy is not None and (task is not None or Path(name).is_dir()):
+        raise InputError("--policy is evaluated in a task: name the task instead of a folder, or give --baselines")
+    from guiderail.tools.evaluation.evaluate import evaluate as evaluate_policy
 
-    others = _select_baselines(run, environment, baselines)
-    result = evaluate_run(
-        run, episodes=episodes, seed=seed, environment=environment, baselines=others, resample_offsets=resample_offsets
+    result = evaluate_policy(
+        policy or Path(name),
+        name if policy is not None else task if task is None else cli.find_task(task)[0],
+        episodes=episodes,
+        seed=seed,
+        environment=environment,
+        baselines=_split(baselines),
+        resample_offsets=resample_offsets,
+        save=save,
+        signal=signal,
     )
-    for name in others:
-        if name not in result["baselines"]:
-            print_message(f"{name} is left out: its observation or action does not match this environment")
+    for skipped in result.pop("skipped_baselines"):
+        print_message(f"{skipped} is left out: its observation or action does not match this environment")
+    if result.get("saved") == 0:
+        print_message(f"no episode succeeded: {save} is not written")
     print_result(result, as_json)
+
+
+def _split(names: str | None) -> list[str] | None:
+    """Return names of baseline policies, comma-separated in `names`; None for None, the default set."""
+    if names is None:
+        return None
+    return [] if names == "none" else [name.strip() for name in names.split(",")]
 
 
 def _evaluate_on_hardware(
@@ -99,24 +130,6 @@ def _evaluate_on_hardware(
     )
 
 
-def _select_baselines(run: Path, environment: Mapping[str, Any], names: str | None) -> dict[str, Any]:
-    """Return baseline policies by name, comma-separated in `names`; the default set of the run's task for None."""
-    from guiderail.tools.environments import changed_environment
-    from guiderail.tools.evaluation.baselines import make_baseline, scripted_policies
-    from guiderail.tools.learning.run_folder import RunFolder
-    from guiderail.tools.visualization.style import is_demonstrated
-
-    config = RunFolder(run).config()
-    environment = changed_environment(config.task, config.environment, environment)
-    if names is None:
-        zero = [] if is_demonstrated(environment.get("guidance")) else ["zero"]
-        has_scripted = bool(scripted_policies(config.task)) and environment.get("observation") != "image"
-        chosen = [*zero, "uniform_random", "constant", *(["scripted"] if has_scripted else [])]
-    else:
-        chosen = [] if names == "none" else [name.strip() for name in names.split(",")]
-    return {name: make_baseline(config.task, name, config.seed) for name in chosen}
-
-
 @cli.command("robustness runs/connector --env station=mujoco --episodes 50")
 def robustness(
     runs: Annotated[list[Path], argument("Folders of runs of one task, which are compared.", "RUN...")],
@@ -135,22 +148,18 @@ def robustness(
     One quantity is changed at a time; one table and one picture compare all runs. Evaluated episodes are stored: the
     same command resumes an interrupted evaluation, and an additional run costs only its own episodes.
     """
-    from guiderail.tools.evaluation.robustness import breaks
     from guiderail.tools.evaluation.robustness import robustness as evaluate_robustness
+    from guiderail.tools.evaluation.robustness import values_below
 
-    environment = cli.parse_environment(env)
-    others = _select_baselines(runs[0], environment, baselines)
-    if baselines is None:
-        others.pop("constant")
     result = evaluate_robustness(
         runs,
         episodes=episodes,
         seed=seed,
-        environment=environment,
+        environment=cli.parse_environment(env),
         axes=axes,
-        baselines=others,
+        baselines=_split(baselines),
         out=out,
-        tell=print_message,
+        say=print_message,
     )
     if as_json:
         typer.echo(to_json({"table": str(result["table"]), "picture": str(result["picture"]), "rows": result["rows"]}))
@@ -158,7 +167,7 @@ def robustness(
     for line in result["table"].with_suffix(".md").read_text(encoding="utf-8").splitlines():
         typer.echo(line)
     for policy in result["policies"]:
-        for name, values in breaks(result["rows"], policy).items():
+        for name, values in values_below(result["rows"], policy).items():
             below = ", ".join(f"{value:.3g}" for value in values) or "no value"
             typer.echo(f"{policy}, {name}: success rate below 90 % at {below}")
     typer.echo(result["table"])

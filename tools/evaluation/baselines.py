@@ -1,4 +1,4 @@
-"""Policies that know nothing: what a learned one is compared with, and what guidance must withstand."""
+"""Baseline policies: they ignore the observation, and show what a task's success rate is without learning."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -13,91 +13,95 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn
 
-REPEATS = 10  # decisions that a held action lasts
-TURNS = 0.1  # how likely corner actions turn into another corner at a decision
+HOLD = 10  # actions that `random_hold` repeats
+SWITCH_PROBABILITY = 0.1  # probability per action that `bang_bang` samples another corner
 
-# Makes the actions of an episode from its random generator and the size of an action.
-Choose = Callable[[np.random.Generator, int], PolicyFn]
+# Makes the policy of an episode from its random generator and the size of an action.
+BaselineFactory = Callable[[np.random.Generator, int], PolicyFn]
+# Makes a policy for an environment.
+MakePolicy = Callable[[gymnasium.Env], PolicyFn]
 
 
 def zero(rng: np.random.Generator, size: int) -> PolicyFn:
-    """The action of zero, which leaves guidance to itself: where it has demonstrations, those."""
+    """Return the zero action: guidance alone, which follows the demonstrations where there are some."""
     return lambda observation: np.zeros(size, np.float32)
 
 
 def uniform_random(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Uniform in [−1, 1], anew at every decision: an make_baseline policy."""
+    """Return independent uniform actions in [−1, 1], as of an untrained policy."""
     return lambda observation: rng.uniform(-1.0, 1.0, size)
 
 
 def constant(rng: np.random.Generator, size: int) -> PolicyFn:
-    """One action for the whole episode, uniform in [−1, 1]."""
-    return _repeated(lambda: rng.uniform(-1.0, 1.0, size), lambda count: False)
+    """Return one uniform action in [−1, 1] for the whole episode."""
+    return _repeat(lambda: rng.uniform(-1.0, 1.0, size), lambda count: False)
 
 
 def random_hold(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Uniform, each for `REPEATS` decisions: they lead further than white ones."""
-    return _repeated(lambda: rng.uniform(-1.0, 1.0, size), lambda count: count % REPEATS == 0)
+    """Return uniform actions, each repeated `HOLD` times: they lead further than independent ones."""
+    return _repeat(lambda: rng.uniform(-1.0, 1.0, size), lambda count: count % HOLD == 0)
 
 
 def bang_bang(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Full deflection, that turns into another corner now and then."""
-    return _repeated(lambda: rng.choice([-1.0, 1.0], size), lambda count: rng.uniform() < TURNS)
+    """Return actions at a corner of [−1, 1]^A, which is sampled again with `SWITCH_PROBABILITY`."""
+    return _repeat(lambda: rng.choice([-1.0, 1.0], size), lambda count: rng.uniform() < SWITCH_PROBABILITY)
 
 
 def random_corner(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Full deflection into one corner for the whole episode."""
-    return _repeated(lambda: rng.choice([-1.0, 1.0], size), lambda count: False)
+    """Return one corner of [−1, 1]^A for the whole episode."""
+    return _repeat(lambda: rng.choice([-1.0, 1.0], size), lambda count: False)
 
 
-def _repeated(choose: Callable[[], np.ndarray], turns: Callable[[int], bool]) -> PolicyFn:
-    count, action = 0, choose()
+def _repeat(sample: Callable[[], np.ndarray], is_due: Callable[[int], bool]) -> PolicyFn:
+    """Return a policy that repeats a sampled action until `is_due` of the number of actions so far."""
+    count, action = 0, sample()
 
     def act(observation: np.ndarray) -> np.ndarray:
         nonlocal count, action
-        if count > 0 and turns(count):
-            action = choose()
+        if count > 0 and is_due(count):
+            action = sample()
         count += 1
         return action
 
     return act
 
 
-BASELINES: dict[str, Choose] = {
-    one.__name__: one for one in (zero, uniform_random, constant, random_hold, bang_bang, random_corner)
+BASELINES: dict[str, BaselineFactory] = {
+    factory.__name__: factory for factory in (zero, uniform_random, constant, random_hold, bang_bang, random_corner)
 }
 
 
 class BaselinePolicy(Callback):
-    """Actions that look at nothing, chosen anew for every episode from a random generator of its own."""
+    """Policy that ignores the observation, with a random generator of its own in every episode."""
 
-    def __init__(self, choose: Choose, env: gymnasium.Env, seed: int = 0):
-        """
+    def __init__(self, factory: BaselineFactory, env: gymnasium.Env, seed: int = 0):
+        """Construct the policy.
+
         Args:
-            choose: makes the actions of an episode.
-            env: for its actions' size only.
-            seed: of the generators; episode i has [seed, i].
+            factory: Makes the policy of an episode.
+            env: Environment, for the size of its action only.
+            seed: Seed of the generators; episode i has [seed, i].
         """
-        self._choose, self._seed, self._episode = choose, seed, -1
+        self._factory, self._seed, self._episode = factory, seed, -1
         self._size = int(np.prod(env.action_space.shape or ()))
         self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
 
     def on_episode_start(self) -> None:
-        """The next episode's actions."""
+        """Make the policy of the next episode."""
         self._episode += 1
-        self._act = self._choose(np.random.default_rng([self._seed, self._episode]), self._size)
+        self._act = self._factory(np.random.default_rng([self._seed, self._episode]), self._size)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """An action (A,) in [−1, 1]."""
+        """Return an action (A,) in [−1, 1]."""
         return self._act(observation)
 
 
-still = partial(BaselinePolicy, zero)
-"""What acts by zero, for an environment."""
+zero_policy: MakePolicy = partial(BaselinePolicy, zero)
+"""Make the policy of zero actions for an environment."""
 
 
-def always(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
-    """The same action in every episode."""
+def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
+    """Return the policy whose action (A,) is the same in every episode."""
     return BaselinePolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)
 
 
@@ -110,7 +114,7 @@ def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> Po
     """Return a task's scripted policy by its name; "scripted" is the default for the difficulty.
 
     Raises:
-        InputError: If there is none of that name.
+        InputError: If the task has no policy of that name.
     """
     policies = scripted_policies(task, difficulty)
     if name == "scripted" and policies:
@@ -120,11 +124,16 @@ def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> Po
     return policies[name]
 
 
-def make_baseline(task: str, name: str, seed: int = 0) -> Callable[[gymnasium.Env], PolicyFn]:
-    """Return a function from an environment to a baseline policy or a task's scripted policy of that name.
+def make_baseline(task: str, name: str, seed: int = 0) -> MakePolicy:
+    """Return a function that makes a baseline policy, or a scripted policy of a task, for an environment.
+
+    Args:
+        task: Name of the task.
+        name: Key of `BASELINES`, the name of a scripted policy, or "scripted" for the default of the difficulty.
+        seed: Seed of a baseline's random generators.
 
     Raises:
-        InputError: If there is none.
+        InputError: If the task has no policy of that name.
     """
     if name in BASELINES:
         return lambda env: BaselinePolicy(BASELINES[name], env, seed)

@@ -30,8 +30,9 @@ from guiderail.tools.environments import (
     make_environment,
     task_content,
 )
-from guiderail.tools.evaluation.baselines import always, make_baseline
-from guiderail.tools.evaluation.evaluate import cached, evaluate_run
+from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
+from guiderail.tools.evaluation.cache import load_or_compute
+from guiderail.tools.evaluation.evaluate import evaluate_run
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import PolicyFn, check_compatible, rollout
 from guiderail.tools.experiments.declaration import LEARNED, EvalSet, Ratio, Study
@@ -390,7 +391,7 @@ def _evaluated(job: Job, mark: int, judged: EvalSet) -> pd.DataFrame:
             write_atomically(_says_of_what(file), _digest(job, judged, mark).encode())
         return rows
 
-    return cached(file, evaluated)
+    return load_or_compute(file, evaluated)
 
 
 def _says_of_what(file: Path) -> Path:
@@ -435,7 +436,7 @@ def _policy(job: Job, mark: int) -> Callable[[gymnasium.Env], PolicyFn]:
         return partial(check_compatible, learned)
     if name == BEST_CONSTANT:
         best = _best_constant(job)
-        return lambda env: always(env, best)
+        return lambda env: constant_policy(env, best)
     return make_baseline(job.study.task, name, job.seed)
 
 
@@ -449,11 +450,11 @@ def _best_constant(job: Job) -> np.ndarray:
         rows = []
         for action in itertools.product(grid, repeat=int(np.prod(env.action_space.shape or ()))):
             env.reset(seed=config.seed)
-            found = pd.DataFrame([rollout(env, always(env, np.array(action))) for _ in range(SELECTION_EPISODES)])
+            found = pd.DataFrame([rollout(env, constant_policy(env, np.array(action))) for _ in range(SELECTION_EPISODES)])
             numbers = {f"action_{i}": value for i, value in enumerate(action)}
             rows.append(numbers | summary(found, ("success_rate", "mean_return")))
         env.close()
         return pd.DataFrame(rows).sort_values(["success_rate", "mean_return"], ascending=False, kind="stable")
 
-    best = cached(file, tried).iloc[0]
+    best = load_or_compute(file, tried).iloc[0]
     return best.filter(like="action_").to_numpy(float)

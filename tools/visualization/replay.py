@@ -19,7 +19,7 @@ from pydrake.geometry import Rgba
 from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import BaselinePolicy, still, uniform_random
+from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.files import check_page, write_atomically
@@ -88,7 +88,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     task = base.task.declaration
     scene = Scene(to_world=in_plane) if task is None else task.scene()
     demonstrated = is_demonstrated(episode.environment.get("guidance"))
-    before: PolicyFn = still(env) if demonstrated else BaselinePolicy(uniform_random, env, episode.seed)
+    before: PolicyFn = zero_policy(env) if demonstrated else BaselinePolicy(uniform_random, env, episode.seed)
     sides = {
         Side("before", "before: the demonstration alone" if demonstrated else "before: random actions", BLACK): before,
         Side("after", episode.acting, GREEN): episode.policy(env),

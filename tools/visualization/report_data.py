@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,9 @@ import pandas as pd
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import beyond_defaults, known_tasks
-from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
-from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, cached, evaluate_run, kept_file, learned_file
+from guiderail.tools.evaluation.baselines import make_baseline
+from guiderail.tools.evaluation.cache import BASELINES_FOLDER, POLICY, POLICY_FOLDER, policy_digest, stored_episodes
+from guiderail.tools.evaluation.evaluate import HELD_OUT_SEED, evaluate_once
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import PRESETS
@@ -25,11 +25,7 @@ from guiderail.tools.tables import read_table
 from guiderail.tools.visualization.style import colour, is_demonstrated, label
 
 LEARNED = "learned"
-BESIDE = (
-    "zero",
-    "uniform_random",
-    "constant",
-)  # null policies that an evaluation for a report has beside the learned one
+BASELINES = ("zero", "uniform_random", "constant")  # evaluated together with a run's policy
 STUDY_COLUMNS = {"method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"}
 NEEDED = (
     "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
@@ -163,7 +159,7 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> Gathered:
     if not runs and not held_out:
         raise InputError(f"{paths[0]} has no finished episode yet: let it train, then report on it")
     _name_methods(runs)
-    held_out += [_judged(run, episodes) for run in runs if run.path.resolve() in alone]
+    held_out += [_evaluated(run, episodes) for run in runs if run.path.resolve() in alone]
     name = paths[0].resolve().name if len(paths) == 1 else ", ".join(dict.fromkeys(run.config.task for run in runs))
     tables_of_rows = [table for table in held_out if len(table)]
     judged = pd.concat(tables_of_rows, ignore_index=True) if tables_of_rows else pd.DataFrame()
@@ -209,42 +205,33 @@ def _counted(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.drop(columns="success_rate")
 
 
-def _judged(run: Run, episodes: int) -> pd.DataFrame:
-    """Held-out episodes of a run that are in its folder, and those that are asked for."""
+def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
+    """Return the counts of a run's stored held-out episodes, after evaluating `episodes` if there are not so many."""
     if episodes:
-        _judge(run, episodes)
-    found: dict[str, dict[str, Any]] = {}
-    for file in sorted(file for folder in ("held_out", "baselines") for file in (run.path / folder).glob("*.csv")):
-        table, policy = read_table(file), file.stem.split("-")[0]
-        if "success" not in table or (
-            policy == LEARNED and not file.stem.startswith(f"{LEARNED}-{len(run.episodes)}-{HELD_OUT_SEED}-")
-        ):
-            continue
-        # An evaluation may have been asked for another environment or other episodes.
-        how: dict[str, Any] = {"episodes": len(table), "seed": HELD_OUT_SEED}
-        if file.parent.name == "baselines" and file != kept_file(
-            file.parent, policy, run.config, run.config.environment, **how
-        ):
-            continue
-        count = {"episodes": len(table), "successes": int(table["success"].sum())}
-        where = {"study": "", "method": run.method, "seed": run.config.seed, "after_episodes": len(run.episodes)}
-        if policy not in found or found[policy]["episodes"] < len(table):
-            found[policy] = {**where, "policy": policy, "eval_set": "held out", **count}
-    return pd.DataFrame(list(found.values()))
+        _evaluate(run, episodes)
+    counts: dict[str, dict[str, Any]] = {}
+    run_columns = {"study": "", "method": run.method, "seed": run.config.seed, "after_episodes": len(run.episodes)}
+    for name, rows in stored_episodes(RunFolder(run.path), run.config, HELD_OUT_SEED):
+        policy = LEARNED if name == POLICY else name
+        if policy not in counts or counts[policy]["episodes"] < len(rows):
+            count = {"episodes": len(rows), "successes": int(rows["success"].sum())}
+            counts[policy] = {**run_columns, "policy": policy, "eval_set": "held out", **count}
+    return pd.DataFrame(list(counts.values()))
 
 
-def _judge(run: Run, episodes: int) -> None:
+def _evaluate(run: Run, episodes: int) -> None:
+    """Evaluate a run's policy and baseline policies on held-out episodes, unless they are stored in its folder."""
+    folder, where = RunFolder(run.path), run.config.environment
     policy = Policy.load(run.path)
-    known = learned_file(run.path, len(run.episodes), HELD_OUT_SEED, episodes)
-    cached(known, partial(evaluate_run, run.config, lambda env: policy, episodes=episodes, words=LEARNED))
-    acts: dict[str, Any] = {}
-    demonstrated = is_demonstrated(run.config.environment.get("guidance"))
-    for name in BESIDE:
-        called = "demonstration" if name == "zero" and demonstrated else name
-        acts[called] = lambda env, choose=BASELINES[name]: BaselinePolicy(choose, env, seed=HELD_OUT_SEED)
-    for name, act in acts.items():
-        file = run.path / "held_out" / f"{name}-{HELD_OUT_SEED}-{episodes}.csv"
-        cached(file, partial(evaluate_run, run.config, act, episodes=episodes, words=name))
+    how: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED}
+    evaluate_once(
+        run.path / POLICY_FOLDER, POLICY, run.config, lambda env: policy, where, about=policy_digest(folder), **how
+    )
+    is_demonstration = is_demonstrated(where.get("guidance"))
+    for name in BASELINES:
+        stored_name = "demonstration" if name == "zero" and is_demonstration else name
+        make_policy = make_baseline(run.config.task, name, run.config.seed)
+        evaluate_once(run.path / BASELINES_FOLDER, stored_name, run.config, make_policy, where, **how)
 
 
 def _name_methods(runs: list[Run]) -> None:

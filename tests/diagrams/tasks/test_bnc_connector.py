@@ -16,7 +16,7 @@ from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.models.objects.insertion import COLLISION_FORCE
-from guiderail.tools.evaluation.baselines import still
+from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
 NEW_RUN = {"new_run": True}  # every episode is a run of its own
@@ -63,7 +63,7 @@ def test_spaces(skgrl):
 
 @pytest.mark.parametrize("offset", [(0.3, 0.0), (-0.2, -0.2)])
 def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
-    _, info, total, _ = play(kmp, still(kmp), seed=0, options={"offset": np.array(offset) * MM})
+    _, info, total, _ = play(kmp, zero_policy(kmp), seed=0, options={"offset": np.array(offset) * MM})
     assert info["termination"] == "success"
     assert info["control_steps"] < NUM_STEPS
     assert total > 50.0
@@ -71,7 +71,7 @@ def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
 
 def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
     """On the whole at most one in five; here, not once."""
-    assert evaluate_policy(skgrl, still(skgrl), episodes=1, options=NEW_RUN)["success"].sum() == 0
+    assert evaluate_policy(skgrl, zero_policy(skgrl), episodes=1, options=NEW_RUN)["success"].sum() == 0
 
 
 def test_a_rule_that_feels_the_torque_finds_a_hidden_jack(skgrl):

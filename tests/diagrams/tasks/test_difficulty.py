@@ -16,7 +16,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
-from guiderail.tools.evaluation.baselines import still
+from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
 HARD = {"BncConnector": bnc_options.HARD, "GridClamp": grid_clamp_options.HARD}
@@ -137,7 +137,7 @@ def test_at_its_hardest_the_rule_locks_and_the_demonstrations_do_not(connector):
     row = evaluate_policy(connector, scripted_center_of_pressure, episodes=1, **FRESH).iloc[0]
     assert row["success"]
     assert row["max_commanded_violation"] <= 1e-9
-    assert not evaluate_policy(connector, still(connector), episodes=1, **FRESH)["success"].any()
+    assert not evaluate_policy(connector, zero_policy(connector), episodes=1, **FRESH)["success"].any()
 
 
 def test_at_its_hardest_the_rule_snaps_the_clamp_in_and_the_straight_descent_does_not(clamp):

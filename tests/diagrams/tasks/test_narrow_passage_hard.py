@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.task import HARD, NarrowPassageOptions, scripted_slalom
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
-from guiderail.tools.evaluation.baselines import BASELINES, always, still
+from guiderail.tools.evaluation.baselines import BASELINES, constant_policy, zero_policy
 from guiderail.tools.evaluation.rollout import rollout
 
 
@@ -20,13 +20,13 @@ def test_the_rule_passes_and_the_demonstrations_do_not(env):
     row = rollout(env, scripted_slalom, seed=0, held_out=True)
     assert row["success"]
     assert row["max_commanded_violation"] <= 1e-9
-    row = rollout(env, still(env), seed=0, held_out=True)
+    row = rollout(env, zero_policy(env), seed=0, held_out=True)
     assert row["termination"] == "collision"
 
 
 def test_no_constant_side_is_right(env):
     for side in (-1.0, 1.0):
-        row = rollout(env, always(env, np.array([side, 0.0])), seed=1)
+        row = rollout(env, constant_policy(env, np.array([side, 0.0])), seed=1)
         assert row["termination"] == "collision"
 
 

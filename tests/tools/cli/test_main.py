@@ -64,7 +64,11 @@ def trained(bead_run):
         (["train", "BncConnector", "--out", "new", "--scenario", "lab.yaml"], "give --station hardware too"),
         (["evaluate", "new"], "not a run"),
         (["evaluate", "new", "--sim"], "give --station hardware too"),
-        (["evaluate", "new", "--station", "hardware", "--sim", "--resample-offsets"], "leave --baselines"),
+        (["evaluate", "new", "--station", "hardware", "--sim", "--resample-offsets"], "leave --env"),
+        (["evaluate", "new", "--task", "Bead"], "no policy 'new'"),
+        (["evaluate", "Bead", "--policy", "scripted"], "Bead has no policy 'scripted'"),
+        (["evaluate", ".", "--policy", "zero"], "name the task instead of a folder"),
+        (["evaluate", "new", "--save", "x.yaml"], "demonstrations are .npz or .csv"),
         (["visualize", "new"], "not a run"),
         (["visualize", "new", "--image", "picture.png"], "not a run"),
         (["visualize", "Bead", "--policy", "scripte", "--image", "picture.png"], "no policy 'scripte'"),
@@ -163,7 +167,7 @@ def test_train_writes_all_files_of_a_run(capsys, tmp_path):
 def test_evaluate_prints_one_json_object(capsys, trained):
     code, out, err = call(capsys, "evaluate", trained, "--episodes", 3, "--json")
     assert code == 0
-    assert "series 1 of 4: the policy 3/3" in err
+    assert "series 1 of 4: policy 3/3" in err
     result = json.loads(out)
     assert {
         "success_rate",
@@ -285,7 +289,7 @@ def test_list_prints_json_options_and_metrics(capsys):
     assert {"tasks", "guidance", "learners", "presets"} <= listed.keys()
     assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
     assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["action_repeat"]
-    assert "ten in a row" in call(capsys, "list", "metrics")[1]
+    assert "first ten consecutive successes" in call(capsys, "list", "metrics")[1]
     # What `hard` stands for can be given option by option.
     assert "offset_range=[0.0026,0.003]" in call(capsys, "list", "BncConnector")[1]
     assert json.loads(call(capsys, "list", "GridClamp", "--json")[1])["difficulties"]["hard"]["force_limit"] == 10.0

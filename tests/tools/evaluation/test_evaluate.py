@@ -5,13 +5,23 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import BaselinePolicy, still, uniform_random
-from guiderail.tools.evaluation.evaluate import COMPARED, cached, evaluate, evaluate_policy, evaluation_scope
+from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
+from guiderail.tools.evaluation.cache import load_or_compute, stored_episodes
+from guiderail.tools.evaluation.evaluate import (
+    COMPARED,
+    HELD_OUT_SEED,
+    check_guidance_change,
+    evaluate,
+    evaluate_policy,
+    evaluation_scope,
+)
 from guiderail.tools.learning.run_folder import RunFolder
 
 
-def test_every_episode_has_conditions_of_its_own_and_any_of_them_can_be_had_again():
+def test_episode_conditions_depend_on_its_seed_alone():
     env = make_environment("Bead", {})
     four = evaluate_policy(env, lambda observation: np.zeros(2), episodes=4, seed=20)
     assert four["return"].nunique() == 4
@@ -20,28 +30,28 @@ def test_every_episode_has_conditions_of_its_own_and_any_of_them_can_be_had_agai
 
 
 @pytest.mark.parametrize("wrong", [{"episodes": 0}, {"episodes": 1, "seed": -1}, {"episodes": 1, "seed": 2**31}])
-def test_numbers_out_of_range_are_refused(wrong):
+def test_evaluate_policy_refuses_numbers_out_of_range(wrong):
     with pytest.raises(InputError):
         evaluate_policy(make_environment("Bead", {}), lambda observation: np.zeros(2), **wrong)
 
 
-def test_what_is_known_is_not_evaluated_again(tmp_path):
-    asked = []
+def test_load_or_compute_computes_once(tmp_path):
+    calls = []
 
-    def evaluated():
-        asked.append(1)
+    def compute():
+        calls.append(1)
         return pd.DataFrame({"success": [1, 0], "return": [0.1 + 0.2, -np.inf]})
 
-    first, again = (cached(tmp_path / "rows.csv", evaluated) for _ in range(2))
+    first, again = (load_or_compute(tmp_path / "rows.csv", compute) for _ in range(2))
     pd.testing.assert_frame_equal(first, again)
-    assert len(asked) == 1
+    assert len(calls) == 1
 
 
-def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_run, capsys):
+def test_demonstration_runs_on_the_episodes_of_the_policy(bead_run, capsys):
     result = evaluate(bead_run, episodes=3)
-    said = capsys.readouterr().err
-    assert "series 1 of 2: the policy 3/3" in said
-    assert "series 2 of 2: demonstration alone 3/3" in said
+    printed = capsys.readouterr().err
+    assert "series 1 of 2: policy 3/3" in printed
+    assert "series 2 of 2: demonstration alone 3/3" in printed
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
     elsewhere = evaluate(bead_run, episodes=3, environment={"wall": -0.5})
@@ -49,48 +59,108 @@ def test_the_demonstration_meets_the_same_episodes_as_the_policy(bead_run, capsy
     assert elsewhere["mean_return"] != result["mean_return"]
 
 
-def test_what_learned_nothing_meets_the_same_episodes_once(bead_run, capsys):
+def test_baselines_are_evaluated_once(bead_run, capsys):
     policies = {
-        "zero": still,
+        "zero": zero_policy,
         "uniform_random": partial(BaselinePolicy, uniform_random),
         "other": lambda env: lambda observation: np.zeros(7),
     }
     first = evaluate(bead_run, episodes=3, baselines=policies)
     assert first["baselines"] == ["demonstration", "zero", "uniform_random"]
+    assert first["skipped_baselines"] == ["other"]
     for name in COMPARED:
         assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
-    assert first["white_mean_return"] != first["zero_mean_return"]
-    assert "series 4 of 5: white noise 3/3" in capsys.readouterr().err
+    assert first["uniform_random_mean_return"] != first["zero_mean_return"]
+    assert "series 4 of 5: uniform random actions 3/3" in capsys.readouterr().err
     again = evaluate(bead_run, episodes=3, baselines=policies)
-    said = capsys.readouterr().err
-    for who in ("series 2 of 5: demonstration alone", "series 4 of 5: white noise"):
-        assert f"{who}: kept from before, and not run again" in said
-        assert f"{who} 3/3" not in said
+    printed = capsys.readouterr().err
+    for name in ("series 2 of 5: demonstration alone", "series 4 of 5: uniform random actions"):
+        assert f"{name}: evaluated before, and used again" in printed
+        assert f"{name} 3/3" not in printed
     assert again == first
-    assert evaluate(bead_run, episodes=4, baselines=policies)["white_mean_return"] != first["white_mean_return"]
+    four = evaluate(bead_run, episodes=4, baselines=policies)
+    assert four["uniform_random_mean_return"] != first["uniform_random_mean_return"]
 
 
-def test_a_policy_for_one_offset_and_one_for_any_are_two_claims(bead_run):
+def test_stored_episodes_are_those_of_the_runs_own_policy(bead_run):
+    folder = RunFolder(bead_run)
+    evaluate(bead_run, episodes=2, baselines=["constant"])
+    evaluate(bead_run, episodes=2, environment={"wall": -0.5})
+    stored = dict(stored_episodes(folder, folder.config(), HELD_OUT_SEED))
+    assert {name: len(rows) for name, rows in stored.items()} == {"policy": 2, "demonstration": 2, "constant": 2}
+    policy = Policy.load(bead_run)
+    policy._layers[0][0][0, 0] += 0.1
+    policy.save(bead_run)
+    assert "policy" not in dict(stored_episodes(folder, folder.config(), HELD_OUT_SEED))
+
+
+def test_evaluate_takes_a_policy_without_a_run(bead_run, tmp_path):
+    (tmp_path / "exported").mkdir()
+    Policy.load(bead_run).save(tmp_path / "exported")
+    own = evaluate(bead_run, episodes=2)
+    exported = evaluate(tmp_path / "exported", "Bead", environment=RunFolder(bead_run).config().environment, episodes=2)
+    assert exported["mean_return"] == own["mean_return"]
+    assert exported["trained_episodes"] is None
+    zero, function = (evaluate(act, "Bead", episodes=2) for act in ("zero", lambda observation: np.zeros(2)))
+    assert zero["mean_return"] == function["mean_return"]
+    assert list((tmp_path / "exported").rglob("*.csv")) == []
+    with pytest.raises(InputError, match="name it"):
+        evaluate(lambda observation: np.zeros(2), episodes=2)
+
+
+def test_evaluate_saves_successful_episodes(tmp_path):
+    file = tmp_path / "saved.npz"
+    result = evaluate("zero", "NarrowPassage", environment={"guidance": "kmp"}, episodes=1, save=file)
+    assert result["success_rate"] == 1.0
+    assert result["saved"] == Demonstrations.load(file).num_demonstrations == 1
+    for wrong, message in (({"save": file}, "already exists"), ({"save": tmp_path / "x.yaml"}, r"\.npz or \.csv")):
+        with pytest.raises(InputError, match=message):
+            evaluate("zero", "NarrowPassage", **wrong)
+    with pytest.raises(InputError, match="no signal 'wrench'"):
+        evaluate("zero", "NarrowPassage", save=tmp_path / "other.npz", signal="wrench")
+
+
+def test_evaluate_saves_nothing_when_no_episode_succeeds(bead_run, tmp_path):
+    result = evaluate(bead_run, episodes=1, environment={"wall": -0.5}, save=tmp_path / "none.npz")
+    assert result["saved"] == 0
+    assert not (tmp_path / "none.npz").exists()
+
+
+def test_evaluate_describes_differences_when_asked(bead_run):
+    assert "differences" not in evaluate(bead_run, episodes=1)
+    result = evaluate(bead_run, episodes=1, describe_differences=lambda config: [config.task])
+    assert result["differences"] == ["Bead"]
+
+
+def test_another_guidance_is_refused_or_stated():
+    assert check_guidance_change({"guidance": "skgrl"}, {"guidance": "skgrl"}) == ""
+    remark = check_guidance_change({"guidance": "skgrl"}, {"guidance": "residual"})
+    assert remark == "with guidance residual, and was trained with skgrl"
+    with pytest.raises(InputError, match="its actions mean something else with none"):
+        check_guidance_change({"guidance": "skgrl"}, {"guidance": "none"})
+
+
+def test_scope_differs_between_one_offset_and_any(bead_run):
     one = evaluation_scope("BncConnector", {"fixture_offset": "per_run"}, resample_offsets=False)
     for_any = evaluation_scope("BncConnector", {"fixture_offset": "per_run"}, resample_offsets=True)
     assert "the one offset that is hidden in this run" in one
     assert for_any == evaluation_scope("GridClamp", {"fixture_offset": "per_episode"}, resample_offsets=False) != one
-    assert evaluate(bead_run, episodes=1)["evaluation_scope"] == "a policy for starts that training never drew"
-    with pytest.raises(InputError, match="hides nothing that could be drawn anew: leave --fresh out"):
+    assert evaluate(bead_run, episodes=1)["evaluation_scope"] == "held-out starts"
+    with pytest.raises(InputError, match="no hidden offset to resample: leave --resample-offsets out"):
         evaluate(bead_run, episodes=1, resample_offsets=True)
 
 
-def test_what_a_run_hid_is_not_among_what_is_drawn_anew(bead_run, monkeypatch):
-    monkeypatch.setattr("guiderail.tools.evaluation.evaluate.claim", lambda *given: "for any")
+def test_resampled_offsets_exclude_that_of_the_run(bead_run, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.evaluation.evaluate.evaluation_scope", lambda *given: "any")
     own = RunFolder(bead_run).config().seed
     for seed, episodes in ((own, 1), (own - 2, 3)):
-        with pytest.raises(InputError, match="hides what the run itself hid"):
+        with pytest.raises(InputError, match="has the offset of the run itself"):
             evaluate(bead_run, episodes=episodes, seed=seed, resample_offsets=True)
 
 
-def test_what_is_hidden_in_a_run_is_drawn_anew_only_where_that_is_asked_for():
+def test_hidden_offset_is_resampled_only_with_new_run():
     env = make_environment("BncConnector", {"fixture_offset": "per_run"})
     env.reset(seed=3)
-    for options, places in (({}, 1), ({"new_run": True}, 3)):
-        drawn = [env.reset(seed=seed, options={"held_out": True} | options)[1]["jack_offset"] for seed in (7, 8, 9)]
-        assert len({tuple(offset) for offset in drawn}) == places
+    for options, number in (({}, 1), ({"new_run": True}, 3)):
+        sampled = [env.reset(seed=seed, options={"held_out": True} | options)[1]["jack_offset"] for seed in (7, 8, 9)]
+        assert len({tuple(offset) for offset in sampled}) == number

@@ -12,7 +12,7 @@ def rows(count):
     ]
 
 
-def shown(terminal):
+def printed(terminal):
     text = io.StringIO()
     with EpisodeProgress(4, console=Console(file=text, force_terminal=terminal, width=140)) as progress:
         for row in rows(4):
@@ -20,26 +20,26 @@ def shown(terminal):
     return text.getvalue()
 
 
-def test_a_log_file_gets_lines_that_say_the_same_as_the_bar():
-    text = shown(terminal=False)
+def test_log_file_gets_the_lines_of_the_bar():
+    text = printed(terminal=False)
     assert "\x1b" not in text
     first, last = text.splitlines()[0], text.splitlines()[-1]
     assert "1/4" in first
     assert "violation none" in first
-    for word in ("4/4", "success 50%", "return 10.0", "violation 2.0e-03", "done in"):
+    for word in ("4/4", "success 50%", "return 10.0", "violation 2.0e-03 m", "done in"):
         assert word in last
 
 
-def test_an_evaluation_says_the_mean_of_all_its_episodes():
+def test_status_averages_all_episodes_without_a_window():
     last, whole = EpisodeProgress(40), EpisodeProgress(40, window=None)
     for i in range(40):
         for progress in (last, whole):
             progress.update({"episode": i, "success": int(i >= 30), "return": 0.0, "max_commanded_violation": -1.0})
-    assert last.says().startswith("last 10: success 100%")
-    assert whole.says().startswith("success 25%")
+    assert last.status().startswith("last 10: success 100%")
+    assert whole.status().startswith("success 25%")
 
 
-def test_a_terminal_gets_a_bar():
-    text = shown(terminal=True)
-    for word in ("4/4", "success 50%", "return 10.0", "violation 2.0e-03"):
+def test_terminal_gets_a_bar():
+    text = printed(terminal=True)
+    for word in ("4/4", "success 50%", "return 10.0", "violation 2.0e-03 m"):
         assert word in text

@@ -8,7 +8,7 @@ import yaml
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import import_modules, make_environment
-from guiderail.tools.evaluation.baselines import always
+from guiderail.tools.evaluation.baselines import constant_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import statistics_of
 from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study
@@ -215,7 +215,7 @@ def test_the_best_constant_is_the_best_of_its_grid(tmp_path):
     assert tried[["action_0", "action_1"]].iloc[0].tolist() == [1.0, 1.0]  # up and to the right, where the goal is
     assert tried["success_rate"].is_monotonic_decreasing
     env = make_environment("Bead", {})
-    expected = evaluate_policy(env, always(env, np.array([1.0, 1.0])), episodes=3)
+    expected = evaluate_policy(env, constant_policy(env, np.array([1.0, 1.0])), episodes=3)
     assert rows["mean_return"].tolist() == [expected["return"].mean()]
 
 

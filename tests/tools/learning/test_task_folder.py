@@ -12,7 +12,7 @@ import guiderail.models.objects.bnc_connector
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import import_modules, task_content
-from guiderail.tools.evaluation.evaluate import kept_file
+from guiderail.tools.evaluation.cache import episodes_file
 from guiderail.tools.experiments.declaration import Study
 from guiderail.tools.experiments.study import Job, _digest
 from guiderail.tools.learning.run_folder import RunFolder
@@ -75,7 +75,7 @@ def test_what_was_judged_of_another_task_is_not_taken_for_this_one(folder, tmp_p
     job = Job(Study.model_validate(said), "zero", 0, tmp_path)
 
     def files():
-        kept = kept_file(tmp_path, "uniform_random", config, config.environment, episodes=2)
+        kept = episodes_file(tmp_path, "uniform_random", config, config.environment, episodes=2)
         return kept, _digest(job), _digest(job, job.study.judgements[0])
 
     before = files()

@@ -16,7 +16,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.evaluate import kept_file
+from guiderail.tools.evaluation.cache import episodes_file
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
@@ -402,11 +402,11 @@ def test_a_run_does_not_go_on_with_another_task_of_the_same_file(tmp_path, monke
     out = tmp_path / "run"
     start_or_resume("changes/Passage", out, environment={"guidance": "kgrl"}, episodes=1, imports=[str(file)])
     config = RunFolder(out).config()
-    before = kept_file(out, "uniform_random", config, config.environment, episodes=2)
+    before = episodes_file(out, "uniform_random", config, config.environment, episodes=2)
     file.write_text(file.read_text() + "# now it is another one\n")
     with pytest.raises(InputError, match="are not those that the run"):
         start_or_resume(None, out, environment={}, episodes=2, resume=True)
-    assert kept_file(out, "uniform_random", config, config.environment, episodes=2) != before
+    assert episodes_file(out, "uniform_random", config, config.environment, episodes=2) != before
     gymnasium.registry.pop(environment_id("changes/Passage"), None)
 
 

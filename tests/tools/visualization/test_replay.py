@@ -10,7 +10,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 from guiderail.tools.environments import check_environment, make_environment
-from guiderail.tools.evaluation.baselines import BaselinePolicy, always, uniform_random
+from guiderail.tools.evaluation.baselines import BaselinePolicy, constant_policy, uniform_random
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.visualization import motion
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
@@ -22,7 +22,7 @@ BALL = f"{DRAWN}/robot/ball"
 
 
 def _to_the_right(env):
-    return always(env, np.array([1.0, 0.0]))
+    return constant_policy(env, np.array([1.0, 0.0]))
 
 
 def poses(text):
@@ -98,7 +98,7 @@ def test_no_peak_of_force_is_lost_where_an_episode_is_longer_than_a_page_is_wide
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)
     watching = Motion(env)
-    row = rollout(env, always(env, np.array([1.0, 0.0])), watching, seed=1_000_000, held_out=True)
+    row = rollout(env, constant_policy(env, np.array([1.0, 0.0])), watching, seed=1_000_000, held_out=True)
     shown, trace = watching.shown(), env.unwrapped.trace
     assert len(shown["times"]) <= 8
     assert shown["times"][-1] == pytest.approx(len(trace) * trace.period)

@@ -86,10 +86,10 @@ def test_a_run_can_be_judged_for_the_report_beside_null_policies(studied):
 def test_policies_beside_a_run_are_those_that_met_its_own_episodes(studied, tmp_path):
     run = shutil.copytree(studied / "skgrl-2", tmp_path / "run")
     others = {"uniform_random": partial(BaselinePolicy, uniform_random)}
-    evaluate(run, episodes=4, environment={"wall": -0.5}, beside=others)
-    evaluate(run, episodes=4, seed=7, beside=others)
+    evaluate(run, episodes=4, environment={"wall": -0.5}, baselines=others)
+    evaluate(run, episodes=4, seed=7, baselines=others)
     assert len(gather([run]).held_out) == 0
-    evaluate(run, episodes=2, beside=others)
+    evaluate(run, episodes=2, baselines=others)
     judged = gather([run]).held_out
     assert judged[["policy", "episodes"]].to_numpy().tolist() == [
         ["demonstration", 2],
