@@ -1,4 +1,4 @@
-"""Publisher of joint torque commands on LCM."""
+"""Publisher of joint torque commands."""
 
 from collections.abc import Callable
 
@@ -22,13 +22,7 @@ class TorquePublisher(LeafSystem):
     ``torque`` is (n,) [Nm]. ``is_sending`` is (1,); no message is sent while it is 0.
     """
 
-    def __init__(
-        self,
-        write: Callable[[np.ndarray, float], None],
-        num_joints: int,
-        *,
-        period: float,
-    ):
+    def __init__(self, write: Callable[[np.ndarray, float], None], num_joints: int, *, period: float):
         """Construct the system.
 
         Args:

@@ -1,4 +1,4 @@
-"""The impedance by what it does to an arm in free space: statics, energy, limits and the watchdog."""
+"""Physics of the impedance of an arm in free space: statics, energy, limits and command timeout."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ WORKCELL = BncWorkcell()
 
 
 class FreeArm:
-    """The arm at a posture, told to stay there, with a force that a test can apply to its tool."""
+    """Arm that is commanded to stay at a posture, with a force that a test applies to its tool."""
 
     def __init__(self, q, *, gains=None, time_step=0.001, ball=False, turned_axes=None):
         builder = DiagramBuilder()
@@ -120,14 +120,14 @@ def _with_axes(R_WAxes):
 
 
 def displacement(before, after):
-    """Translation and rotation vector of the tool between two poses, in T's axes."""
+    """Return translation and rotation vector of the tool between two poses, in the axes of T."""
     X, Y = pose_to_transform(before), pose_to_transform(after)
     turn = (Y.rotation() @ X.rotation().inverse()).ToAngleAxis()
     return np.concatenate([Y.translation() - X.translation(), turn.angle() * turn.axis()])
 
 
 @pytest.mark.parametrize("q", POSTURES)
-def test_static_displacement_is_the_compliance_times_the_wrench(q):
+def test_static_displacement_is_compliance_times_wrench(q):
     arm = FreeArm(q, time_step=0.005)
     before = arm.pose()
     force, torque = np.array([6.0, -4.0, 8.0]), np.array([0.3, -0.2, 0.4])
@@ -139,8 +139,8 @@ def test_static_displacement_is_the_compliance_times_the_wrench(q):
     assert np.linalg.norm(moved[3:] - expected[3:]) < 0.02 * np.linalg.norm(expected[3:])
 
 
-def test_stiffness_in_a_turned_frame():
-    """Soft along a world axis that no joint and no axis of T is along."""
+def test_stiffness_applies_in_the_axes_of_a_rotated_frame():
+    """The soft direction is a world axis that is parallel to no joint and no axis of T."""
     R_WAxes = RotationMatrix.MakeZRotation(0.7) @ RotationMatrix.MakeXRotation(0.4)
     K = np.diag([400.0, 2000.0, 2000.0, 40.0, 40.0, 40.0])
     arm = FreeArm(
@@ -155,11 +155,11 @@ def test_stiffness_in_a_turned_frame():
     np.testing.assert_allclose(displacement(before, arm.pose())[:3], expected, atol=0.02 * np.linalg.norm(expected))
 
 
-def test_pushed_and_released_its_energy_never_grows():
+def test_energy_never_increases_after_a_push():
     gains = ImpedanceGains(STIFFNESS, LIMITS, np.array(POSTURES[1]), damping_ratio=0.3, posture_stiffness=0.0)
     arm = FreeArm(POSTURES[1], gains=gains, time_step=0.001)
     desired = arm.pose()
-    # The spring is pushed below its limits: its energy is then the quadratic form.
+    # Below its limits the energy of the spring is the quadratic form.
     arm.push([12.0, -10.0, 15.0], [0.5, 0.5, -0.5])
     arm.advance(0.4)
     arm.push([0.0, 0.0, 0.0])
@@ -179,7 +179,7 @@ def test_pushed_and_released_its_energy_never_grows():
     assert energies[-1] < 0.01 * energies[0]
 
 
-def test_a_target_half_a_metre_away_is_approached_within_limits():
+def test_distant_target_is_approached_within_limits():
     arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
     arm.command(start + [-0.1, 0.35, 0.35, 0.5, 0, 0])
@@ -196,7 +196,7 @@ def test_a_target_half_a_metre_away_is_approached_within_limits():
     assert np.linalg.norm((arm.pose() - start)[:3]) > 0.3
 
 
-def test_a_mass_dropped_on_it_is_caught_within_limits():
+def test_dropped_mass_is_caught_within_limits():
     arm = FreeArm(POSTURES[0], time_step=0.001, ball=True)
     start = arm.pose()
     p_WLink = arm.plant.GetFrameByName("iiwa_link_6").CalcPoseInWorld(arm.plant_context).translation()
@@ -213,7 +213,7 @@ def test_a_mass_dropped_on_it_is_caught_within_limits():
     np.testing.assert_allclose(arm.pose(), start, atol=2e-3)
 
 
-def test_when_commands_stop_the_last_sound_pose_is_held():
+def test_last_valid_pose_is_followed_when_commands_stop():
     arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
     command_timed_out = arm.controller.get_command_timed_out_output_port()
@@ -223,12 +223,12 @@ def test_when_commands_stop_the_last_sound_pose_is_held():
     assert command_timed_out.Eval(arm.controller_context)[0] == 0.0
     arm.advance(0.2)
     assert command_timed_out.Eval(arm.controller_context)[0] == 1.0
-    arm.command(start + [0.5, 0.5, 0, 0, 0, 0], time=0.0)  # an old message with a far target
+    arm.command(start + [0.5, 0.5, 0, 0, 0, 0], time=0.0)  # a stale message with a distant target
     arm.advance(2.0)
     np.testing.assert_allclose(arm.pose(), safe, atol=5e-4)
 
 
-def test_a_command_that_is_not_finite_is_not_followed():
+def test_command_is_ignored_when_it_is_not_finite():
     arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
     arm.command(np.full(6, np.nan))
@@ -238,7 +238,7 @@ def test_a_command_that_is_not_finite_is_not_followed():
 
 
 def test_spring_is_the_gradient_of_its_potential():
-    """Along any motion of the tool, minus the spring's power is the growth of ½ eᵀ K e."""
+    """Along any motion of the tool, minus the power of the spring is the increase of ½ eᵀ K e."""
     rng = np.random.default_rng(0)
     A = rng.standard_normal((6, 6))
     K = A @ A.T + np.eye(6)
@@ -261,7 +261,7 @@ def test_spring_is_the_gradient_of_its_potential():
         assert spring_wrench(K, *error(0.0)) @ V == pytest.approx(-growth, rel=1e-5, abs=1e-6)
 
 
-def test_damping_gives_every_mode_its_ratio():
+def test_damping_gives_every_mode_its_damping_ratio():
     rng = np.random.default_rng(1)
     A, B = rng.standard_normal((2, 6, 6))
     K, Lambda = A @ A.T + np.eye(6), B @ B.T + np.eye(6)
@@ -295,7 +295,7 @@ def test_damping_gives_every_mode_its_ratio():
         {"posture": np.array([0.0] * 6 + [np.inf])},
     ],
 )
-def test_refuses_what_makes_no_sense(wrong):
+def test_constructor_refuses_arguments_out_of_range(wrong):
     sound = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
     with pytest.raises(InputError):
         ImpedanceGains(**(sound | wrong))

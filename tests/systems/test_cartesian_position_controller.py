@@ -22,7 +22,7 @@ def arm():
 
 
 class Commanded:
-    """The controller alone, its joint command started at `START`, or at joint positions."""
+    """Controller whose joint command starts at `START` or at given joint positions."""
 
     def __init__(self, arm, q_start=None, **options):
         self.plant, model = arm
@@ -65,17 +65,17 @@ class Commanded:
         return self.system.get_command_timed_out_output_port().Eval(self.context)[0]
 
 
-def test_starts_where_the_arm_is(arm):
+def test_joint_command_starts_at_the_measured_positions(arm):
     commanded = Commanded(arm)
     np.testing.assert_array_equal(commanded.joints, commanded.q_start)
     np.testing.assert_allclose(commanded.pose, START, atol=1e-8)
 
 
-def test_nothing_feeds_through(arm):
+def test_no_direct_feedthrough(arm):
     assert not Commanded(arm).system.HasAnyDirectFeedthrough()
 
 
-def test_arrives_at_the_desired_pose(arm):
+def test_tool_reaches_the_desired_pose(arm):
     commanded = Commanded(arm)
     commanded.command(GOAL)
     commanded.advance(2.0)
@@ -83,7 +83,7 @@ def test_arrives_at_the_desired_pose(arm):
     assert commanded.stuck == 0.0
 
 
-def test_where_no_limit_binds_the_closed_form_is_the_optimum(arm, monkeypatch):
+def test_closed_form_is_the_optimum_when_no_limit_is_active(arm, monkeypatch):
     quick, slow = Commanded(arm), Commanded(arm)
     for commanded in (quick, slow):
         commanded.command(GOAL)
@@ -94,11 +94,11 @@ def test_where_no_limit_binds_the_closed_form_is_the_optimum(arm, monkeypatch):
     assert np.abs(quick.joints - quick.q_start).max() > 0.1
 
 
-def test_where_a_joint_would_be_too_fast_the_tool_slows_down_and_keeps_its_direction(arm):
+def test_tool_slows_down_when_a_joint_velocity_limit_is_active(arm):
     commanded = Commanded(arm, speed_limits=SpeedLimits(translational=50.0, rotational=50.0))
     commanded.command(GOAL)
     limit = commanded.plant.GetVelocityUpperLimits()
-    # Looked at between steps, which are at multiples of the period.
+    # Sampled between the steps, which are at multiples of the period.
     commanded.advance(0.005)
     way = GOAL[:3] - START[:3]
     for _ in range(20):
@@ -110,7 +110,7 @@ def test_where_a_joint_would_be_too_fast_the_tool_slows_down_and_keeps_its_direc
     np.testing.assert_allclose(commanded.pose, GOAL, atol=1e-4)
 
 
-def test_is_no_faster_than_its_limits(arm):
+def test_tool_speed_is_within_its_limits(arm):
     limits = SpeedLimits(translational=0.1, rotational=0.5)
     commanded = Commanded(arm, speed_limits=limits)
     commanded.command(START + [0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
@@ -123,7 +123,7 @@ def test_is_no_faster_than_its_limits(arm):
         assert np.linalg.norm(commanded.pose[:3] - pose[:3]) / 0.01 <= limits.translational * 1.02
 
 
-def test_out_of_reach_it_stays_within_the_joints_limits(arm):
+def test_joint_limits_are_satisfied_when_the_pose_is_unreachable(arm):
     commanded = Commanded(arm, speed_limits=SpeedLimits(translational=2.0, rotational=3.0))
     commanded.command(START + [2.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     commanded.advance(3.0)
@@ -133,7 +133,7 @@ def test_out_of_reach_it_stays_within_the_joints_limits(arm):
 
 
 def beyond(arm, posture, joint, by):
-    """A posture one of whose joints is beyond its upper limit, and the same one as far within it, with its pose."""
+    """Posture with one joint outside its upper limit, the mirrored posture inside it, and the pose of the latter."""
     plant, model = arm
     outside, inside = np.array(posture, dtype=float), np.array(posture, dtype=float)
     outside[joint] = plant.GetPositionUpperLimits()[joint] + by
@@ -148,8 +148,8 @@ BENT, STRETCHED = READY_POSTURE, np.zeros(7)
 
 @pytest.mark.parametrize("by", [1e-4, 0.02, 0.3])
 @pytest.mark.parametrize(("posture", "joint"), [(BENT, 1), (BENT, 3), (BENT, 5), (STRETCHED, 1)])
-def test_a_joint_beyond_its_limit_comes_back_without_a_leap(arm, posture, joint, by):
-    """An arm may have been moved there by hand; stretched, a posture is singular as well."""
+def test_joint_outside_its_limit_returns_without_a_jump(arm, posture, joint, by):
+    """An arm may have been moved there by hand; a stretched posture is singular as well."""
     q, goal = beyond(arm, posture, joint, by)
     commanded = Commanded(arm, q)
     commanded.command(goal)
@@ -164,7 +164,7 @@ def test_a_joint_beyond_its_limit_comes_back_without_a_leap(arm, posture, joint,
     np.testing.assert_allclose(commanded.pose, goal, atol=1e-3)
 
 
-def test_a_joint_beyond_its_limit_goes_no_farther(arm):
+def test_joint_outside_its_limit_moves_no_farther_out(arm):
     q, _ = beyond(arm, BENT, 3, 1e-4)
     _, farther = beyond(arm, BENT, 3, -0.1)
     commanded = Commanded(arm, q)
@@ -173,7 +173,7 @@ def test_a_joint_beyond_its_limit_goes_no_farther(arm):
     assert commanded.joints[3] <= q[3]
 
 
-def test_holds_its_joint_command_while_the_desired_pose_is_not_finite(arm):
+def test_joint_command_is_constant_when_the_pose_is_not_finite(arm):
     commanded = Commanded(arm)
     commanded.command(np.full(6, np.nan))
     commanded.advance(0.1)
@@ -185,7 +185,7 @@ def test_holds_its_joint_command_while_the_desired_pose_is_not_finite(arm):
     assert commanded.command_timed_out == 0.0
 
 
-def test_holds_its_joint_command_when_commands_stop(arm):
+def test_joint_command_is_constant_when_commands_stop(arm):
     commanded = Commanded(arm, timeout=0.1)
     commanded.command(GOAL, time=0.0)
     commanded.advance(0.095)
@@ -196,7 +196,7 @@ def test_holds_its_joint_command_when_commands_stop(arm):
     commanded.advance(0.5)
     np.testing.assert_array_equal(commanded.joints, stopped)
     assert np.linalg.norm(commanded.pose - GOAL) > 0.05
-    # A fresh command counts at the next period, and an old one doesn't count again.
+    # A new command is valid at the next period, and a stale one does not become valid again.
     commanded.command(GOAL, time=commanded.context.get_time())
     commanded.advance(0.01)
     assert commanded.command_timed_out == 0.0
@@ -206,7 +206,7 @@ def test_holds_its_joint_command_when_commands_stop(arm):
 
 
 @pytest.mark.parametrize("time", [0.02, 1e6, np.inf, np.nan])
-def test_a_command_from_the_future_or_from_no_time_is_not_followed(arm, time):
+def test_command_is_ignored_when_its_time_stamp_is_invalid(arm, time):
     commanded = Commanded(arm)
     commanded.command(GOAL, time=time)
     commanded.advance(0.005)
@@ -214,7 +214,7 @@ def test_a_command_from_the_future_or_from_no_time_is_not_followed(arm, time):
     assert commanded.command_timed_out == 1.0
 
 
-def test_command_times_change_nothing_while_commands_come(arm):
+def test_time_stamps_change_nothing_when_commands_are_current(arm):
     plain, timed = Commanded(arm), Commanded(arm)
     plain.command(GOAL)
     for step in range(20):
@@ -237,23 +237,23 @@ def test_command_times_change_nothing_while_commands_come(arm):
         {"timeout": 0.0},
     ],
 )
-def test_refuses_what_makes_no_sense(arm, wrong):
+def test_constructor_refuses_arguments_out_of_range(arm, wrong):
     plant, model = arm
     with pytest.raises(InputError):
         CartesianPositionController(plant, model.target, model.tool_centre, **({"posture": READY_POSTURE} | wrong))
 
 
-def test_refuses_speeds_that_make_no_sense():
+def test_speed_limits_refuse_values_out_of_range():
     with pytest.raises(InputError):
         SpeedLimits(translational=0.0)
 
 
-# With the wrist's axes in line an arm of six joints can't turn its tool about one direction, nor move it along another.
+# With aligned wrist axes an arm of six joints can neither turn its tool about one direction nor move it along another.
 SINGULAR = np.array([-0.2448, -1.3796, 1.8297, -2.021, 0.0, 0.0])
 
 
 class SixJoints(Commanded):
-    """The same of a UR5e, started in a singular posture."""
+    """Controller of a UR5e that starts in a singular posture."""
 
     def __init__(self, shift):
         known = ArmControllerPlant(BncWorkcell(), "ur5e")
@@ -272,8 +272,8 @@ class SixJoints(Commanded):
 
 
 @pytest.mark.parametrize("shift", [[0.05, 0, 0, 0, 0, 0], [0, 0.05, 0, 0, 0, 0], [0, 0, 0, 0.3, 0, 0], [0] * 6])
-def test_out_of_a_singular_posture_no_joint_leaps_and_the_tool_gets_there(shift):
-    """What the wrist can't do at once costs the tool's orientation a little, for a while, and it says so."""
+def test_tool_leaves_a_singular_posture_without_a_jump(shift):
+    """The orientation deviates temporarily in the lost direction of the wrist, and `stuck` is reported."""
     commanded = SixJoints(np.array(shift))
     limit = commanded.plant.GetVelocityUpperLimits()
     errors, stuck = [], []
@@ -291,14 +291,14 @@ def test_out_of_a_singular_posture_no_joint_leaps_and_the_tool_gets_there(shift)
     assert max(stuck) == float(bool(np.any(shift)))
 
 
-def test_close_to_a_singular_posture_the_tool_still_goes_its_way():
-    """Through the wrist's singularity by the one turn that it does not lose."""
+def test_tool_follows_its_path_near_a_singular_posture():
+    """The path passes the singularity of the wrist by a rotation that is not lost."""
     commanded = SixJoints(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
     commanded.advance(3.0)
     np.testing.assert_allclose(commanded.pose, commanded.start + [0, 0, 0, 0, 0.5, 0], atol=1e-4)
     assert commanded.stuck == 0.0
 
 
-def test_an_arm_whose_positions_are_not_known_does_not_begin_to_move(arm):
+def test_initialization_fails_when_positions_are_not_finite(arm):
     with pytest.raises(InputError, match="measured positions must be finite"):
         Commanded(arm, q_start=np.full(7, np.nan))

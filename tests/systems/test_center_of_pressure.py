@@ -13,18 +13,18 @@ def lever(wrench, least_force=0.5):
 
 
 @pytest.mark.parametrize("force", [0.5, 2.0, 30.0])
-def test_leads_from_the_tool_centre_to_where_a_force_acts_however_large_it_is(force):
+def test_center_of_pressure_is_the_point_of_a_point_force(force):
     point = np.array([0.003, -0.004, 0.0])
     pushed = np.array([0.0, 0.0, force])
     np.testing.assert_allclose(lever([*pushed, *np.cross(point, pushed)]), point[:2])
 
 
 @pytest.mark.parametrize("force", [0.49, 0.0, -5.0])
-def test_is_zero_where_next_to_nothing_pushes(force):
+def test_center_of_pressure_is_zero_when_the_force_is_small(force):
     np.testing.assert_array_equal(lever([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
 
 
 @pytest.mark.parametrize("least_force", [0.0, -1.0, np.nan])
-def test_refuses_what_is_no_least_force(least_force):
+def test_constructor_refuses_a_minimum_force_out_of_range(least_force):
     with pytest.raises(InputError):
         CenterOfPressure(least_force)

@@ -11,8 +11,8 @@ PERIOD, TIMEOUT = 2.0**-6, 2.0**-3
 START, FIRST, SECOND = np.zeros(6), np.full(6, 1.0), np.full(6, 2.0)
 
 
-class SupervisedTraining:
-    """A watchdog whose robot is at `START`, with its inputs at hand."""
+class Rig:
+    """Watchdog of a robot at `START`, with its inputs fixed by the test."""
 
     def __init__(self, command, time=None, start=START):
         self.system = CommandWatchdog(PERIOD, TIMEOUT, pose_size=len(start))
@@ -36,117 +36,117 @@ class SupervisedTraining:
         assert self.system.get_command_timed_out_output_port().Eval(self.context) == [command_timed_out]
 
 
-def test_a_valid_command_passes_at_once():
-    watched = SupervisedTraining(FIRST)
-    watched.check(FIRST, command_timed_out=0)
-    watched.command(SECOND)
-    watched.check(SECOND, command_timed_out=0)
+def test_valid_command_is_passed_through_at_once():
+    rig = Rig(FIRST)
+    rig.check(FIRST, command_timed_out=0)
+    rig.command(SECOND)
+    rig.check(SECOND, command_timed_out=0)
 
 
-def test_without_a_time_commands_never_get_stale():
-    watched = SupervisedTraining(FIRST)
-    watched.advance(100 * TIMEOUT)
-    watched.check(FIRST, command_timed_out=0)
+def test_commands_never_time_out_without_a_time_stamp():
+    rig = Rig(FIRST)
+    rig.advance(100 * TIMEOUT)
+    rig.check(FIRST, command_timed_out=0)
 
 
-def test_a_stale_command_gives_way_to_the_last_one_that_was_followed():
-    watched = SupervisedTraining(FIRST, time=0.0)
-    watched.advance(TIMEOUT)
-    watched.check(FIRST, command_timed_out=0)
-    # Found at the first check at which it is stale: a period after the timeout at the latest.
-    watched.advance(2.5 * PERIOD)
-    watched.check(FIRST, command_timed_out=1)
-    watched.command(SECOND, time=0.0)  # an old message that arrives late
-    watched.check(FIRST, command_timed_out=1)
-
-
-@pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
-def test_a_fresh_command_after_a_stale_one_counts_at_once(phase):
-    watched = SupervisedTraining(FIRST, time=0.0)
-    watched.advance(3 * TIMEOUT + phase * PERIOD)
-    watched.check(FIRST, command_timed_out=1)
-    watched.command(SECOND, time=watched.context.get_time())
-    watched.check(SECOND, command_timed_out=0)
-
-
-def test_a_command_that_arrives_late_and_gets_stale_at_once_is_what_is_held():
-    watched = SupervisedTraining(FIRST, time=0.0)
-    watched.advance(4.5 * PERIOD)
-    # Still followed, and stale at the very next check.
-    watched.command(SECOND, time=watched.context.get_time() - TIMEOUT - 0.25 * PERIOD)
-    watched.check(SECOND, command_timed_out=0)
-    watched.advance(PERIOD)
-    watched.check(SECOND, command_timed_out=1)
+def test_stale_command_is_replaced_by_the_last_valid_one():
+    rig = Rig(FIRST, time=0.0)
+    rig.advance(TIMEOUT)
+    rig.check(FIRST, command_timed_out=0)
+    # Detected at the first check after the timeout, at most one period later.
+    rig.advance(2.5 * PERIOD)
+    rig.check(FIRST, command_timed_out=1)
+    rig.command(SECOND, time=0.0)  # a stale message that arrives late
+    rig.check(FIRST, command_timed_out=1)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
-def test_a_command_from_the_future_is_never_followed(phase):
-    """It would never get stale."""
-    watched = SupervisedTraining(FIRST, time=0.0)
-    watched.advance(3 * PERIOD + phase * PERIOD)
+def test_new_command_after_a_stale_one_is_valid_at_once(phase):
+    rig = Rig(FIRST, time=0.0)
+    rig.advance(3 * TIMEOUT + phase * PERIOD)
+    rig.check(FIRST, command_timed_out=1)
+    rig.command(SECOND, time=rig.context.get_time())
+    rig.check(SECOND, command_timed_out=0)
+
+
+def test_late_command_is_stored_when_it_becomes_stale_at_once():
+    rig = Rig(FIRST, time=0.0)
+    rig.advance(4.5 * PERIOD)
+    # Still valid, and stale at the next check.
+    rig.command(SECOND, time=rig.context.get_time() - TIMEOUT - 0.25 * PERIOD)
+    rig.check(SECOND, command_timed_out=0)
+    rig.advance(PERIOD)
+    rig.check(SECOND, command_timed_out=1)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
+def test_command_is_ignored_when_it_is_in_the_future(phase):
+    """Otherwise it would never time out."""
+    rig = Rig(FIRST, time=0.0)
+    rig.advance(3 * PERIOD + phase * PERIOD)
     for ahead in (1.5 * PERIOD, 1000.0, np.inf):
-        watched.command(SECOND, time=watched.context.get_time() + ahead)
-        watched.check(FIRST, command_timed_out=1)
-    watched.advance(3 * PERIOD)
-    watched.check(FIRST, command_timed_out=1)
+        rig.command(SECOND, time=rig.context.get_time() + ahead)
+        rig.check(FIRST, command_timed_out=1)
+    rig.advance(3 * PERIOD)
+    rig.check(FIRST, command_timed_out=1)
 
 
-def test_a_clock_that_is_ahead_by_less_than_a_period_is_no_reason_to_stop():
-    watched = SupervisedTraining(FIRST, time=0.5 * PERIOD)
-    watched.check(FIRST, command_timed_out=0)
+def test_command_is_valid_when_it_leads_by_less_than_a_period():
+    rig = Rig(FIRST, time=0.5 * PERIOD)
+    rig.check(FIRST, command_timed_out=0)
 
 
-def test_a_time_that_is_no_number_is_no_command():
-    watched = SupervisedTraining(FIRST, time=np.nan)
-    watched.check(START, command_timed_out=1)
+def test_command_is_ignored_when_its_time_stamp_is_not_finite():
+    rig = Rig(FIRST, time=np.nan)
+    rig.check(START, command_timed_out=1)
 
 
 @pytest.mark.parametrize("nonsense", [np.nan, np.inf])
-def test_before_any_command_it_holds_where_the_robot_is(nonsense):
-    watched = SupervisedTraining(np.full(6, nonsense))
-    watched.check(START, command_timed_out=1)
-    watched.advance(3 * PERIOD)
-    watched.check(START, command_timed_out=1)
+def test_measured_pose_is_output_before_the_first_command(nonsense):
+    rig = Rig(np.full(6, nonsense))
+    rig.check(START, command_timed_out=1)
+    rig.advance(3 * PERIOD)
+    rig.check(START, command_timed_out=1)
 
 
-def test_a_command_that_is_not_finite_gives_way_and_comes_back():
-    watched = SupervisedTraining(FIRST)
-    watched.advance(3 * PERIOD)
-    watched.command(np.array([2.0, 2.0, np.nan, 2.0, 2.0, 2.0]))
-    watched.check(FIRST, command_timed_out=1)
-    watched.command(SECOND)
-    watched.check(SECOND, command_timed_out=0)
+def test_command_is_ignored_while_it_is_not_finite():
+    rig = Rig(FIRST)
+    rig.advance(3 * PERIOD)
+    rig.command(np.array([2.0, 2.0, np.nan, 2.0, 2.0, 2.0]))
+    rig.check(FIRST, command_timed_out=1)
+    rig.command(SECOND)
+    rig.check(SECOND, command_timed_out=0)
 
 
 @pytest.mark.parametrize("size", [1, 2, 7])
-def test_poses_of_any_size(size):
-    watched = SupervisedTraining(np.full(size, np.nan), start=np.arange(float(size)))
-    watched.check(np.arange(float(size)), command_timed_out=1)
-    watched.command(np.ones(size))
-    watched.check(np.ones(size), command_timed_out=0)
+def test_pose_size_is_arbitrary(size):
+    rig = Rig(np.full(size, np.nan), start=np.arange(float(size)))
+    rig.check(np.arange(float(size)), command_timed_out=1)
+    rig.command(np.ones(size))
+    rig.check(np.ones(size), command_timed_out=0)
 
 
-def test_a_reset_forgets():
-    watched = SupervisedTraining(FIRST, time=0.0)
-    watched.advance(3 * TIMEOUT)
-    watched.context.SetTimeStateAndParametersFrom(watched.pristine)
-    watched.simulator.Initialize()
-    watched.check(FIRST, command_timed_out=0)
-    watched.command(np.full(6, np.nan))
-    watched.check(START, command_timed_out=1)
+def test_initialization_resets_the_last_valid_pose():
+    rig = Rig(FIRST, time=0.0)
+    rig.advance(3 * TIMEOUT)
+    rig.context.SetTimeStateAndParametersFrom(rig.pristine)
+    rig.simulator.Initialize()
+    rig.check(FIRST, command_timed_out=0)
+    rig.command(np.full(6, np.nan))
+    rig.check(START, command_timed_out=1)
 
 
 @pytest.mark.parametrize(("age", "command_timed_out"), [(0.5 * TIMEOUT, 0), (2.0 * TIMEOUT, 1), (-2.0 * PERIOD, 1)])
-def test_started_between_two_checks_it_judges_by_the_time_of_the_start(age, command_timed_out):
-    watched, start = SupervisedTraining(FIRST), 5.0 + 0.5 * PERIOD
-    watched.context.SetTime(start)
-    watched.command(FIRST, time=start - age)
-    watched.simulator.Initialize()
-    watched.check(START if command_timed_out else FIRST, command_timed_out)
+def test_validity_uses_the_start_time_before_the_first_check(age, command_timed_out):
+    rig, start = Rig(FIRST), 5.0 + 0.5 * PERIOD
+    rig.context.SetTime(start)
+    rig.command(FIRST, time=start - age)
+    rig.simulator.Initialize()
+    rig.check(START if command_timed_out else FIRST, command_timed_out)
 
 
-def test_between_two_checks_nothing_is_computed_anew():
-    """Python that runs at every step of a plant is what makes a simulation slow."""
+def test_outputs_are_not_computed_again_between_two_checks():
+    """Python code in every plant step would slow down the simulation."""
     calls = []
 
     class Counted(CommandWatchdog):
@@ -182,6 +182,6 @@ def test_between_two_checks_nothing_is_computed_anew():
 @pytest.mark.parametrize(
     "arguments", [(0.0, 0.1), (0.01, 0.0), (np.nan, 0.1), (np.inf, 0.1), (0.01, np.nan), (0.01, 0.1, 0)]
 )
-def test_refuses_what_makes_no_sense(arguments):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         CommandWatchdog(*arguments)

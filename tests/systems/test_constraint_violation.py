@@ -13,38 +13,38 @@ def violation(system, pose):
     return system.get_violation_output_port().Eval(context)[0]
 
 
-def test_is_the_worst_of_all_constraints():
+def test_violation_is_the_maximum_over_all_constraints():
     system = ConstraintViolation(LinearConstraints.box([-1.0, -1.0], [1.0, 1.0]), 0.1)
     assert violation(system, [0.0, 0.0]) == -1.0
     assert violation(system, [0.5, -0.75]) == -0.25
     assert violation(system, [1.5, -3.0]) == 2.0
 
 
-def test_says_unconstrained_where_nothing_is():
+def test_violation_is_unconstrained_without_constraints():
     assert (
         violation(ConstraintViolation(LinearConstraints.none(2), 0.1), [1.0, 2.0]) == ConstraintViolation.UNCONSTRAINED
     )
 
 
-def test_does_not_take_nan_for_unconstrained():
+def test_violation_is_nan_when_the_pose_is_nan():
     assert np.isnan(violation(ConstraintViolation(LinearConstraints.box([0.0], [1.0]), 0.1), [np.nan]))
 
 
-def test_follows_constraints_that_change_from_step_to_step():
+def test_violation_uses_the_constraints_of_the_control_step():
     bounds = np.arange(4.0)[:, None]  # y <= 0, 1, 2, 3
     system = ConstraintViolation(LinearConstraints.box(np.full((4, 1), -np.inf), bounds), 0.1)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_pose_input_port().FixValue(context, [2.0])
     simulator.Initialize()
-    seen = []
+    violations = []
     for n in range(6):
-        # Before the events of an instant it still judges by the step that is just over.
+        # Before the events of an instant the constraints of the previous step apply.
         simulator.AdvanceTo((n + 1) * 0.1)
-        seen.append(system.get_violation_output_port().Eval(context)[0])
-    np.testing.assert_array_equal(seen, [2.0, 1.0, 0.0, -1.0, -1.0, -1.0])
+        violations.append(system.get_violation_output_port().Eval(context)[0])
+    np.testing.assert_array_equal(violations, [2.0, 1.0, 0.0, -1.0, -1.0, -1.0])
 
 
-def test_refuses_what_makes_no_sense():
+def test_constructor_refuses_a_period_out_of_range():
     with pytest.raises(InputError):
         ConstraintViolation(LinearConstraints.none(2), 0.0)

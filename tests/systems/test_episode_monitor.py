@@ -9,7 +9,7 @@ BLOCKED = TERMINATIONS.index("blocked")
 
 
 class Episode:
-    """Feeds a monitor one signal a control step and reads its output as an environment does."""
+    """Monitor with one signal value per control step, whose output is read as by an environment."""
 
     def __init__(self, *conditions, size=1):
         self.system = EpisodeMonitor(conditions, PERIOD)
@@ -25,12 +25,12 @@ class Episode:
         self.simulator.Initialize()
 
     def step(self, *values):
-        """The events at the beginning of a step see the last signal; what it ends with is seen at the step's end."""
+        """Events at the start of a step use the last signal; the signal of this step takes effect at its end."""
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
         self.signal.GetMutableData().set_value(values)
         self.steps += 1
         self.simulator.AdvanceTo(self.steps * PERIOD)
-        # An environment may read more than once.
+        # An environment may evaluate the output more than once.
         self.system.get_termination_output_port().Eval(self.context)
         return int(self.system.get_termination_output_port().Eval(self.context)[0])
 
@@ -46,33 +46,33 @@ def test_ports():
     assert system.GetOutputPort("termination").size() == 1
 
 
-def test_sees_the_step_that_is_just_over():
+def test_termination_includes_the_step_that_has_just_ended():
     episode = Episode(above(1))
     assert [episode.step(0), episode.step(2)] == [0, BLOCKED]
 
 
-def test_stays_what_it_is_until_a_reset():
+def test_termination_is_constant_until_a_reset():
     episode = Episode(above(1))
     assert [episode.step(2), episode.step(0), episode.step(0)] == [BLOCKED] * 3
     episode.reset()
     assert episode.step(0) == 0
 
 
-def test_counts_consecutive_steps_once_each():
+def test_consecutive_steps_are_counted_once_each():
     episode = Episode(above(1, steps=3))
     assert [episode.step(u) for u in (2, 2, 0, 2, 2, 2)] == [0, 0, 0, 0, 0, BLOCKED]
 
 
-def test_counts_steps_since_the_last_progress():
-    # Stuck where the second signal says so; progress is the first one.
+def test_steps_are_counted_since_the_last_progress():
+    # The second entry is the condition, the first one the progress.
     stuck = TerminationTerm("blocked", {"u": 2}, lambda u: u[1] > 0, steps=3, progress=lambda u: u[0], min_progress=0.1)
     episode = Episode(stuck, size=2)
-    # Neither a free step nor one that gains less than 0.1 starts the count anew; one that gains more does.
+    # Neither a free step nor progress below 0.1 resets the count; larger progress does.
     moves = [(0, 1), (0, 1), (0.05, 0), (0.5, 1), (0.5, 1), (0.4, 0), (0.55, 1), (0.5, 1)]
     assert [episode.step(*u) for u in moves] == [0] * 7 + [BLOCKED]
 
 
-def test_the_first_of_two_conditions_counts():
+def test_first_term_takes_precedence():
     success = TerminationTerm("success", {"u": 1}, lambda u: u[0] > 1)
     assert Episode(success, above(1)).step(2) == SUCCESS
     assert Episode(above(1), success).step(2) == BLOCKED
@@ -89,17 +89,17 @@ def test_the_first_of_two_conditions_counts():
         lambda: above(1, steps=0),
     ],
 )
-def test_refuses_what_makes_no_sense(make):
+def test_constructor_refuses_invalid_arguments(make):
     with pytest.raises(InputError):
         make()
 
 
-def test_each_condition_counts_for_itself():
+def test_each_term_has_its_own_count():
     episode = Episode(above(5, steps=2), TerminationTerm("success", {"u": 1}, lambda u: u[0] > 1, steps=3))
     assert [episode.step(u) for u in (6, 2, 6, 0)] == [0, 0, SUCCESS, SUCCESS]
 
 
-def test_an_initialization_forgets():
+def test_initialization_resets_the_counts():
     episode = Episode(above(1))
     assert [episode.step(2), episode.step(0)] == [BLOCKED, BLOCKED]
     episode.signal.GetMutableData().set_value([0.0])

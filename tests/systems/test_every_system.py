@@ -1,4 +1,10 @@
-"""What holds for every LeafSystem of the project, so that who knows one finds their way in all of them."""
+"""Rules that every LeafSystem of the project satisfies.
+
+- A file defines one exported system, named like the file, with a test file of its own.
+- Each port is a private attribute with a typed and documented getter, and the class docstring lists all ports.
+- Outputs declare their prerequisites and depend on inputs, parameters and discrete state only.
+- Invalid arguments raise an `InputError`.
+"""
 
 import ast
 import inspect
@@ -11,7 +17,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pydrake.common.value import Value
-from pydrake.lcm import DrakeLcm
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, LeafSystem, OutputPort, ValueProducer
 
@@ -51,7 +56,7 @@ def primitive(history):
 
 @pytest.fixture(scope="module")
 def built():
-    """One instance of each system, with every port that it can have."""
+    """Return one instance of each system, with all of its optional ports."""
     plant, arm = controller_model(BncWorkcell())
     template, frames = load_template("pouring"), {"mug_tip": RigidTransform()}
     body, other = arm.tool[0], plant.world_body()
@@ -95,7 +100,7 @@ def built():
         systems.SensorDisturbance(PERIOD, np.ones(2), delay=1),
         systems.StatusWatchdog(StatusLimits((1.0, 1.0)), period=PERIOD),
         systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),
-        systems.TorquePublisher(DrakeLcm("memq://"), "torques", lambda time, torque: b"", 7, period=PERIOD),
+        systems.TorquePublisher(lambda torque, time: None, 7, period=PERIOD),
         systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_centre, RotationMatrix(), PERIOD, 0.0),
     ]
     return {type(instance).__name__: instance for instance in instances}
@@ -107,7 +112,7 @@ def system(request, built):
 
 
 def ports(system):
-    """Kind, name and port of all of them."""
+    """Yield kind, name and port of all ports of a system."""
     for kind in ("input", "output"):
         for index in range(getattr(system, f"num_{kind}_ports")()):
             port = getattr(system, f"get_{kind}_port")(index)
@@ -119,19 +124,19 @@ def getters(system, kind):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_a_file_holds_one_system_that_has_its_name_is_exported_and_tested(path):
+def test_file_has_one_exported_and_tested_system_of_its_name(path):
     (name,) = system_names(path)
     assert re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() == path.stem
     assert issubclass(getattr(systems, name), LeafSystem)
     assert (TESTS / f"test_{path.stem}.py").is_file()
 
 
-def test_what_is_no_system_is_elsewhere():
+def test_support_modules_define_no_system():
     for path in (FOLDER / "support").glob("*.py"):
         assert not system_names(path), path
 
 
-def test_everything_public_is_exported():
+def test_public_classes_are_exported():
     public = {c.name for path in FILES for c in classes(path) if not c.name.startswith("_")}
     assert public <= set(systems.__all__)
     assert set(systems.__all__) <= set(dir(systems))
@@ -141,13 +146,13 @@ def test_everything_public_is_exported():
         systems.Nothing  # noqa: B018
 
 
-def test_one_system_is_imported_without_the_others():
+def test_importing_one_system_does_not_import_the_others():
     program = "import sys; from guiderail.systems import Recorder; print('sklearn' in sys.modules)"
     finished = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert finished.stdout.strip() == "False"
 
 
-def test_every_system_is_examined_here(built):
+def test_every_system_has_an_instance_here(built):
     assert sorted(built) == sorted(NAMES)
 
 
@@ -157,17 +162,17 @@ def test_every_port_has_a_documented_getter(system):
         method = methods.get(f"get_{name}_{kind}_port")
         if method is not None:
             assert getattr(system, f"_{name}_port") is port
-            found = method()
+            returned = method()
         else:
-            # Ports whose names the constructor is given have one getter, by name.
+            # Ports whose names are constructor arguments share one getter by name.
             (method,) = (m for m in methods.values() if "name" in inspect.signature(m).parameters)
-            found = method(name)
-        assert found is port
+            returned = method(name)
+        assert returned is port
         assert inspect.signature(method).return_annotation is (InputPort if kind == "input" else OutputPort)
         assert inspect.getdoc(method)
 
 
-def test_the_documented_ports_are_those_that_there_are(system):
+def test_documented_ports_are_the_declared_ports(system):
     (block,) = re.findall(r"\.\. pydrake_system::\n\n((?:    .*\n)+)", inspect.getdoc(type(system)) + "\n")
     assert re.search(r"name: (\w+)", block)[1] == type(system).__name__
     for kind in ("input", "output"):
@@ -179,8 +184,8 @@ def test_the_documented_ports_are_those_that_there_are(system):
         assert len(actual) == len(named) or len(named) < len(lines)
 
 
-def test_no_output_depends_on_time_or_on_everything(system):
-    """A cache entry's prerequisites are what it is computed anew for, and what counts as direct feedthrough."""
+def test_output_depends_only_on_declared_prerequisites(system):
+    """Default prerequisites would cause repeated evaluation at every plant step and false direct feedthrough."""
     nothing, parameters = system.nothing_ticket(), system.all_parameters_ticket()
     probe = system.DeclareCacheEntry(
         "probe", ValueProducer(allocate=lambda: Value(0), calc=lambda context, value: None), {nothing}
@@ -205,7 +210,7 @@ def test_no_output_depends_on_time_or_on_everything(system):
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")), ids=lambda path: path.stem)
-def test_prerequisites_are_given_by_keyword_and_users_get_an_input_error(path):
+def test_source_gives_prerequisites_and_raises_input_errors(path):
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             name = node.func.attr

@@ -11,7 +11,7 @@ PERIOD = 0.25
 
 
 def running(law, action=(0.5,), pose=(1.0, 2.0), wrench=(3.0,)):
-    """The system in a simulation, its constants, and a function that sets one of them."""
+    """Return the system in a simulation, and a function that sets one of its constant inputs."""
     builder = DiagramBuilder()
     system = builder.AddSystem(FunctionGuidanceSystem(law, len(action), len(pose), len(wrench), PERIOD))
     sources = {}
@@ -31,7 +31,7 @@ def running(law, action=(0.5,), pose=(1.0, 2.0), wrench=(3.0,)):
     return simulator, give, out
 
 
-def test_commands_what_the_law_says_once_a_period():
+def test_desired_pose_is_the_function_value_of_each_period():
     simulator, give, out = running(lambda action, pose, wrench: pose + action * wrench)
     assert out("desired_pose") == [2.5, 3.5]
     assert (out("held_action"), out("fallback")) == ([0.5], [0.0])
@@ -47,7 +47,7 @@ def test_commands_what_the_law_says_once_a_period():
 @pytest.mark.parametrize(
     "nothing", [[np.nan, 0.0], [np.inf, 0.0], [1.0], [[1.0, 2.0]], None, "far", np.array([1j, 0.0]), [[], 1.0]]
 )
-def test_what_cannot_be_commanded_leaves_the_last_command(nothing):
+def test_desired_pose_is_repeated_when_the_value_is_invalid(nothing):
     simulator, give, out = running(lambda action, pose, wrench: pose + 1 if action[0] > 0 else nothing)
     assert out("desired_pose") == [2.0, 3.0]
     give("action", [-1.0])
@@ -59,12 +59,12 @@ def test_what_cannot_be_commanded_leaves_the_last_command(nothing):
     assert (out("desired_pose"), out("fallback")) == ([8.0, 8.0], [0.0])
 
 
-def test_before_there_was_a_command_the_measured_pose_is_commanded():
+def test_first_fallback_is_the_measured_pose():
     _, _, out = running(lambda action, pose, wrench: None)
     assert (out("desired_pose"), out("fallback")) == ([1.0, 2.0], [1.0])
 
 
-def test_the_law_cannot_change_what_others_read():
+def test_function_cannot_modify_the_inputs():
     def law(action, pose, wrench):
         action[:], pose[:], wrench[:] = 9.0, 9.0, 9.0
         return pose
@@ -73,12 +73,12 @@ def test_the_law_cannot_change_what_others_read():
     assert out("held_action") == [0.5]
 
 
-def test_nothing_feeds_through():
+def test_no_direct_feedthrough():
     assert not FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD).HasAnyDirectFeedthrough()
 
 
 @pytest.mark.parametrize("sizes", [(0, 1, 1), (1, 0, 1), (1, 1, 0)])
-def test_refuses_what_makes_no_sense(sizes):
+def test_constructor_refuses_arguments_out_of_range(sizes):
     with pytest.raises(InputError, match="sizes of at least 1"):
         FunctionGuidanceSystem(lambda action, pose, wrench: pose, *sizes, PERIOD)
     with pytest.raises(InputError, match="period"):

@@ -25,13 +25,13 @@ class Commanded:
         return self.system.get_desired_state_output_port().Eval(self.context)
 
 
-def test_unconnected_it_stays_where_it_starts():
+def test_initial_opening_is_output_when_not_connected():
     commanded = Commanded()
     commanded.advance(0.1)
     np.testing.assert_array_equal(commanded.desired, [0.03, 0.5, 0.0, 0.0])
 
 
-def test_a_command_counts_at_once_and_within_limits():
+def test_command_is_output_at_once_within_limits():
     commanded = Commanded()
     commanded.command([0.01, 0.2])
     np.testing.assert_array_equal(commanded.desired, [0.01, 0.2, 0.0, 0.0])
@@ -40,7 +40,7 @@ def test_a_command_counts_at_once_and_within_limits():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_what_is_not_a_number_leaves_its_joint_where_it_was_told_to_be(bad):
+def test_last_position_is_output_when_a_command_is_not_finite(bad):
     commanded = Commanded()
     commanded.command([0.01, 0.2])
     commanded.advance(0.05)
@@ -50,7 +50,7 @@ def test_what_is_not_a_number_leaves_its_joint_where_it_was_told_to_be(bad):
         commanded.advance(0.05)
 
 
-def test_a_reset_forgets():
+def test_reset_restores_the_initial_opening():
     commanded = Commanded()
     commanded.command([0.01, 0.2])
     commanded.advance(0.05)
@@ -69,7 +69,7 @@ def test_a_reset_forgets():
         {"period": 0.0},
     ],
 )
-def test_refuses_what_makes_no_sense(wrong):
+def test_constructor_refuses_arguments_out_of_range(wrong):
     sound = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | wrong
     with pytest.raises(InputError):
         GripperCommand(sound.pop("lower"), sound.pop("upper"), sound.pop("opening"), **sound)

@@ -8,7 +8,7 @@ from guiderail.systems.history_buffer import HistoryBuffer
 
 
 class Counter(LeafSystem):
-    """Outputs how many periods have begun, as a movement primitive outputs its step's command."""
+    """Output the number of periods started, like a movement primitive outputs the command of its step."""
 
     def __init__(self, period):
         super().__init__()
@@ -37,11 +37,11 @@ def test_ports(system):
     assert system.get_history_output_port().size() == 6
 
 
-def test_history_never_feeds_through(system):
+def test_no_direct_feedthrough(system):
     assert not system.HasAnyDirectFeedthrough()
 
 
-def test_starts_filled_with_the_present(system):
+def test_history_is_filled_with_the_output_at_initialization(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_output_input_port().FixValue(context, [1.0, -2.0])
@@ -49,7 +49,7 @@ def test_starts_filled_with_the_present(system):
     np.testing.assert_array_equal(history(system, context), [[1.0, -2.0]] * 3)
 
 
-def test_starts_filled_with_the_initial_output_where_there_is_one(system):
+def test_history_is_filled_with_initial_output_when_connected(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_output_input_port().FixValue(context, [1.0, -2.0])
@@ -60,7 +60,7 @@ def test_starts_filled_with_the_initial_output_where_there_is_one(system):
     np.testing.assert_array_equal(history(system, context), [[5.0, 6.0], [5.0, 6.0], [1.0, -2.0]])
 
 
-def test_newest_enters_last_and_oldest_leaves(system):
+def test_newest_output_replaces_the_oldest(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     port = system.get_output_input_port().FixValue(context, [0.0, 0.0])
@@ -72,7 +72,7 @@ def test_newest_enters_last_and_oldest_leaves(system):
 
 
 @pytest.mark.parametrize("period", [0.02, 0.1, 1 / 3, 0.007])
-def test_takes_in_each_command_exactly_once_whatever_the_rounding_of_time(period):
+def test_each_command_is_stored_exactly_once(period):
     builder = DiagramBuilder()
     counter = builder.AddSystem(Counter(period))
     buffer = builder.AddSystem(HistoryBuffer(1, 2, period))
@@ -82,11 +82,11 @@ def test_takes_in_each_command_exactly_once_whatever_the_rounding_of_time(period
     simulator.Initialize()
     for n in range(1, 400):
         simulator.AdvanceTo((n + 0.5) * period)
-        # After instant n, command n-1 is the newest of the past.
+        # After instant n the newest stored command is n − 1.
         assert buffer.get_history_output_port().Eval(context)[-1] == n - 1
 
 
-def test_a_reset_forgets(system):
+def test_initialization_fills_the_history_again(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     pristine = system.CreateDefaultContext()
@@ -100,11 +100,11 @@ def test_a_reset_forgets(system):
 
 
 @pytest.mark.parametrize("arguments", [(0, 3, 0.1), (2, 0, 0.1), (2, 3, 0.0), (2, 3, float("nan"))])
-def test_refuses_what_makes_no_sense(arguments):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         HistoryBuffer(*arguments)
 
 
-def test_refuses_a_wrong_size(system):
+def test_input_of_another_size_is_refused(system):
     with pytest.raises(Exception, match="size"):
         system.get_output_input_port().FixValue(system.CreateDefaultContext(), [1.0, 2.0, 3.0])

@@ -9,7 +9,7 @@ PERIOD = 0.125
 
 
 def lengths_under(forces, **arguments):
-    """The history length after each control step with these forces."""
+    """Return the history length after each control step with the given forces."""
     system = HistoryLengthSchedule([1, 2, 5, 10], PERIOD, **arguments)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -23,35 +23,35 @@ def lengths_under(forces, **arguments):
     return lengths
 
 
-def test_gets_shorter_in_contact_and_longer_after_dwelling_in_free_space_one_length_at_a_time():
+def test_length_decreases_in_contact_and_increases_after_dwell():
     lengths = lengths_under([0, 0, 3, 3, 3, 3] + [0] * 9, dwell_steps=3)
     assert lengths == [10, 10, 5, 2, 1, 1, 1, 1, 2, 2, 2, 5, 5, 5, 10]
 
 
-def test_noise_about_a_threshold_changes_nothing():
+def test_length_is_constant_when_force_noise_crosses_a_threshold():
     noisy = 1.5 + 0.4 * np.array([1, -1] * 20)
     assert set(lengths_under(noisy)) == {10}
     assert lengths_under([3.0, 3.0, 3.0, *noisy], dwell_steps=1)[3:] == [1] * 40
 
 
-def test_a_contact_in_between_restarts_the_dwelling():
+def test_contact_restarts_the_dwell_steps():
     assert lengths_under([3, 3, 3, 0, 0, 3, 0, 0], dwell_steps=3)[2:] == [1] * 6
 
 
-def test_torques_are_no_contact():
+def test_torque_is_not_contact():
     assert lengths_under([0.0] * 5) == [10] * 5
 
 
-def test_a_force_at_the_threshold_is_no_contact_yet():
+def test_force_at_the_threshold_is_not_contact():
     assert lengths_under([2.0] * 3) == [10] * 3
 
 
-def test_a_force_that_is_no_number_is_contact():
+def test_nan_force_is_contact():
     assert lengths_under([np.nan] * 3) == [2, 1, 1]
     assert lengths_under([3.0] * 3 + [np.nan] * 4, dwell_steps=2) == [2, 1, 1, 1, 1, 1, 1]
 
 
-def test_an_initialization_begins_with_the_longest_in_free_space():
+def test_initialization_restores_the_longest_length():
     system = HistoryLengthSchedule([1, 5], PERIOD, dwell_steps=2)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -60,7 +60,7 @@ def test_an_initialization_begins_with_the_longest_in_free_space():
     simulator.AdvanceTo(2 * PERIOD)
     assert length.Eval(context)[0] == 1
     context.SetTime(0.0)
-    wrench.GetMutableData().set_value([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])  # which ends no contact, and begins none
+    wrench.GetMutableData().set_value([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])  # neither starts nor ends contact
     simulator.Initialize()
     assert length.Eval(context)[0] == 5
     simulator.AdvanceTo(2 * PERIOD)
@@ -78,10 +78,10 @@ def test_an_initialization_begins_with_the_longest_in_free_space():
         {"lengths": [0, 3]},
     ],
 )
-def test_what_makes_no_sense_is_refused(arguments):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         HistoryLengthSchedule(arguments.pop("lengths", [1, 2]), PERIOD, **arguments)
 
 
-def test_one_component_and_a_contact_that_ends_at_no_force_are_allowed():
+def test_constructor_accepts_limiting_arguments():
     HistoryLengthSchedule([1], PERIOD, contact_threshold=0.0, release_threshold=0.0, dwell_steps=1, wrench_size=1)

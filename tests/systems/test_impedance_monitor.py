@@ -21,7 +21,7 @@ def test_contact_force_is_the_norm_of_the_force_alone():
 
 @pytest.mark.parametrize("axis", range(6))
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_any_axis_at_its_limit_is_saturation(axis, sign):
+def test_saturation_is_reported_when_any_axis_is_at_its_limit(axis, sign):
     wrench = np.zeros(6)
     wrench[axis] = 0.99 * sign * LIMITS[axis]
     assert read(wrench)[1] == 0.0
@@ -30,6 +30,6 @@ def test_any_axis_at_its_limit_is_saturation(axis, sign):
 
 
 @pytest.mark.parametrize("limits", [np.ones(5), np.zeros(6), np.full(6, np.nan)])
-def test_refuses_what_makes_no_sense(limits):
+def test_constructor_refuses_limits_out_of_range(limits):
     with pytest.raises(InputError):
         ImpedanceMonitor(limits)

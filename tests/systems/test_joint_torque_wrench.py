@@ -18,7 +18,7 @@ def arm():
 
 
 def estimate(arm, wrench, seconds=0.005, **options):
-    """What is estimated from the joint torques that a wrench (6,), force first, causes."""
+    """Return the estimate from the joint torques of a wrench (6,), force first."""
     plant, model = arm
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, READY_POSTURE)
@@ -37,7 +37,7 @@ def estimate(arm, wrench, seconds=0.005, **options):
     return system.get_wrench_output_port().Eval(simulator.get_context()).copy()
 
 
-def test_gives_back_the_wrench_that_the_joints_feel(arm):
+def test_wrench_is_recovered_from_its_joint_torques(arm):
     wrench = np.array([5.0, -3.0, 12.0, 0.2, -0.1, 0.3])
     np.testing.assert_allclose(estimate(arm, wrench, damping=0.0), wrench, atol=1e-9)
     np.testing.assert_allclose(estimate(arm, wrench), wrench, rtol=0.05, atol=0.05)
@@ -50,13 +50,13 @@ def test_filter_is_a_first_order_low_pass(arm):
 
 
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"time_constant": -1.0}, {"damping": -1.0}])
-def test_refuses_what_makes_no_sense(arm, wrong):
+def test_constructor_refuses_arguments_out_of_range(arm, wrong):
     with pytest.raises(InputError):
         estimate(arm, np.zeros(6), **wrong)
 
 
 @pytest.mark.parametrize("port", ["positions", "external_torque"])
-def test_a_sample_that_is_no_number_is_left_out(arm, port):
+def test_sample_is_skipped_when_it_is_not_finite(arm, port):
     plant, model = arm
     system = JointTorqueWrench(plant, model.target, model.tool_centre, period=0.01, time_constant=0.1)
     simulator = Simulator(system)

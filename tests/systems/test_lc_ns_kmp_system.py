@@ -36,7 +36,7 @@ def test_ports():
         without.get_history_input_port()
 
 
-def test_output_is_the_law_at_the_step_the_clock_says():
+def test_command_is_the_prediction_at_the_control_step():
     p = primitive()
     gain = np.array([3.0, 5.0])
     system = LcNsKmpSystem(p, gain, PERIOD)
@@ -54,7 +54,7 @@ def test_output_is_the_law_at_the_step_the_clock_says():
         assert violation == pytest.approx(expected[0] - 0.5, abs=1e-12)
 
 
-def test_the_same_within_a_control_step_and_not_recomputed():
+def test_command_is_computed_once_per_control_step():
     calls = []
     p = primitive(history=0)
     predict, p.predict = p.predict, lambda *a: calls.append(a[0]) or predict(*a)
@@ -71,7 +71,7 @@ def test_the_same_within_a_control_step_and_not_recomputed():
 
 
 def loop(history):
-    """KGRL or sKGRL as wired in every guidance diagram, with the command logged at each control instant."""
+    """Return KGRL or sKGRL wired as in a guidance diagram, with the command logged at each control instant."""
     builder = DiagramBuilder()
     p = primitive(history)
     system = builder.AddSystem(LcNsKmpSystem(p, np.array([20.0, 20.0]), PERIOD))
@@ -107,7 +107,7 @@ def test_closed_loop_is_the_recursion_of_algorithm_3(history):
         past = np.vstack([past, expected])[1:] if history else past
 
 
-def test_repeats_the_last_safe_command_where_there_is_no_solution_and_says_so():
+def test_last_command_is_repeated_when_there_is_no_solution():
     p = primitive(history=0)
     predict = p.predict
 
@@ -128,15 +128,15 @@ def test_repeats_the_last_safe_command_where_there_is_no_solution_and_says_so():
     diagram = builder.Build()
     simulator = Simulator(diagram)
     simulator.AdvanceTo(10 * PERIOD + 1e-6)
-    # A log at instant n sees the values just before it: command n − 1.
+    # The log at instant n contains the values just before it: command n − 1.
     outputs, fallback = (sink.FindLog(simulator.get_context()).data()[:, 1:] for sink in sinks)
     np.testing.assert_array_equal(np.flatnonzero(fallback[0]), [5])
     np.testing.assert_array_equal(outputs[:, 5], outputs[:, 4])
     assert (outputs[:, 6] != outputs[:, 4]).any()
 
 
-def test_where_constraints_change_on_the_way_a_fallback_is_within_those_of_its_own_step():
-    """What was safe a step ago may be outside now; nothing that was not checked is sent."""
+def test_fallback_satisfies_the_constraints_of_its_step():
+    """The last command may violate the constraints of the next step, so the fallback is projected again."""
     upper = np.linspace(0.3, -0.4, 50)
     c = np.tile(LinearConstraints.box([-np.inf, -np.inf], [0.0, np.inf]).c, (50, 1)) - upper[:, None]
     G = np.tile(LinearConstraints.box([-np.inf, -np.inf], [0.0, np.inf]).G, (50, 1, 1))
@@ -157,7 +157,7 @@ def test_where_constraints_change_on_the_way_a_fallback_is_within_those_of_its_o
         assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
 
-def test_where_even_the_nearest_is_not_found_the_last_command_goes_on(monkeypatch):
+def test_last_command_is_output_when_no_nearest_point_is_found(monkeypatch):
     p = primitive(history=0, upper=0.5)
 
     def never(*arguments):
@@ -175,7 +175,7 @@ def test_where_even_the_nearest_is_not_found_the_last_command_goes_on(monkeypatc
     assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
 
-def test_first_fallback_is_within_the_constraints():
+def test_first_fallback_satisfies_the_constraints():
     p = primitive(history=0, upper=-0.5)
 
     def never(*arguments):
@@ -188,7 +188,7 @@ def test_first_fallback_is_within_the_constraints():
     assert system.get_command_output_port().Eval(context)[0] <= -0.5 + 1e-9
 
 
-def test_an_initialization_begins_at_the_first_step_with_the_first_safe_command():
+def test_initialization_restores_step_and_initial_command():
     p = primitive(history=0)
 
     def never(*arguments):
@@ -202,7 +202,7 @@ def test_an_initialization_begins_at_the_first_step_with_the_first_safe_command(
     simulator.AdvanceTo(20.5 * PERIOD)
     p.predict = never
     context.SetTime(0.0)
-    action.GetMutableData()  # what was evaluated is not known to be the same any more
+    action.GetMutableData()  # invalidates the cache
     simulator.Initialize()
     np.testing.assert_array_equal(system.get_command_output_port().Eval(context), p.reference.means[0])
     p.predict = predict
@@ -214,7 +214,7 @@ def test_an_initialization_begins_at_the_first_step_with_the_first_safe_command(
 
 
 @pytest.mark.parametrize("length", [2.0, 4.0, 0.0, 1.5, np.nan])
-def test_refuses_the_length_of_a_history_that_no_primitive_has(length):
+def test_history_length_is_refused_when_no_primitive_has_it(length):
     system = LcNsKmpSystem(primitive(history=3), None, PERIOD, shorter=[(primitive(history=1), np.ones(2))])
     context = system.CreateDefaultContext()
     system.get_null_space_action_input_port().FixValue(context, np.zeros(2))
@@ -224,7 +224,7 @@ def test_refuses_the_length_of_a_history_that_no_primitive_has(length):
         system.get_command_output_port().Eval(context)
 
 
-def test_the_history_length_selects_the_primitive_which_gets_the_newest_part():
+def test_history_length_selects_the_primitive():
     longest, short = primitive(history=3), primitive(history=1)
     gains = {3: np.array([3.0, 5.0]), 1: np.array([7.0, -2.0])}
     system = LcNsKmpSystem(longest, gains[3], PERIOD, shorter=[(short, gains[1])])
@@ -243,7 +243,7 @@ def test_the_history_length_selects_the_primitive_which_gets_the_newest_part():
 
 
 @pytest.mark.parametrize("history", [0, 3, 4])
-def test_refuses_a_shorter_history_that_is_not(history):
+def test_constructor_refuses_a_history_that_is_not_shorter(history):
     with pytest.raises(InputError, match="shorter history has 1 to 2"):
         LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(primitive(history), np.ones(2))])
 
@@ -252,12 +252,12 @@ def test_refuses_a_shorter_history_that_is_not(history):
     ("shorter", "words"),
     [([primitive(1, upper=0.4)], "other constraints"), ([primitive(1), primitive(1)], "of one length")],
 )
-def test_refuses_shorter_histories_that_are_another_skill(shorter, words):
+def test_constructor_refuses_primitives_with_other_constraints(shorter, words):
     with pytest.raises(InputError, match=words):
         LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(one, np.ones(2)) for one in shorter])
 
 
-def test_without_constraints_the_violation_is_a_finite_number():
+def test_violation_is_finite_without_constraints():
     system = LcNsKmpSystem(LcNsKmp(primitive().reference, horizon=8), None, PERIOD)
     context = system.CreateDefaultContext()
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
@@ -272,6 +272,6 @@ def test_without_constraints_the_violation_is_a_finite_number():
         (None, 0.0, "period"),
     ],
 )
-def test_refuses(gain, period, words):
+def test_constructor_refuses_arguments_out_of_range(gain, period, words):
     with pytest.raises(InputError, match=words):
         LcNsKmpSystem(primitive(), gain, period)

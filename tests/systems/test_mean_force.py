@@ -6,7 +6,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.mean_force import MeanForce
 
 
-def test_averages_over_the_control_step_and_forgets_the_one_before():
+def test_force_is_the_mean_of_the_last_control_step():
     system = MeanForce(size=2, substeps=4, period=0.1)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -23,12 +23,12 @@ def test_averages_over_the_control_step_and_forgets_the_one_before():
 
 
 @pytest.mark.parametrize("arguments", [(0, 4, 0.1), (2, 0, 0.1), (2, 4, 0.0)])
-def test_refuses_what_makes_no_sense(arguments):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         MeanForce(*arguments)
 
 
-def test_one_component_and_one_plant_step_are_enough():
+def test_constructor_accepts_one_component_and_one_substep():
     system = MeanForce(1, 1, 0.1)
     context = system.CreateDefaultContext()
     system.get_force_sum_input_port().FixValue(context, [-3.0])

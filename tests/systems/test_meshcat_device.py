@@ -15,7 +15,7 @@ class Gamepad:
 
 
 class Browser:
-    """What the device asks of a Meshcat; a real one opens a port, and has nobody to move its sliders."""
+    """Stub of Meshcat: a real instance opens a port, and no operator moves its sliders."""
 
     def __init__(self):
         self.sliders, self.gamepad = {}, Gamepad()
@@ -35,7 +35,7 @@ def browser():
     return Browser()
 
 
-def test_follows_the_sliders_at_its_period(browser):
+def test_action_follows_the_sliders_once_per_period(browser):
     system = MeshcatDevice(browser, AXES, KEYS, 0.125)
     simulator = Simulator(system)
     simulator.Initialize()
@@ -51,20 +51,20 @@ def test_follows_the_sliders_at_its_period(browser):
     np.testing.assert_array_equal(action.Eval(simulator.get_context()), [-0.5, 0.75])
 
 
-def test_a_stick_that_is_moved_comes_before_its_slider(browser):
+def test_gamepad_axis_overrides_its_slider_when_moved(browser):
     system = MeshcatDevice(browser, AXES, KEYS, 0.1)
     browser.sliders["input 1"] = 0.5
     browser.gamepad.index, browser.gamepad.axes = 0, (0.02, 0.9)
     np.testing.assert_array_equal(system.read(), [0.5, -0.9])
 
 
-def test_a_gamepad_with_fewer_axes_is_no_error(browser):
+def test_gamepad_with_fewer_axes_is_accepted(browser):
     system = MeshcatDevice(browser, AXES, KEYS, 0.1)
     browser.gamepad.index, browser.gamepad.axes = 0, (-1.0,)
     np.testing.assert_array_equal(system.read(), [-1.0, 0.0])
 
 
 @pytest.mark.parametrize(("axes", "keys", "period"), [(AXES, KEYS, 0.0), (AXES, KEYS[:1], 0.1), ([], [], 0.1)])
-def test_refuses_what_makes_no_sense(browser, axes, keys, period):
+def test_constructor_refuses_invalid_arguments(browser, axes, keys, period):
     with pytest.raises(InputError, match=r"device|period"):
         MeshcatDevice(browser, axes, keys, period)

@@ -1,4 +1,4 @@
-"""The system by itself; `tests/diagrams/stations/test_mujoco_rails.py` has the physics."""
+"""Tests of the system alone; `tests/diagrams/stations/test_mujoco_gantry.py` tests the physics."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
 from guiderail.systems import MovedBodies, MujocoGantry
 
-FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # high above the jack
+FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # far above the jack
 
 
 @pytest.fixture(scope="module")
@@ -32,27 +32,27 @@ def advanced(station, desired, steps):
     return context
 
 
-def test_in_the_air_it_goes_where_it_is_told_without_a_force(station):
+def test_tool_reaches_a_free_pose_without_contact_force(station):
     desired = FREE + [0.01, -0.005, 0.01, 0.2, 0.05, -0.05]
     context = advanced(station, desired, 60)
     np.testing.assert_allclose(station.get_pose_output_port().Eval(context), desired, atol=1e-5)
     np.testing.assert_allclose(station.get_wrench_output_port().Eval(context), 0.0, atol=1e-9)
 
 
-def test_it_pushes_as_far_as_its_limits(station):
+def test_motor_forces_are_within_their_limits(station):
     context = advanced(station, FREE + [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 1)
     pushed = station.gantry.get_impedance_wrench_output_port().Eval(station.gantry.GetMyContextFromRoot(context))
     assert pushed[0] == pytest.approx(Impedance().limits[0])
 
 
-def test_the_state_is_all_there_is(station):
-    """Time, state and parameters copied into another context go on to the same bits."""
+def test_restored_state_continues_identically(station):
+    """A copy of time, state and parameters continues bit for bit identically."""
     context = advanced(station, FREE - [0.0, 0.0, 0.04, 0.0, 0.0, 0.0], 20)
     copy = station.CreateDefaultContext()
     station.get_desired_pose_input_port().FixValue(copy, FREE)
     station.get_desired_pose_input_port().FixValue(context, FREE)
     copy.SetTimeStateAndParametersFrom(context)
-    advanced(station, FREE, 5)  # another one between
+    advanced(station, FREE, 5)  # another simulation in between
     poses = []
     for one in (context, copy):
         simulator = Simulator(station, one)
@@ -63,7 +63,7 @@ def test_the_state_is_all_there_is(station):
 
 
 def pressed(workcell, modulus):
-    """How deep a clamp beside its holes sinks into the table [m] under 19.5 N."""
+    """Return the penetration [m] of a clamp next to its holes into the table under 19.5 N."""
     station = MujocoStation(workcell)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
@@ -78,15 +78,15 @@ def pressed(workcell, modulus):
     return top[2] - station.get_pose_output_port().Eval(context)[2]
 
 
-def test_the_contact_itself_is_as_many_times_stiffer_as_it_is_told():
+def test_contact_stiffness_scales_with_the_modulus():
     workcell = GridClampWorkcell()
     nominal = pressed(workcell, 1.0)
     for modulus in (0.1, 3.0, 10.0, 30.0):
         assert pressed(workcell, modulus) * modulus == pytest.approx(nominal, rel=1e-2)
 
 
-def test_what_is_no_stiffer_is_stepped_as_the_model_says(station):
-    """And what is stiffer leaves nothing behind in the model."""
+def test_step_is_nominal_when_the_modulus_is_at_most_one(station):
+    """A higher modulus before must leave no trace in the model."""
     model = station.gantry.model
     names = ("jnt_stiffness", "dof_damping", "geom_solref", "geom_friction")
     before = {name: getattr(model, name).copy() for name in names} | {"timestep": model.opt.timestep}
@@ -104,7 +104,7 @@ def test_what_is_no_stiffer_is_stepped_as_the_model_says(station):
 
 
 @pytest.mark.parametrize(("period", "constant"), [(PLANT_PERIOD * 1.0001, 0.0), (PLANT_PERIOD, -1.0), (0.0, 0.0)])
-def test_what_makes_no_sense_is_refused(station, period, constant):
+def test_constructor_refuses_arguments_out_of_range(station, period, constant):
     plant = station.plant
     moved = MovedBodies(*(plant.GetBodyByName(name) for name in ("jack", "tool_centre", "plug")))
     with pytest.raises(InputError):

@@ -1,4 +1,4 @@
-"""The policy in a diagram: what it observes, when it acts, and that an environment does the same."""
+"""Policy as a system: observation, order of events, and equality with an environment."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ PERIOD = 2.0**-5
 
 
 class Counter(LeafSystem):
-    """How many periods have begun: 1 after the discrete updates of time zero, n + 1 after those of n · PERIOD."""
+    """Number of periods started: 1 after the discrete updates of time zero, n + 1 after those of n · PERIOD."""
 
     def __init__(self):
         super().__init__()
@@ -30,7 +30,7 @@ class Counter(LeafSystem):
 
 
 class Loop:
-    """A counter that a policy observes, and the hold of the control period behind that policy."""
+    """Counter observed by a policy, and a zero-order hold of its action."""
 
     def __init__(self, policy, action_repeat=1):
         builder = DiagramBuilder()
@@ -52,10 +52,10 @@ class Loop:
         return float(system.get_output_port().Eval(system.GetMyContextFromRoot(self.context))[0])
 
     def held(self, steps):
-        """What is held during each of the next control steps."""
+        """Return the action during each of the next control steps."""
         held = []
         for _ in range(steps):
-            # To the middle of a step: then all events of its first instant are over.
+            # In the middle of a step all events of its first instant are over.
             n = int(self.context.get_time() / PERIOD + 0.5)
             self.simulator.AdvanceTo((n + 0.5) * PERIOD)
             held.append(self.read(self.action_repeat))
@@ -66,13 +66,13 @@ def tenth(observation):
     return observation / 16.0
 
 
-def test_acts_before_the_discrete_updates_of_its_instant():
-    """The policy sees the counter from before the instant, and the hold takes the new action in at the same one."""
+def test_action_is_set_before_discrete_updates_of_its_instant():
+    """The policy observes the counter before the instant; the hold samples the new action at the same instant."""
     assert Loop(tenth).held(5) == [0.0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]
 
 
-def test_one_period_later_is_what_a_discrete_update_would_give():
-    """The counterexample: a system that acts by a discrete update is a step late, so the order above is no accident."""
+def test_discrete_update_would_delay_the_action_by_one_period():
+    """Counterexample: with a discrete update the action is one step late, so the unrestricted update is needed."""
 
     class Late(LeafSystem):
         def __init__(self):
@@ -93,14 +93,14 @@ def test_one_period_later_is_what_a_discrete_update_would_give():
     assert action_repeat.get_output_port().Eval(action_repeat.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
 
 
-def test_an_action_lasts_until_the_next_decision():
+def test_action_is_constant_until_the_next_action_period():
     calls = []
     loop = Loop(lambda observation: calls.append(observation) or tenth(observation), action_repeat=4)
     assert loop.held(10) == [0.0] * 4 + [4 / 16] * 4 + [8 / 16] * 2
     assert [c.tolist() for c in calls] == [[0.0], [4.0], [8.0]]
 
 
-def test_no_action_before_the_first_decision_and_after_a_reset():
+def test_action_is_zero_before_the_first_update_and_after_reset():
     loop = Loop(lambda observation: np.ones(1))
     assert loop.read(loop.system) == 0.0
     assert loop.held(3) == [1.0] * 3
@@ -109,16 +109,16 @@ def test_no_action_before_the_first_decision_and_after_a_reset():
     assert loop.held(2) == [1.0] * 2
 
 
-def test_the_action_never_feeds_through():
+def test_no_direct_feedthrough():
     assert not PolicySystem(tenth, 3, 3, PERIOD).HasAnyDirectFeedthrough()
 
 
-def test_observes_what_an_environment_returns():
-    """A vector as float32; an image without its alpha, as a copy that outlives the simulation."""
-    seen = []
+def test_policy_gets_the_observation_of_an_environment():
+    """A vector is float32; an image has no alpha channel and is a copy that remains valid."""
+    observations = []
 
     def policy(observation):
-        seen.append(observation)
+        observations.append(observation)
         return np.zeros(1)
 
     Loop(policy).held(1)
@@ -130,26 +130,26 @@ def test_observes_what_an_environment_returns():
     builder.Connect(camera.get_output_port(), system.get_observation_input_port())
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(0.5 * PERIOD)
-    assert seen[0].dtype == np.float32
-    assert seen[1].dtype == np.uint8
-    np.testing.assert_array_equal(seen[1], image.data[:, :, :3])
+    assert observations[0].dtype == np.float32
+    assert observations[1].dtype == np.uint8
+    np.testing.assert_array_equal(observations[1], image.data[:, :, :3])
 
 
-def test_actions_beyond_the_action_space_are_clipped_as_an_environment_clips_them():
+def test_action_is_clipped_to_the_action_space():
     assert Loop(lambda observation: np.array([3.0])).held(1) == [1.0]
 
 
 @pytest.mark.parametrize(
     "returned", [[np.nan], [np.inf], [0.0, 0.0], 0.0, [[0.0]], [], None, "forward", (np.zeros(1), None)]
 )
-def test_a_policy_that_returns_no_action_stops_the_robot(returned):
+def test_policy_error_is_raised_when_no_action_is_returned(returned):
     loop = Loop(lambda observation: returned)
     with pytest.raises(PolicyError, match="the robot must stop"):
         loop.held(1)
     assert loop.read(loop.system) == 0.0
 
 
-def test_an_error_of_the_policy_itself_is_not_hidden():
+def test_exception_of_the_policy_is_propagated():
     def broken(observation):
         raise ZeroDivisionError
 
@@ -160,14 +160,14 @@ def test_an_error_of_the_policy_itself_is_not_hidden():
 @pytest.mark.parametrize(
     "arguments", [(0, 1, PERIOD), (1, 0, PERIOD), (1, 1, 0.0), (1, 1, np.nan), (Value(ImageRgba8U()), 0, PERIOD)]
 )
-def test_refuses_what_makes_no_sense(arguments):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         PolicySystem(tenth, *arguments)
 
 
 @pytest.mark.parametrize("action_repeat", [1, 5])
-def test_a_simulator_does_bit_for_bit_what_the_environment_does(action_repeat):
-    """The narrow passage under sKGRL, with a policy that depends on everything it observes."""
+def test_simulator_gives_bitwise_the_results_of_the_environment(action_repeat):
+    """The policy depends on the complete observation of the narrow passage under sKGRL."""
     steps = 30
 
     def policy(observation):

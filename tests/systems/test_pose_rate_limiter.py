@@ -9,7 +9,9 @@ PERIOD, SPEED, ANGULAR_SPEED = 0.125, 0.2, 0.4
 MEASURED = np.array([0.1, -0.2, 0.3, 1.0, 0.0, 0.0])
 
 
-class Ramped:
+class Rig:
+    """Limiter at the measured pose, with its inputs fixed by the test."""
+
     def __init__(self, desired, blend_factor=0.0):
         self.system = PoseRateLimiter(period=PERIOD, speed=SPEED, angular_speed=ANGULAR_SPEED)
         self.simulator = Simulator(self.system)
@@ -20,53 +22,53 @@ class Ramped:
         self.simulator.Initialize()
 
     def go(self, steps=1):
-        """The poses just before each of the next instants."""
+        """Return the poses just before each of the next instants."""
         poses = []
         for _ in range(steps):
             self.simulator.AdvanceTo(self.simulator.get_context().get_time() + PERIOD)
             poses.append(self.system.get_limited_pose_output_port().Eval(self.simulator.get_context()).copy())
         return np.array(poses)
 
-    def copy_state_from(self):
+    def start_blending(self):
         self.go()
         self.blend_factor.GetMutableData().set_value([0.1])
         return self
 
 
-def test_stays_where_the_robot_is_while_it_stands_by():
-    ramped = Ramped(np.zeros(6))
-    np.testing.assert_array_equal(ramped.go(3), np.tile(MEASURED, (3, 1)))
+def test_measured_pose_is_output_while_blend_factor_is_zero():
+    rig = Rig(np.zeros(6))
+    np.testing.assert_array_equal(rig.go(3), np.tile(MEASURED, (3, 1)))
     pushed = MEASURED + 0.05
-    ramped.pose.GetMutableData().set_value(pushed)
-    np.testing.assert_array_equal(ramped.go()[0], pushed)
+    rig.pose.GetMutableData().set_value(pushed)
+    np.testing.assert_array_equal(rig.go()[0], pushed)
 
 
-def test_where_there_is_authority_from_the_beginning_it_starts_where_the_robot_is():
-    ramped = Ramped(MEASURED + [10.0, 0.0, 0.0, 0.0, 0.0, 0.0], blend_factor=1.0)
+def test_output_starts_at_the_measured_pose_if_blending_at_once():
+    rig = Rig(MEASURED + [10.0, 0.0, 0.0, 0.0, 0.0, 0.0], blend_factor=1.0)
     step = np.array([SPEED * PERIOD, 0.0, 0.0, 0.0, 0.0, 0.0])
-    first = ramped.system.get_limited_pose_output_port().Eval(ramped.simulator.get_context()).copy()
+    first = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context()).copy()
     np.testing.assert_allclose(first, MEASURED + step, atol=1e-12)
-    np.testing.assert_allclose(np.diff([first, *ramped.go(4)], axis=0), np.tile(step, (4, 1)), atol=1e-12)
+    np.testing.assert_allclose(np.diff([first, *rig.go(4)], axis=0), np.tile(step, (4, 1)), atol=1e-12)
 
 
-def test_an_initialization_starts_where_the_robot_is_then():
-    ramped = Ramped(MEASURED).copy_state_from()
-    ramped.go(3)
+def test_initialization_restarts_at_the_measured_pose():
+    rig = Rig(MEASURED).start_blending()
+    rig.go(3)
     elsewhere = MEASURED + [0.5, 0.0, 0.0, 0.0, 0.0, 0.0]
-    for port in (ramped.pose, ramped.desired):
+    for port in (rig.pose, rig.desired):
         port.GetMutableData().set_value(elsewhere)
-    ramped.simulator.get_mutable_context().SetTime(0.0)
-    ramped.simulator.Initialize()
-    np.testing.assert_array_equal(ramped.go(2), [elsewhere, elsewhere])
+    rig.simulator.get_mutable_context().SetTime(0.0)
+    rig.simulator.Initialize()
+    np.testing.assert_array_equal(rig.go(2), [elsewhere, elsewhere])
 
 
-def test_goes_from_there_along_a_straight_line_never_faster_than_it_may():
+def test_output_moves_in_a_straight_line_within_speed_limit():
     goal = np.array([0.4, 0.2, 0.3, 0.5, 0.3, 0.0])
-    ramped = Ramped(goal).copy_state_from()
-    first = ramped.system.get_limited_pose_output_port().Eval(ramped.simulator.get_context())
+    rig = Rig(goal).start_blending()
+    first = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
     assert np.linalg.norm((first - MEASURED)[:3]) <= SPEED * PERIOD + 1e-12
     assert np.abs((first - MEASURED)[3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
-    poses = ramped.go(30)
+    poses = rig.go(30)
     steps = np.diff(poses, axis=0)
     assert np.linalg.norm(steps[:, :3], axis=1).max() <= SPEED * PERIOD + 1e-12
     assert np.abs(steps[:, 3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
@@ -75,34 +77,34 @@ def test_goes_from_there_along_a_straight_line_never_faster_than_it_may():
     np.testing.assert_allclose(across, 0.0, atol=1e-12)
 
 
-def test_turns_the_shorter_way():
-    ramped = Ramped(np.array([*MEASURED[:3], -3.1, 0.0, 0.0]))
-    ramped.pose.GetMutableData().set_value([*MEASURED[:3], 3.1, 0.0, 0.0])
-    poses = ramped.copy_state_from().go(4)
+def test_angles_turn_in_the_shorter_direction():
+    rig = Rig(np.array([*MEASURED[:3], -3.1, 0.0, 0.0]))
+    rig.pose.GetMutableData().set_value([*MEASURED[:3], 3.1, 0.0, 0.0])
+    poses = rig.start_blending().go(4)
     np.testing.assert_array_equal(poses[-1][3:], [-3.1, 0.0, 0.0])
 
 
-def test_what_keeps_to_the_speed_is_passed_on_as_it_is():
-    ramped = Ramped(MEASURED).copy_state_from()
-    ramped.go()
+def test_pose_within_the_speed_limits_is_output_unchanged():
+    rig = Rig(MEASURED).start_blending()
+    rig.go()
     for step in range(5):
         desired = MEASURED + [0.9 * SPEED * PERIOD * step, 0.0, 0.0, 0.9 * ANGULAR_SPEED * PERIOD * step, 0.0, 0.0]
-        ramped.desired.GetMutableData().set_value(desired)
-        now = ramped.system.get_limited_pose_output_port().Eval(ramped.simulator.get_context())
+        rig.desired.GetMutableData().set_value(desired)
+        now = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
         np.testing.assert_array_equal(now, desired)
-        ramped.go()
+        rig.go()
 
 
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"speed": 0.0}, {"angular_speed": np.inf}])
-def test_refuses_what_makes_no_sense(wrong):
+def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         PoseRateLimiter(**({"period": PERIOD} | wrong))
 
 
-def test_a_pose_that_is_no_number_is_not_remembered():
-    ramped = Ramped(MEASURED + 0.01).copy_state_from()
-    before = ramped.go(4)[-1]
-    ramped.desired.GetMutableData().set_value([np.nan, *MEASURED[1:]])
-    np.testing.assert_array_equal(ramped.go(2)[-1], before)
-    ramped.desired.GetMutableData().set_value(MEASURED)
-    np.testing.assert_allclose(ramped.go(4)[-1], MEASURED)
+def test_desired_pose_is_ignored_when_it_is_not_finite():
+    rig = Rig(MEASURED + 0.01).start_blending()
+    before = rig.go(4)[-1]
+    rig.desired.GetMutableData().set_value([np.nan, *MEASURED[1:]])
+    np.testing.assert_array_equal(rig.go(2)[-1], before)
+    rig.desired.GetMutableData().set_value(MEASURED)
+    np.testing.assert_allclose(rig.go(4)[-1], MEASURED)

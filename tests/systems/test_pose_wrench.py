@@ -1,4 +1,4 @@
-"""The wrench from generalized forces does the same work, whatever the pose and whichever way it moves."""
+"""The wrench has the same power as the generalized forces, for any pose and velocity."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ STEP = 1e-6
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.7, -0.4, 0.3), (-2.0, 1.2, -1.5), (3.0, -1.5, 0.1)])
-def test_the_wrench_does_the_generalized_forces_work(angles):
+def test_wrench_has_the_power_of_the_generalized_forces(angles):
     rng = np.random.default_rng(0)
     pose, force = np.array([0.1, -0.2, 0.3, *angles]), rng.normal(size=6)
     system = PoseWrench()
@@ -26,7 +26,7 @@ def test_the_wrench_does_the_generalized_forces_work(angles):
         assert moved @ wrench == pytest.approx(change @ force, abs=1e-6)
 
 
-def test_a_singular_pose_gives_finite_numbers():
+def test_wrench_is_finite_at_a_singular_pose():
     system = PoseWrench()
     context = system.CreateDefaultContext()
     system.get_pose_input_port().FixValue(context, [0.0, 0.0, 0.0, 0.0, np.pi / 2, 0.0])

@@ -8,12 +8,12 @@ from pydrake.trajectories import PiecewisePolynomial
 from guiderail.models.common.errors import InputError
 from guiderail.systems.recorder import Recorder
 
-PERIOD = 0.25  # exact in binary: events fall on the same instants
+PERIOD = 0.25  # exact in binary, so that events coincide
 
 
 @pytest.fixture
 def ramp():
-    """A command that counts its periods (0, 1, 2, …), held, and the time itself."""
+    """Recorder of a command that counts its periods (0, 1, 2, …), and of the time."""
     builder = DiagramBuilder()
     line = PiecewisePolynomial.FirstOrderHold([0.0, 100.0], np.array([[0.0, 400.0]]))
     source = builder.AddSystem(TrajectorySource(line))
@@ -29,7 +29,7 @@ def read(simulator, recorder):
     return recorder.recording(recorder.GetMyContextFromRoot(simulator.get_context()))
 
 
-def test_a_row_is_a_command_and_what_it_led_to(ramp):
+def test_sample_contains_a_command_and_its_result(ramp):
     simulator, recorder = ramp
     simulator.AdvanceTo(3.5 * PERIOD)
     recording = read(simulator, recorder)
@@ -39,7 +39,7 @@ def test_a_row_is_a_command_and_what_it_led_to(ramp):
 
 
 @pytest.mark.parametrize("period", [0.02, 0.1, 1 / 3, 0.007])
-def test_records_each_command_exactly_once_whatever_the_rounding_of_time(period):
+def test_each_command_is_recorded_exactly_once(period):
     builder = DiagramBuilder()
     line = PiecewisePolynomial.FirstOrderHold([0.0, 1000 * period], np.array([[0.0, 1000.0]]))
     source = builder.AddSystem(TrajectorySource(line))
@@ -52,13 +52,13 @@ def test_records_each_command_exactly_once_whatever_the_rounding_of_time(period)
     np.testing.assert_allclose(read(simulator, recorder)["command"][:, 0], np.arange(400), atol=1e-9)
 
 
-def test_stops_when_it_is_full(ramp):
+def test_recording_stops_when_it_is_full(ramp):
     simulator, recorder = ramp
     simulator.AdvanceTo(20 * PERIOD)
     assert len(read(simulator, recorder).times) == 4
 
 
-def test_a_reset_clears_it(ramp):
+def test_reset_clears_the_samples(ramp):
     simulator, recorder = ramp
     pristine = simulator.get_context().Clone()
     simulator.AdvanceTo(3.5 * PERIOD)
@@ -66,7 +66,7 @@ def test_a_reset_clears_it(ramp):
     assert len(read(simulator, recorder).times) == 0
 
 
-def test_what_was_read_is_a_copy(ramp):
+def test_recording_is_a_copy(ramp):
     simulator, recorder = ramp
     simulator.AdvanceTo(2.5 * PERIOD)
     first = read(simulator, recorder)
@@ -75,6 +75,6 @@ def test_what_was_read_is_a_copy(ramp):
 
 
 @pytest.mark.parametrize("arguments", [({}, 1, 0.1), ({"a": 0}, 1, 0.1), ({"a": 1}, 0, 0.1), ({"a": 1}, 1, 0.0)])
-def test_refuses_what_makes_no_sense(arguments):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         Recorder(*arguments)

@@ -20,7 +20,7 @@ def plant():
     return plant
 
 
-def test_are_those_in_the_reference_body(plant):
+def test_poses_are_relative_to_the_reference_body(plant):
     a, b = plant.GetBodyByName("a"), plant.GetBodyByName("b")
     plant_context = plant.CreateDefaultContext()
     plant.SetFloatingBaseBodyPoseInWorldFrame(plant_context, a, X_WA)
@@ -35,6 +35,6 @@ def test_are_those_in_the_reference_body(plant):
     np.testing.assert_allclose(poses[1], np.zeros(6), atol=1e-12)
 
 
-def test_refuses_no_bodies(plant):
+def test_constructor_refuses_an_empty_list_of_bodies(plant):
     with pytest.raises(InputError, match="at least one"):
         RelativePoses(plant, [], plant.world_body())

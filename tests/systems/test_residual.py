@@ -5,7 +5,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.residual import Residual
 
 
-def test_adds_the_scaled_action():
+def test_desired_pose_is_reference_plus_scaled_action():
     system = Residual([0.1, 2.0])
     context = system.CreateDefaultContext()
     system.get_reference_input_port().FixValue(context, [1.0, 2.0])
@@ -14,6 +14,6 @@ def test_adds_the_scaled_action():
 
 
 @pytest.mark.parametrize("gain", [[], [[1.0]], [np.nan]])
-def test_refuses_what_makes_no_sense(gain):
+def test_constructor_refuses_an_invalid_gain(gain):
     with pytest.raises(InputError):
         Residual(gain)

@@ -31,24 +31,24 @@ def test_ports(system):
     assert system.term_names == ("effort", "height")
 
 
-def test_is_the_sum_of_its_terms(system, context):
+def test_reward_is_the_sum_of_its_terms(system, context):
     assert system.get_term_output_port("effort").Eval(context) == [-5.0]
     assert system.get_term_output_port("height").Eval(context) == [5.0]
     assert system.get_reward_output_port().Eval(context) == [0.0]
 
 
-def test_a_term_that_there_is_not_is_refused_with_those_that_there_are(system):
+def test_unknown_term_is_refused_with_the_known_names(system):
     with pytest.raises(InputError, match="'speed', only effort, height"):
         system.get_term_output_port("speed")
 
 
-def test_follows_its_inputs(system, context):
+def test_reward_changes_with_its_inputs(system, context):
     system.get_reward_output_port().Eval(context)
     system.get_signal_input_port("pose").FixValue(context, [1.0, 4.0])
     assert system.get_reward_output_port().Eval(context) == [4.0]
 
 
-def test_evaluates_each_term_once_however_many_ports_are_read():
+def test_each_term_is_evaluated_once_for_all_ports():
     calls = []
     system = RewardSystem([RewardTerm("x", {"u": 1}, lambda u: calls.append(1) or u[0])])
     context = system.CreateDefaultContext()
@@ -71,6 +71,6 @@ def test_evaluates_each_term_once_however_many_ports_are_read():
         [RewardTerm("a", {"u": 1}, lambda u: 0.0), RewardTerm("b", {"u": 2}, lambda u: 0.0)],
     ],
 )
-def test_refuses_what_makes_no_sense(terms):
+def test_constructor_refuses_invalid_terms(terms):
     with pytest.raises(InputError):
         RewardSystem(terms)

@@ -28,23 +28,23 @@ def start(system, desired, pose):
 def test_ports(system):
     assert [system.get_input_port(i).get_name() for i in range(2)] == ["desired_pose", "pose"]
     assert [system.get_output_port(i).get_name() for i in range(2)] == ["safe_pose", "intervention"]
-    # The measured pose is sampled: nothing follows it within a step.
+    # The measured pose is sampled, so the output does not follow it within a step.
     assert [[system.HasDirectFeedthrough(i, o) for o in range(2)] for i in range(2)] == [[True, True], [False, False]]
 
 
-def test_passes_on_what_is_safe(system):
+def test_safe_command_is_passed_through(system):
     _, context, _, _ = start(system, [0.5, 0.3], [0.0, 0.0])
     np.testing.assert_array_equal(system.get_safe_pose_output_port().Eval(context), [0.5, 0.3])
     assert system.get_intervention_output_port().Eval(context) == [0.0]
 
 
-def test_stops_before_a_wall_from_the_first_instant_on(system):
+def test_command_into_a_wall_is_projected_from_the_start(system):
     _, context, _, _ = start(system, [3.0, 0.0], [0.0, 0.0])
     np.testing.assert_allclose(system.get_safe_pose_output_port().Eval(context), [0.9, 0.0], atol=1e-5)
     assert system.get_intervention_output_port().Eval(context) == [1.0]
 
 
-def test_the_command_stays_what_it_is_between_control_steps(system):
+def test_command_is_constant_between_control_steps(system):
     simulator, context, _, pose = start(system, [3.0, 1.0], [0.0, 0.0])
     simulator.AdvanceTo(0.05)
     before = system.get_safe_pose_output_port().Eval(context).copy()
@@ -55,6 +55,6 @@ def test_the_command_stays_what_it_is_between_control_steps(system):
     assert system.get_safe_pose_output_port().Eval(context)[1] > 0.9
 
 
-def test_refuses_what_makes_no_sense():
+def test_constructor_refuses_a_period_out_of_range():
     with pytest.raises(InputError):
         SafetyFilter(KeepOut([[0, 0]], [[1, 1]], LinearConstraints.none(2), 0.1), period=0.0)

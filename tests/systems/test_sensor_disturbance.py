@@ -12,7 +12,7 @@ PERIOD = 0.125
 
 
 def readings(seed=0, scale=1.0, bias=0.0, **options):
-    """What the sensor says, just before each instant, of a ramp that is its time."""
+    """Return the outputs just before each instant for a measurement equal to the time."""
     builder = DiagramBuilder()
     ramp = builder.AddSystem(TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 10.0], [[0.0, 10.0]])))
     sensor = builder.AddSystem(SensorDisturbance(PERIOD, **{"noise": np.zeros(1), **options}))
@@ -20,37 +20,37 @@ def readings(seed=0, scale=1.0, bias=0.0, **options):
     simulator = Simulator(builder.Build())
     context = sensor.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     sensor.set_error(context, np.full(1, scale), np.full(1, bias), seed)
-    found = []
+    outputs = []
     for step in range(1, 9):
         simulator.AdvanceTo(step * PERIOD)
-        found.append(sensor.get_disturbed_measurement_output_port().Eval(context)[0])
-    return np.array(found)
+        outputs.append(sensor.get_disturbed_measurement_output_port().Eval(context)[0])
+    return np.array(outputs)
 
 
 TIMES = PERIOD * np.arange(1, 9)
 
 
-def test_a_sensor_without_errors_says_what_is():
+def test_measurement_is_unchanged_without_disturbance():
     np.testing.assert_allclose(readings(), TIMES)
 
 
-def test_scale_and_bias():
+def test_scale_and_bias_are_applied():
     np.testing.assert_allclose(readings(scale=2.0, bias=-0.5), 2.0 * TIMES - 0.5)
 
 
-def test_a_delay_is_of_whole_periods():
+def test_measurement_is_delayed_by_whole_periods():
     np.testing.assert_allclose(readings(delay=2), np.maximum(TIMES - 2.0 * PERIOD, 0.0), atol=1e-12)
 
 
-def test_noise_has_the_size_that_was_asked_for_and_repeats_with_its_seed():
+def test_noise_has_its_deviation_and_repeats_with_its_seed():
     first = readings(seed=3, noise=np.array([0.1])) - TIMES
     assert 0.02 < first.std() < 0.3
     np.testing.assert_array_equal(readings(seed=3, noise=np.array([0.1])) - TIMES, first)
     assert not np.allclose(readings(seed=4, noise=np.array([0.1])) - TIMES, first)
 
 
-def test_an_initialization_begins_anew():
-    """Noise repeats with its seed, and nothing that was measured before comes late."""
+def test_initialization_restarts_noise_and_delay():
+    """Noise repeats with its seed, and the delay line contains no earlier measurement."""
     sensor = SensorDisturbance(PERIOD, np.ones(2), delay=3)
     simulator = Simulator(sensor)
     context = simulator.get_mutable_context()
@@ -70,6 +70,6 @@ def test_an_initialization_begins_anew():
 
 
 @pytest.mark.parametrize("wrong", [{"noise": np.array([-1.0])}, {"noise": np.zeros(1), "delay": -1}])
-def test_what_makes_no_sense_is_refused(wrong):
+def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         SensorDisturbance(PERIOD, **wrong)

@@ -8,7 +8,7 @@ from guiderail.systems.torque_publisher import TorquePublisher
 PERIOD = 0.125
 
 
-def test_sends_once_a_period_while_it_may_and_nothing_otherwise():
+def test_message_is_sent_once_per_period_only_while_enabled():
     written = []
     system = TorquePublisher(lambda torque, time: written.append((time, *torque)), 2, period=PERIOD)
     simulator = Simulator(system)
@@ -23,12 +23,12 @@ def test_sends_once_a_period_while_it_may_and_nothing_otherwise():
 
 
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"num_joints": 0}])
-def test_refuses_what_makes_no_sense(wrong):
+def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         TorquePublisher(print, **({"num_joints": 2, "period": PERIOD} | wrong))
 
 
-def test_torques_are_what_it_was_made_for():
+def test_torques_of_another_size_are_refused():
     system = TorquePublisher(print, 2, period=PERIOD)
     with pytest.raises(RuntimeError):
         system.get_torque_input_port().FixValue(system.CreateDefaultContext(), np.zeros(3))

@@ -1,4 +1,4 @@
-"""The sensor on a tool that hangs on a moving wrist: it must feel what touches the tool and nothing else."""
+"""Sensor on a moving wrist: only external contact of the tool may be measured."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ R_WAXES = RotationMatrix(RollPitchYaw(0.3, -0.2, 0.9))
 
 
 class SwingingTool:
-    """A pendulum whose bob is welded to its rod by the wrist, with a centre of compliance off its centre of mass."""
+    """Pendulum whose bob is welded to its rod at the wrist, with a centre of compliance off the centre of mass."""
 
     def __init__(self, time_constant=0.0):
         builder = DiagramBuilder()
@@ -54,8 +54,8 @@ class SwingingTool:
         return self.sensor.get_wrench_output_port().Eval(self.sensor.GetMyContextFromRoot(self.context)).copy()
 
 
-def test_swinging_freely_it_feels_nothing():
-    """Weight, centripetal force and angular acceleration are all the tool's own."""
+def test_wrench_is_zero_when_the_tool_swings_freely():
+    """Weight, centripetal force and angular acceleration of the tool are compensated."""
     swinging = SwingingTool()
     swinging.joint.set_angle(swinging.plant_context, 1.0)
     swinging.joint.set_angular_rate(swinging.plant_context, 2.0)
@@ -64,7 +64,7 @@ def test_swinging_freely_it_feels_nothing():
         np.testing.assert_allclose(swinging.wrench, np.zeros(6), atol=1e-9)
 
 
-def test_swinging_and_pushed_it_feels_the_push_at_the_centre():
+def test_wrench_is_the_push_at_the_centre_of_a_swinging_tool():
     swinging = SwingingTool()
     swinging.joint.set_angle(swinging.plant_context, 0.5)
     force, torque = np.array([1.0, -2.0, 3.0]), np.array([0.1, 0.2, -0.3])
@@ -75,7 +75,7 @@ def test_swinging_and_pushed_it_feels_the_push_at_the_centre():
 
 
 def test_filter_is_a_first_order_low_pass():
-    """A step of force arrives by 1 − e^(−t/τ)."""
+    """The response to a force step is 1 − e^(−t/τ)."""
     swinging = SwingingTool(time_constant=0.05)
     swinging.joint.Lock(swinging.plant_context)
     swinging.simulator.AdvanceTo(0.01)
@@ -87,7 +87,7 @@ def test_filter_is_a_first_order_low_pass():
     assert np.linalg.norm(swinging.wrench[:3]) == pytest.approx(expected, rel=1e-6)
 
 
-def test_starts_at_zero_and_never_feeds_through():
+def test_wrench_starts_at_zero_without_direct_feedthrough():
     swinging = SwingingTool()
     np.testing.assert_array_equal(swinging.wrench, np.zeros(6))
     assert not swinging.sensor.HasAnyDirectFeedthrough()
@@ -96,14 +96,14 @@ def test_starts_at_zero_and_never_feeds_through():
 
 
 @pytest.mark.parametrize(("period", "time_constant"), [(0.0, 0.1), (0.01, -1.0), (0.01, np.inf)])
-def test_refuses_what_makes_no_sense(period, time_constant):
+def test_constructor_refuses_arguments_out_of_range(period, time_constant):
     swinging = SwingingTool()
     wrist = swinging.plant.GetJointByName("rod_welds_to_tool")
     with pytest.raises(InputError):
         WrenchSensor(swinging.plant, wrist, [swinging.tool], swinging.centre, R_WAXES, period, time_constant)
 
 
-def test_refuses_a_tool_that_hangs_elsewhere():
+def test_constructor_refuses_a_tool_at_another_joint():
     swinging = SwingingTool()
     rod = swinging.plant.GetBodyByName("rod")
     wrist = swinging.plant.GetJointByName("rod_welds_to_tool")

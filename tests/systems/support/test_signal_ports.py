@@ -10,7 +10,7 @@ def system():
     return LeafSystem()
 
 
-def test_signals_of_one_name_share_a_port_in_the_order_of_their_first_mention(system):
+def test_signals_of_one_name_share_a_port_in_order(system):
     signals = SignalPorts(system, {"pose": 2, "force": 1}, {"force": 1, "action": 3})
     names = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
     assert names == ["pose", "force", "action"]
@@ -18,7 +18,7 @@ def test_signals_of_one_name_share_a_port_in_the_order_of_their_first_mention(sy
     assert {int(t) for t in signals.tickets} == {int(system.get_input_port(i).ticket()) for i in range(3)}
 
 
-def test_are_read_together(system):
+def test_eval_returns_all_signals_by_name(system):
     signals = SignalPorts(system, {"pose": 2, "force": 1})
     context = system.CreateDefaultContext()
     signals.port("pose").FixValue(context, [1.0, 2.0])
@@ -26,16 +26,16 @@ def test_are_read_together(system):
     assert {name: value.tolist() for name, value in signals.eval(context).items()} == {"pose": [1, 2], "force": [3]}
 
 
-def test_one_name_has_one_size(system):
+def test_signal_is_refused_when_it_has_two_sizes(system):
     with pytest.raises(InputError, match="'pose' can't be of size 2 and 6"):
         SignalPorts(system, {"pose": 2}, {"pose": 6})
 
 
-def test_a_signal_has_at_least_one_number(system):
+def test_signal_is_refused_when_its_size_is_zero(system):
     with pytest.raises(InputError, match="'pose'"):
         SignalPorts(system, {"pose": 0})
 
 
-def test_a_name_that_there_is_not_is_refused_with_those_that_there_are(system):
+def test_unknown_signal_is_refused_with_the_known_names(system):
     with pytest.raises(InputError, match="'wrench', only pose, force"):
         SignalPorts(system, {"pose": 2, "force": 1}).port("wrench")
