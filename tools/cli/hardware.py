@@ -63,15 +63,13 @@ def teleoperate(
     if record is None:
         if as_json:
             raise InputError("--json prints what was demonstrated: give --record too")
-        from guiderail.tools.teleop.teleoperator import drive_by_hand
-
-        drive_by_hand(name, environment)
-        return
-    if guidance is not None:
+    elif guidance is not None:
         raise InputError("a demonstration is recorded without guidance: leave --guidance out")
-    from guiderail.tools.teleop.teach import teach
+    from guiderail.tools.teleop.teleoperate import teleoperate as run
 
-    print_result(teach(name, environment, record, print_progress), as_json)
+    statistics = run(name, environment, record=record, log=print_progress)
+    if statistics is not None:
+        print_result(statistics, as_json)
 
 
 @cli.command("sim-driver --seconds 60", "sim-driver")

@@ -1,4 +1,4 @@
-"""`guiderail train --with-person`: whoever sits before the page in the browser."""
+"""Supervision of a training in the browser: `guiderail train --human-in-the-loop`."""
 
 from __future__ import annotations
 
@@ -8,97 +8,83 @@ from typing import Any, cast
 
 import gymnasium
 import numpy as np
-from pydrake.geometry import Meshcat
 
 from guiderail.diagrams.envs.cameras import open_meshcat
 from guiderail.diagrams.envs.scene import View
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.interventions import Supervisor
-from guiderail.tools.teleop.teach import look_at
+from guiderail.tools.teleop.teleoperator import KEY_PAIRS, MeshcatPanel, Slider, page_address, set_camera
 
-SAYS = {
-    "success (Enter)": ("Enter", "success"),
-    "failure (Backspace)": ("Backspace", "failure"),
-    "stop (Escape)": ("Escape", "stop"),
-}
-KEYS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"), ("KeyJ", "KeyL"), ("KeyK", "KeyI"), ("KeyH", "KeyY"))
-LET_GO, LET_GO_KEY = "let go (Space)", "Space"
-FARTHEST, STEP = 4.0, 0.25  # of a slider, in what a full action reaches
+# Labels of an episode by button, and the buttons' keys.
+LABELS = {"success (Enter)": "success", "failure (Backspace)": "failure", "stop (Escape)": "stop"}
+LABEL_KEYS = {"success (Enter)": "Enter", "failure (Backspace)": "Backspace", "stop (Escape)": "Escape"}
+RELEASE, RELEASE_KEY = "let go (Space)", "Space"
+LIMIT, STEP = 4.0, 0.25  # of a slider, in units of a full action
 
 
 class MeshcatSupervisor(Supervisor):
-    """Sliders push, buttons speak, each with keys; an episode goes on in real time while somebody looks.
+    """Supervisor at a Meshcat page: sliders correct the policy, buttons label an episode.
+
+    An episode runs in real time while it is supervised.
 
     Attributes:
-        meshcat: the page.
+        panel: The page's controls.
     """
 
-    def __init__(self, say: Callable[[str], None], meshcat: Any = None):
-        """
+    def __init__(self, log: Callable[[str], None], meshcat: Any = None):
+        """Open the page.
+
         Args:
-            say: is told where the page is, and what its keys are.
-            meshcat: the page; a new one on this machine unless given.
+            log: Function that shows a message.
+            meshcat: The page; a new one on this machine by default.
         """
-        self.meshcat: Meshcat = open_meshcat()[0] if meshcat is None else meshcat
-        self._say, self._sliders = say, list[str]()
-        self._clicks: dict[str, int] = {}
+        meshcat = open_meshcat()[0] if meshcat is None else meshcat
+        self.panel = MeshcatPanel(meshcat, {}, {**LABEL_KEYS, RELEASE: RELEASE_KEY})
+        self._log = log
         self._view: View | None = None
-        self._looks = self._is_stopped = False
-        for name, (key, _) in SAYS.items():
-            self.meshcat.AddButton(name, key)
-        self.meshcat.AddButton(LET_GO, LET_GO_KEY)
+        self._has_camera = self._is_stop_pending = False
 
     def wait(self) -> None:
-        """Says where the page is and waits until somebody opens it."""
-        port = self.meshcat.port()
-        self._say(f"Watch at {self.meshcat.web_url()} (from elsewhere: ssh -L {port}:localhost:{port}).")
-        self._say("Sliders push, each with two keys; Space lets go; Enter: success, Backspace: failure, Escape: stop.")
-        while self.meshcat.GetNumActiveConnections() == 0:
+        """Show the page's address and block until a browser connects."""
+        self._log(f"Watch at {page_address(self.panel.meshcat)}.")
+        self._log("Sliders push, each with two keys; Space lets go; Enter: success, Backspace: failure, Escape: stop.")
+        while self.panel.meshcat.GetNumActiveConnections() == 0:
             time.sleep(0.1)
 
     def on_episode_start(self, env: gymnasium.Env) -> None:
-        """Shows the episode from here on, with all sliders let go; of what was said before it, a stop alone counts."""
+        """Show an episode of `env` with all sliders at zero; of earlier clicks only a stop is kept."""
         base = cast(Any, env.unwrapped)
-        self._name_sliders(base)
+        self._add_sliders(base)
         if base.task.query is not None:
-            self._view = View(base.task.query, self.meshcat)
-            if not self._looks and base.task.declaration is not None:
-                look_at(self.meshcat, base.task.declaration)
-                self._looks = True  # from where the person moves it to, from now on
+            self._view = View(base.task.query, self.panel.meshcat)
+            if not self._has_camera and base.task.declaration is not None:
+                set_camera(self.panel.meshcat, base.task.declaration)
+                self._has_camera = True  # set once, because the supervisor may move the camera
             base.simulator.set_monitor(self._view.follow)
             base.simulator.set_target_realtime_rate(1.0)
-        self._let_go()
-        self._is_stopped = self.label() == "stop"
+        self.panel.reset()
+        self._is_stop_pending = self.label() == "stop"
 
     def correction(self, observation: np.ndarray) -> np.ndarray | None:
-        """Where the sliders are; None while all are let go."""
-        if self._clicked(LET_GO):
-            self._let_go()
-        values = np.array([self.meshcat.GetSliderValue(name) for name in self._sliders])
+        """Return the sliders' values, (A,); None while all are zero."""
+        if self.panel.take_clicks(RELEASE):
+            self.panel.reset()
+        values = self.panel.read()
         return values if values.any() else None
 
     def label(self) -> str | None:
-        """What was clicked last."""
-        said, self._is_stopped = "stop" if self._is_stopped else None, False
-        for name, (_, word) in SAYS.items():
-            if self._clicked(name):
-                said = word
-        return said
+        """Return the last label that was clicked since the last call."""
+        label, self._is_stop_pending = "stop" if self._is_stop_pending else None, False
+        for button, clicked in LABELS.items():
+            if self.panel.take_clicks(button):
+                label = clicked
+        return label
 
-    def _name_sliders(self, base: Any) -> None:
+    def _add_sliders(self, base: Any) -> None:
         size = int(base.action_space.shape[0])
-        if size > len(KEYS):
-            raise InputError(f"an action of {size} numbers can't be pushed by {len(KEYS)} sliders: name fewer explored")
-        for number in range(len(self._sliders), size):
-            name = f"push {number + 1}"
-            self.meshcat.AddSlider(name, -FARTHEST, FARTHEST, STEP, 0.0, *KEYS[number])
-            self._sliders.append(name)
-
-    def _let_go(self) -> None:
-        for name in self._sliders:
-            self.meshcat.SetSliderValue(name, 0.0)
-
-    def _clicked(self, name: str) -> bool:
-        clicks = self.meshcat.GetButtonClicks(name)
-        known, self._clicks[name] = self._clicks.get(name, 0), clicks
-        return clicks > known
+        if size > len(KEY_PAIRS):
+            raise InputError(
+                f"an action of {size} numbers can't be pushed by {len(KEY_PAIRS)} sliders: give fewer action_dims"
+            )
+        for number in range(size):
+            self.panel.add_slider(f"push {number + 1}", Slider(LIMIT, STEP, KEY_PAIRS[number]))

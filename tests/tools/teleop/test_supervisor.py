@@ -1,4 +1,4 @@
-"""Who watches a run through a page: sliders are a push while they are not let go, and each click is one word."""
+"""Supervisor at a page: sliders correct the policy, clicks label an episode."""
 
 from types import SimpleNamespace
 
@@ -7,18 +7,19 @@ import pytest
 from pydrake.geometry import Meshcat
 
 from guiderail.tools.environments import make_environment
-from guiderail.tools.teleop import supervisor as page_person
-from guiderail.tools.teleop.supervisor import FARTHEST, KEYS, LET_GO, SAYS, MeshcatSupervisor
+from guiderail.tools.teleop import supervisor as supervising
+from guiderail.tools.teleop.supervisor import LABEL_KEYS, LABELS, LIMIT, RELEASE, MeshcatSupervisor
+from guiderail.tools.teleop.teleoperator import KEY_PAIRS
 
 
 class Page:
-    """What is asked of a Meshcat: sliders that stay where they are, buttons that count their clicks."""
+    """Meshcat with the methods that a supervisor needs: sliders keep their values, buttons count their clicks."""
 
     def __init__(self):
         self.sliders, self.clicks = {}, {}
 
     def AddSlider(self, name, low, high, step, value, lower, higher):
-        assert (low, high) == (-FARTHEST, FARTHEST)
+        assert (low, high) == (-LIMIT, LIMIT)
         self.sliders[name] = value
 
     def AddButton(self, name, key):
@@ -41,59 +42,61 @@ def env():
     env.close()
 
 
-def watched(supervisor, env):
-    # A page that is no Meshcat shows nothing.
-    supervisor._name_sliders(env.unwrapped)
-    supervisor._let_go()
+def add_sliders(supervisor, env):
+    # Without `View`, which needs a real Meshcat.
+    supervisor._add_sliders(env.unwrapped)
+    supervisor.panel.reset()
     return supervisor
 
 
-def test_sliders_push_until_they_are_let_go(env):
+def test_correction_follows_the_sliders_until_released(env):
     page = Page()
-    supervisor = watched(MeshcatSupervisor(print, page), env)
+    supervisor = add_sliders(MeshcatSupervisor(print, page), env)
     assert supervisor.correction(None) is None
     page.sliders["push 2"] = -2.5
     np.testing.assert_array_equal(supervisor.correction(None), [0.0, -2.5])
-    page.clicks[LET_GO] += 1
+    page.clicks[RELEASE] += 1
     assert supervisor.correction(None) is None
     assert page.sliders == {"push 1": 0.0, "push 2": 0.0}
 
 
-def test_a_click_is_one_word(env):
+def test_label_is_returned_once_per_click(env):
     page = Page()
-    supervisor = watched(MeshcatSupervisor(print, page), env)
+    supervisor = add_sliders(MeshcatSupervisor(print, page), env)
     assert supervisor.label() is None
-    for name, (_, word) in SAYS.items():
+    for name, label in LABELS.items():
         page.clicks[name] += 2
-        assert supervisor.label() == word
+        assert supervisor.label() == label
         assert supervisor.label() is None
 
 
-def test_of_what_is_said_between_two_episodes_a_stop_alone_counts(env, monkeypatch):
+def test_only_a_stop_outlasts_the_start_of_an_episode(env, monkeypatch):
     page = Page()
     supervisor = MeshcatSupervisor(print, page)
-    monkeypatch.setattr(page_person, "look_at", lambda page, declaration: None)
-    monkeypatch.setattr(page_person, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
-    for name, (_, word) in SAYS.items():
+    monkeypatch.setattr(supervising, "set_camera", lambda page, declaration: None)
+    monkeypatch.setattr(supervising, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
+    for name, label in LABELS.items():
         page.clicks[name] += 1
         supervisor.on_episode_start(env)
-        assert supervisor.label() == ("stop" if word == "stop" else None)
+        assert supervisor.label() == ("stop" if label == "stop" else None)
         assert supervisor.label() is None
 
 
-def test_no_key_has_two_meanings():
-    keys = [key for pair in KEYS for key in pair] + [key for key, _ in SAYS.values()]
+def test_keys_are_unique():
+    keys = [key for pair in KEY_PAIRS for key in pair] + list(LABEL_KEYS.values())
     assert len(set(keys)) == len(keys)
 
 
-def test_an_episode_is_shown_on_a_real_page(env):
+def test_episode_is_shown_on_a_meshcat_page(env):
     supervisor = MeshcatSupervisor(print)
-    assert isinstance(supervisor.meshcat, Meshcat)
+    assert isinstance(supervisor.panel.meshcat, Meshcat)
     env.reset(seed=0)
     supervisor.on_episode_start(env)
     assert supervisor.correction(None) is None
     env.step(np.zeros(2))
-    assert supervisor.meshcat.HasPath("/drake/visualizer") or supervisor.meshcat.HasPath("/drake/illustration")
-    supervisor.meshcat.SetSliderValue("push 1", 1.0)
+    assert supervisor.panel.meshcat.HasPath("/drake/visualizer") or supervisor.panel.meshcat.HasPath(
+        "/drake/illustration"
+    )
+    supervisor.panel.meshcat.SetSliderValue("push 1", 1.0)
     supervisor.on_episode_start(env)
-    assert supervisor.correction(None) is None  # let go at the beginning of an episode
+    assert supervisor.correction(None) is None  # released at the start of an episode

@@ -1,6 +1,6 @@
-"""Demonstrations by a scripted person at a real page: headless Chromium, whose keys are pressed as a person would.
+"""Demonstrations by a scripted operator, who presses the keys of a real page in headless Chromium.
 
-`python tests/tools/operate/teach_in_browser.py TASK OUT.npz [SCREENSHOT.png]`; it needs chromium and websockets.
+`python tests/tools/teleop/record_in_browser.py TASK OUT.npz [SCREENSHOT.png]`; it needs chromium and websockets.
 """
 
 import asyncio
@@ -21,14 +21,14 @@ import websockets
 from guiderail.diagrams.stations.station import CONTROL_PERIOD as PERIOD
 from guiderail.models.objects.bnc_connector.motion import RIM, SEARCH_PUSH, SEAT_COMMAND
 from guiderail.tools.environments import task_named
-from guiderail.tools.teleop.teach import SLIDERS, Teaching
+from guiderail.tools.teleop.recorder import SLIDERS, DemonstrationRecorder
 
 PORT = 9333
 COUNT = 5
 
 
 class Page:
-    """A tab, by Chromium's own protocol."""
+    """Tab of a browser, controlled by the Chrome DevTools protocol."""
 
     def __init__(self, socket):
         self._socket, self._number, self._asking = socket, 0, asyncio.Lock()
@@ -48,8 +48,8 @@ class Page:
             await self.call("Input.dispatchKeyEvent", type=kind, code=code, key=key)
 
 
-class Supervisor:
-    """Who sits before the page, looks at where the robot is, and presses keys one after the other."""
+class Operator:
+    """Scripted operator that reads the robot's pose and presses keys one after the other."""
 
     def __init__(self, page, session, seed):
         self.page, self.session, self.random = page, session, np.random.default_rng(seed)
@@ -60,43 +60,43 @@ class Supervisor:
             await asyncio.sleep(self.random.uniform(0.02, 0.06))
 
     async def look(self, seconds):
-        """Waits for so much of the simulation's time."""
+        """Wait for some simulated time [s]."""
         until = self.session.steps * PERIOD + seconds
         while self.session.steps * PERIOD < until:
             await asyncio.sleep(0.02)
 
     async def settle(self):
-        """Waits until the page has taken all keys in: a slow one does so seconds later."""
+        """Wait until the page has handled all keys, which can take seconds."""
         seen = None
-        while not np.array_equal(seen, self.session.wanted):
-            seen = self.session.wanted.copy()
+        while not np.array_equal(seen, self.session.offset):
+            seen = self.session.offset.copy()
             await asyncio.sleep(0.4)
             await self.look(0.1)
 
     async def bring(self, output, to):
-        """Presses keys until a slider on the page says that an output of the command is to be there [m, rad]."""
-        *_, step, lower, higher, unit = list(SLIDERS.values())[output]
+        """Press keys until an output of the desired pose has the value `to` [m] or [rad]."""
+        slider = list(SLIDERS.values())[output]
         for _ in range(5):
-            said = self.session.start[output] + self.session.wanted[output]
-            left = round((to - said) / (step * unit))
+            value = self.session.start[output] + self.session.offset[output]
+            left = round((to - value) / (slider.step * slider.scale))
             if left == 0:
                 return
-            await self.press(higher if left > 0 else lower, abs(left))
+            await self.press(slider.keys[left > 0], abs(left))
             await self.settle()
 
     async def wander(self, seconds):
-        """Searches the rim: half a millimetre here, half a millimetre there, and back at last."""
+        """Search the rim in steps of half a millimetre, and return to the center."""
         until = self.session.steps * PERIOD + seconds
         while self.session.steps * PERIOD < until:
-            for output, there in enumerate(self.random.integers(-3, 4, size=2)):
-                await self.bring(output, 0.5e-3 * there)
+            for output, steps in enumerate(self.random.integers(-3, 4, size=2)):
+                await self.bring(output, 0.5e-3 * steps)
         await self.bring(0, 0.0)
         await self.bring(1, 0.0)
 
     async def demonstrate(self, motion, picture=None):
-        """One demonstration of an insertion: to the rim, a search on it, in, a turn where there is one, and at rest.
+        """Demonstrate an insertion: approach the rim, search, push in, turn if the task has a turn, and rest.
 
-        The picture is taken while it is pushed in.
+        The picture is taken during the push.
         """
         await self.look(0.3)
         await self.bring(2, motion.rim - motion.press)
@@ -117,7 +117,7 @@ class Supervisor:
 
 @dataclass(frozen=True)
 class Insertion:
-    """What the person knows of the task: heights [m], and a turn [degrees]."""
+    """Motion of an insertion: heights [m], and a turn [degrees]."""
 
     rim: float
     press: float
@@ -125,15 +125,15 @@ class Insertion:
     turn: float
 
 
-def known(session):
-    """Of the connector, or of a task folder."""
+def insertion_of(session):
+    """Return the motion of the connector, or of a task folder."""
     file = getattr(session.task, "file", None)
     if file is None:
         return Insertion(RIM, SEARCH_PUSH, -SEAT_COMMAND, -90.0)
     return Insertion(file.motion.rim, file.motion.press, file.motion.push, file.motion.turn)
 
 
-async def person(url, session, connected, picture):
+async def operate(url, session, connected, picture):
     target = next(
         tab for tab in json.load(urllib.request.urlopen(f"http://localhost:{PORT}/json")) if tab["type"] == "page"
     )
@@ -144,14 +144,14 @@ async def person(url, session, connected, picture):
         while not connected.is_set():
             await asyncio.sleep(0.2)
         await asyncio.sleep(2.0)
-        await page.press("KeyM")  # slow motion: keys take their time
+        await page.press("KeyM")  # slow motion, because keys take time
         for number in range(COUNT):
-            kept = len(session.kept)
-            whoever = Supervisor(page, session, number)
-            await whoever.page.press("Backspace")  # from the start, as nothing was shown yet
+            count = len(session.demonstrations)
+            operator = Operator(page, session, number)
+            await operator.page.press("Backspace")  # start of the demonstration
             await asyncio.sleep(0.5)
-            await whoever.demonstrate(known(session), picture if number == 0 else None)
-            while len(session.kept) == kept:
+            await operator.demonstrate(insertion_of(session), picture if number == 0 else None)
+            while len(session.demonstrations) == count:
                 await asyncio.sleep(0.1)
         if picture is not None:
             await shoot(page, picture.with_stem(picture.stem + "-end"))
@@ -165,7 +165,7 @@ async def shoot(page, picture):
 
 def main(task, out, picture=None):
     name, _ = task_named(task)
-    session = Teaching(name, {}, Path(out))
+    session = DemonstrationRecorder(name, {}, Path(out))
     profile = tempfile.mkdtemp()
     browser = subprocess.Popen(
         [
@@ -182,17 +182,19 @@ def main(task, out, picture=None):
                 break
             except OSError:
                 threading.Event().wait(0.5)
-        session.begin()
+        session.reset()
         connected = threading.Event()
-        at_page = person(session.meshcat.web_url(), session, connected, None if picture is None else Path(picture))
+        at_page = operate(
+            session.panel.meshcat.web_url(), session, connected, None if picture is None else Path(picture)
+        )
         hands = threading.Thread(target=asyncio.run, args=(at_page,))
         hands.start()
-        while session.meshcat.GetNumActiveConnections() == 0:  # Meshcat answers the thread that made it, no other
+        while session.panel.meshcat.GetNumActiveConnections() == 0:  # from the thread that created Meshcat
             threading.Event().wait(0.1)
         connected.set()
-        session.run(print, most_steps=100_000)
+        session.run(print, max_steps=100_000)
         hands.join()
-        print(json.dumps(session.learned()))
+        print(json.dumps(session.summarize()))
     finally:
         browser.terminate()
         browser.wait()

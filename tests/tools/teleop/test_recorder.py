@@ -1,0 +1,306 @@
+"""Recording of demonstrations at a page that stands in for Meshcat's."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from guiderail.models.common import files as writing
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.tools.teleop import recorder as recording
+from guiderail.tools.teleop.recorder import (
+    BLUE,
+    BUTTONS,
+    DISCARD,
+    END,
+    KEEP,
+    LENGTH,
+    PATH,
+    RED,
+    SLIDERS,
+    SLOW,
+    UNDO,
+    DemonstrationRecorder,
+    ForceGauge,
+)
+
+
+class Page:
+    """Meshcat with the methods that a session needs: sliders keep their values, buttons count their clicks."""
+
+    def __init__(self):
+        self.sliders, self.clicks, self.lines = {}, dict.fromkeys(BUTTONS, 0), {}
+        self.gamepad = SimpleNamespace(index=None, axes=[])
+        self.poses, self.properties = {}, {}
+
+    def AddSlider(self, name, low, high, step, value, lower, higher):
+        self.sliders[name] = value
+
+    def AddButton(self, name, key):
+        pass
+
+    def SetSliderValue(self, name, value):
+        self.sliders[name] = value
+
+    def GetSliderValue(self, name):
+        return self.sliders[name]
+
+    def GetButtonClicks(self, name):
+        return self.clicks[name]
+
+    def GetGamepad(self):
+        return self.gamepad
+
+    def SetProperty(self, path, name, value):
+        self.properties[path, name] = value
+
+    def SetObject(self, path, shape, colour):
+        pass
+
+    def SetTransform(self, path, pose):
+        self.poses[path] = np.array(pose)
+
+    def SetCameraPose(self, eye, target):
+        self.lines["camera"] = np.array([eye, target])
+
+    def SetLine(self, path, vertices, width, colour):
+        self.lines[path] = vertices
+
+
+@pytest.fixture
+def session(tmp_path):
+    return DemonstrationRecorder("GridClamp", {}, tmp_path / "recorded.npz", meshcat=Page())
+
+
+def lead(session, name, to, steps):
+    session.panel.meshcat.SetSliderValue(name, to)
+    for _ in range(steps):
+        session.step()
+
+
+def test_keep_writes_the_demonstration_at_once(session):
+    session.reset()
+    lead(session, "x [mm]", 2.0, 20)
+    assert "kept demonstration 1" in session.keep()
+    recorded = Demonstrations.load(session.out)
+    moved = recorded.outputs[0] - session.start
+    assert moved[-1] == pytest.approx([2e-3, 0, 0, 0, 0, 0])
+    # The command's speed is limited, however far the slider jumps.
+    assert np.abs(np.diff(moved[:, 0])).max() <= recording.MAX_SPEED[0] * 0.02 + 1e-12
+    session.reset()
+    lead(session, "y [mm]", 1.0, 20)
+    session.keep()
+    assert Demonstrations.load(session.out).num_demonstrations == 2
+
+
+def test_gauge_shows_the_force_on_the_robot(session):
+    session.reset()
+    lead(session, "x [mm]", 3.0, 15)  # next to the holes
+    lead(session, "z [mm]", -12.0, 60)
+    force = session._force()
+    assert force[2] > 1.0  # in contact
+    shaft, bar = (session.panel.meshcat.poses[f"{PATH}/{part}"] for part in ("shaft", "bar"))
+    # The arrow has the force's direction, and a length proportional to its share of the limit.
+    full = np.linalg.norm(np.subtract(*session.panel.meshcat.lines["camera"])) * LENGTH
+    share = np.linalg.norm(force) / session.task.collision.above
+    np.testing.assert_allclose(shaft[:3, 2], force / np.linalg.norm(force) * share * full, rtol=1e-9)
+    assert bar[2, 2] == pytest.approx(share * full)
+
+
+@pytest.mark.parametrize(("newtons", "share", "colour"), [(6.9, 0.69, BLUE), (7.1, 0.71, RED), (80.0, 1.0, RED)])
+def test_gauge_is_full_at_the_limit_and_red_below_it(newtons, share, colour):
+    page = Page()
+    gauge = ForceGauge(page, ((0.0, -2.0, 1.0), (0.0, 0.0, 1.0)), limit=10.0)
+    gauge.show(np.array([newtons, 0.0, 0.0]))
+    assert page.poses[f"{PATH}/bar"][2, 2] == pytest.approx(share * 2.0 * LENGTH)
+    np.testing.assert_allclose(page.poses[f"{PATH}/shaft"][:3, 2], [share * 2.0 * LENGTH, 0, 0], atol=1e-12)
+    assert page.properties[f"{PATH}/bar/<object>", "color"] == list(colour)
+    # The camera looks along y: the arrow is right of the part, the bar left of it.
+    assert page.poses[f"{PATH}/shaft"][0, 3] > 0.1 > -0.1 > page.poses[f"{PATH}/bar"][0, 3]
+    gauge.show(np.zeros(3))
+    assert all(np.isfinite(pose).all() and abs(np.linalg.det(pose)) > 0 for pose in page.poses.values())
+
+
+def test_undo_takes_back_one_second(session):
+    session.reset()
+    lead(session, "x [mm]", 1.0, 60)
+    before = [command.copy() for command in session.recording.commands]
+    lead(session, "x [mm]", -3.0, 50)
+    session.undo()  # to the begin of the last motion
+    assert session.steps == 60
+    np.testing.assert_array_equal(session.recording.commands, before)
+    assert session.panel.meshcat.sliders["x [mm]"] == pytest.approx(1.0)
+    lead(session, "x [mm]", 1.0, 10)
+    assert session.simulator.get_context().get_time() == pytest.approx(70 * 0.02)
+
+
+def test_undo_takes_back_a_long_motion_in_seconds(session):
+    session.reset()
+    lead(session, "z [mm]", 40.0, 90)  # two seconds of motion at the limited speed
+    for steps, left in ((50, 50), (0, 0), (0, 0)):
+        session.undo()
+        assert session.steps == steps
+        assert len(session.recording.commands) == left
+    lead(session, "z [mm]", 40.0, 60)
+    session.undo()  # less than half a second is taken back with the second before
+    assert session.steps == 0
+
+
+def test_rest_adds_no_samples_and_no_snapshots(session):
+    session.reset()
+    lead(session, "x [mm]", 2.0, 60)
+    counts = len(session.recording.commands), len(session.recording.snapshots)
+    before = session.command
+    lead(session, "x [mm]", 2.0, 200)
+    assert (len(session.recording.commands), len(session.recording.snapshots)) == counts
+    assert counts[0] <= 10
+    assert counts[1] == 1
+    session.undo()
+    assert (session.steps, session.recording.commands) == (0, [])
+    assert not np.array_equal(session.command, before)
+
+
+def test_undo_is_limited_to_max_undos(session, monkeypatch):
+    monkeypatch.setattr(recording, "MAX_UNDOS", 2)
+    session.reset()
+    for turn in (60.0, 0.0, 60.0, 0.0):
+        lead(session, "turn [degrees]", turn, 50)
+    assert len(session.recording.snapshots) == 2
+    for steps in (150, 100, 100):
+        session.undo()
+        assert session.steps == steps
+
+
+def test_undo_does_nothing_without_motion(session):
+    session.reset()
+    session.undo()
+    lead(session, "x [mm]", 1.0, 5)
+    session.undo()
+    session.undo()
+    assert (session.steps, session.recording.commands) == (0, [])
+    lead(session, "x [mm]", 1.0, 5)
+    assert session.simulator.get_context().get_time() == pytest.approx(5 * 0.02)
+
+
+def test_slow_motion_does_not_catch_up_with_real_time(session, monkeypatch):
+    monkeypatch.setattr(recording, "SLOW_RATE", 4.0)  # a slow rate would take too long here
+    rates, step = [], session.step
+
+    def stepped():
+        step()
+        rates.append((session.simulator.get_target_realtime_rate(), session.simulator.get_num_steps_taken()))
+        session.panel.meshcat.clicks[SLOW] += len(rates) in (3, 6)
+
+    session.step = stepped
+    session.run(lambda text: None, max_steps=9)
+    targets, since = zip(*rates, strict=True)
+    assert targets == (1.0,) * 3 + (4.0,) * 3 + (1.0,) * 3
+    # Drake's steps since it began to compare its time with the wall clock.
+    assert since[0] == since[3] == since[6] < since[1] == since[4] == since[7]
+
+
+def test_file_survives_an_interruption_while_writing(session, monkeypatch):
+    def interrupt(*paths):
+        raise KeyboardInterrupt
+
+    session.reset()
+    lead(session, "x [mm]", 2.0, 12)
+    session.keep()
+    monkeypatch.setattr(writing.os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        session.keep()
+    assert Demonstrations.load(session.out).num_demonstrations == 1
+
+
+def test_buttons_keep_discard_and_end(session):
+    messages = []
+    page, step = session.panel.meshcat, session.step
+    script = {15: ("y [mm]", 1.0), 30: KEEP, 60: DISCARD, 61: KEEP, 80: END}
+    count = [0]
+
+    def scripted():
+        act = script.get(count[0])
+        count[0] += 1
+        if isinstance(act, tuple):
+            page.SetSliderValue(*act)
+        elif act is not None:
+            page.clicks[act] += 1
+        step()
+
+    session.step = scripted
+    session.run(messages.append, real_time=False, max_steps=200)
+    assert count[0] == 81
+    assert [text.split()[0] for text in messages] == ["kept", "discarded", "nothing"]
+    assert len(session.demonstrations) == 1
+    statistics = session.summarize()
+    assert statistics["demonstrations"] == 1
+    assert statistics["the mean alone succeeds"] is False  # the part was never lowered
+
+
+def test_gamepad_moves_the_sliders(session):
+    session.reset()
+    session.panel.meshcat.gamepad = SimpleNamespace(index=0, axes=[1.0, 0.05])
+    for _ in range(50):
+        session.step()
+    assert session.panel.meshcat.sliders["x [mm]"] == pytest.approx(10.0)
+    assert session.panel.meshcat.sliders["y [mm]"] == 0.0
+
+
+def test_keep_omits_rests(session):
+    session.reset()
+    lead(session, "x [mm]", 2.0, 60)
+    lead(session, "y [mm]", 2.0, 60)
+    assert "2.4 s, 0.3 s of them without rests" in session.keep()
+    times, commands = session.demonstrations[0]
+    np.testing.assert_allclose(np.diff(times), 0.02)
+    np.testing.assert_allclose(commands[-1] - session.start, [2e-3, 2e-3, 0, 0, 0, 0])
+
+
+def test_camera_looks_at_the_part(session):
+    eye, target = session.panel.meshcat.lines["camera"]
+    assert np.linalg.norm(target - session.task.workcell().X_WT.translation()) < 0.05
+    assert np.linalg.norm(eye - target) < 0.3
+
+
+def test_recorder_opens_a_meshcat_page(tmp_path):
+    assert (
+        DemonstrationRecorder("BncConnector", {}, tmp_path / "recorded.npz")
+        .panel.meshcat.web_url()
+        .startswith("http://localhost:")
+    )
+
+
+def test_keys_are_unique(session):
+    keys = [key for slider in SLIDERS.values() for key in slider.keys] + list(BUTTONS.values())
+    assert len(set(keys)) == len(keys)
+    assert UNDO in BUTTONS
+
+
+@pytest.mark.parametrize("name", ["file/recorded.npz", f"{'x' * 300}.npz", f"{'x' * 300}/recorded.npz"])
+def test_recorder_raises_first_when_out_is_not_writable(name, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(recording.EnvConfig, "resolve", lambda *given: pytest.fail("the page opens"))
+    with pytest.raises(InputError, match=r"written|read"):
+        DemonstrationRecorder("GridClamp", {}, tmp_path / name, meshcat=Page())
+
+
+def test_keep_can_be_repeated_when_writing_failed(session, tmp_path):
+    messages = []
+    session.out = tmp_path / "file" / "recorded.npz"
+    (tmp_path / "file").touch()
+    session.reset()
+    lead(session, "x [mm]", 2.0, 12)
+    session._press(KEEP, messages.append)
+    assert "cannot be written" in messages[0]
+    (tmp_path / "file").unlink()
+    session._press(KEEP, messages.append)
+    assert "kept demonstration 1" in messages[1]
+    assert Demonstrations.load(session.out).num_demonstrations == 1
+
+
+def test_recorder_raises_when_arguments_are_invalid(tmp_path):
+    (tmp_path / "there.npz").touch()
+    for task, file in (("GridClamp", "there.npz"), ("GridClamp", "new.txt"), ("NarrowPassage", "new.npz")):
+        with pytest.raises(InputError):
+            DemonstrationRecorder(task, {}, tmp_path / file, meshcat=Page())

@@ -1,0 +1,440 @@
+"""Recording of demonstrations: an operator moves the compliant target of a running simulation.
+
+Sliders of the page set the target, each with two keys; a gamepad moves the sliders. The command follows the sliders at
+limited speed and the robot follows the command by its impedance, so that pushing means to command beyond an obstacle.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.geometry import Box, Cylinder, MeshcatCone, Rgba
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, DiagramBuilder
+
+from guiderail.diagrams.envs.cameras import add_meshcat
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_station
+from guiderail.diagrams.envs.scene import Viewpoint
+from guiderail.diagrams.stations.station import POSE_SIZE
+from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.objects.bnc_connector.demonstrations import NAMES
+from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.bounds import demonstrated_bounds
+from guiderail.tools.datasets.paths import check_new
+from guiderail.tools.teleop.teleoperator import MeshcatPanel, Slider, page_address, set_camera
+
+PATH = "/guiderail/force"
+# Of the gauge, relative to the distance of the camera from its target: to the sides, down, length, thickness.
+SIDE_OFFSET, DOWN_OFFSET, LENGTH, THICKNESS = 0.3, 0.05, 0.3, 0.012
+WARNING_SHARE = 0.7  # share of the limit above which the gauge is red
+BLUE, RED, GRAY = (0.1, 0.5, 0.9, 1.0), (0.9, 0.15, 0.1, 1.0), (0.35, 0.35, 0.35, 0.25)
+MIN_LENGTH = 1e-3  # share of the full length, because an arrow without length has no direction
+
+
+class ForceGauge:
+    """Arrow and bar that show a force next to the part.
+
+    They are solid objects, because browsers draw lines one pixel wide.
+    """
+
+    def __init__(self, meshcat: Any, view: Viewpoint, limit: float):
+        """Add the gauge to a page.
+
+        Args:
+            meshcat: The page.
+            view: Viewpoint of its camera, which determines size and position.
+            limit: Force of a full bar, and of an arrow of full length [N].
+        """
+        self._meshcat, self._limit = meshcat, limit
+        eye, target = (np.array(point) for point in view)
+        direction = target - eye
+        distance = float(np.linalg.norm(direction))
+        right = np.cross(direction, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        self._length, thickness = LENGTH * distance, THICKNESS * distance
+        low = target - [0.0, 0.0, DOWN_OFFSET * distance]
+        self._tail, self._foot = low + SIDE_OFFSET * distance * right, low - SIDE_OFFSET * distance * right
+        self._head = 4.0 * thickness
+        meshcat.SetObject(f"{PATH}/shaft", Cylinder(thickness, 1.0), Rgba(*BLUE))
+        meshcat.SetObject(f"{PATH}/head", MeshcatCone(self._head, 2.5 * thickness, 2.5 * thickness), Rgba(*BLUE))
+        meshcat.SetObject(f"{PATH}/bar", Box(3.0 * thickness, 3.0 * thickness, 1.0), Rgba(*BLUE))
+        meshcat.SetObject(f"{PATH}/trough", Box(3.5 * thickness, 3.5 * thickness, self._length), Rgba(*GRAY))
+        meshcat.SetTransform(f"{PATH}/trough", _scaled_pose(np.eye(3), self._foot + [0.0, 0.0, 0.5 * self._length]))
+        self.show(np.zeros(3))
+
+    def show(self, force: np.ndarray) -> None:
+        """Show a force (3,) in the world [N]; above the limit, arrow and bar have full length."""
+        size = float(np.linalg.norm(force))
+        share = float(np.clip(size / self._limit, MIN_LENGTH, 1.0))
+        R = RotationMatrix.MakeFromOneVector(force if size > 0.0 else [0.0, 0.0, 1.0], 2).matrix()
+        arrow = R[:, 2] * share * self._length
+        self._meshcat.SetTransform(f"{PATH}/shaft", _scaled_pose(R, self._tail + 0.5 * arrow, share * self._length))
+        # The cone's tip is its origin, and it opens along z: it is turned over and moved forward by its height.
+        tip = self._tail + arrow + R[:, 2] * self._head
+        self._meshcat.SetTransform(f"{PATH}/head", _scaled_pose(R @ np.diag([1.0, -1.0, -1.0]), tip))
+        height = share * self._length
+        self._meshcat.SetTransform(
+            f"{PATH}/bar", _scaled_pose(np.eye(3), self._foot + [0.0, 0.0, 0.5 * height], height)
+        )
+        color = RED if size > WARNING_SHARE * self._limit else BLUE
+        for part in ("shaft", "head", "bar"):
+            self._meshcat.SetProperty(f"{PATH}/{part}/<object>", "color", list(color))
+
+
+def _scaled_pose(R: np.ndarray, p: np.ndarray, length: float = 1.0) -> np.ndarray:
+    """Return the transform (4, 4) of an object that is 1 m long in z and is to be `length` [m] long."""
+    X = np.eye(4)
+    X[:3, :3] = R @ np.diag([1.0, 1.0, length])
+    X[:3, 3] = p
+    return X
+
+
+SLIDERS = {
+    "x [mm]": Slider(20.0, 0.5, ("KeyA", "KeyD"), MM, 10.0),
+    "y [mm]": Slider(20.0, 0.5, ("KeyS", "KeyW"), MM, 10.0),
+    "z [mm]": Slider(40.0, 0.5, ("KeyF", "KeyR"), MM, 10.0),
+    "turn [degrees]": Slider(180.0, 2.0, ("KeyQ", "KeyE"), DEGREE, 30.0),
+    "pitch [degrees]": Slider(10.0, 0.5, ("KeyK", "KeyI"), DEGREE),
+    "roll [degrees]": Slider(10.0, 0.5, ("KeyJ", "KeyL"), DEGREE),
+}
+KEEP, DISCARD, UNDO, SLOW, END = (
+    "keep (Enter)",
+    "discard (Backspace)",
+    "undo 1 s (U)",
+    "slow motion (M)",
+    "end (Escape)",
+)
+BUTTONS = {KEEP: "Enter", DISCARD: "Backspace", UNDO: "KeyU", SLOW: "KeyM", END: "Escape"}
+MAX_SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])  # of the command, per second
+SLOW_RATE = 0.25  # of real time, in slow motion
+UNDO_TIME = 1.0  # motion that one undo takes back [s]
+MAX_UNDOS = 60  # consecutive undos: each needs a copy of the simulation's state
+FORCE_STEPS = 5  # control steps between updates of the gauge: more would delay the page
+MIN_STEPS = 10  # control steps of a demonstration
+MAX_REST = 0.1  # longest rest of the command in a demonstration [s]
+
+
+@dataclass(frozen=True)
+class _Snapshot:
+    """State before a control step, to which an undo returns.
+
+    Attributes:
+        context: Copy of the root context.
+        steps: Control steps of the simulation.
+        command: Commanded pose, (6,).
+        offset: Offset of the sliders, (6,).
+        samples: Recorded commands.
+        resting: Control steps of the present rest.
+    """
+
+    context: Context
+    steps: int
+    command: np.ndarray
+    offset: np.ndarray
+    samples: int
+    resting: int
+
+
+@dataclass
+class _Recording:
+    """Demonstration that is being recorded, with its rests shortened, in which the operator looks and thinks.
+
+    Attributes:
+        commands: Commanded poses of the recorded control steps.
+        resting: Control steps for which the command has not changed.
+        snapshots: States to which undos return; the oldest are dropped.
+    """
+
+    commands: list[np.ndarray] = field(default_factory=list)
+    resting: int = 0
+    snapshots: deque[_Snapshot] = field(default_factory=lambda: deque(maxlen=MAX_UNDOS))
+
+    def add(self, command: np.ndarray, period: float) -> None:
+        """Record the command of a control step, unless a rest exceeds `MAX_REST`."""
+        is_resting = bool(self.commands) and np.array_equal(command, self.commands[-1])
+        self.resting = self.resting + 1 if is_resting else 0
+        if self.resting * period <= MAX_REST:
+            self.commands.append(command.copy())
+
+
+class DemonstrationRecorder:
+    """Session in which an operator moves a station and records demonstrations.
+
+    Attributes:
+        task: The task.
+        out: File of the demonstrations.
+        station: The station.
+        simulator: Simulator of the station.
+        panel: Controls of the page.
+        demonstrations: Recorded times (N,) and commanded poses (N, 6).
+        successes: Success of each demonstration; None if the task does not define it by the pose.
+        start: Pose at the start of a demonstration, (6,).
+        command: Commanded pose, (6,).
+        offset: Offset of the sliders from the start pose, (6,).
+        steps: Control steps since the start of the demonstration.
+        recording: The demonstration that is being recorded.
+    """
+
+    def __init__(self, task: str, environment: Mapping[str, Any], out: Path, meshcat: Any = None):
+        """Build the simulation and open the page.
+
+        Args:
+            task: Name of the task, or a task folder.
+            environment: Environment options.
+            out: File of the demonstrations, .npz or .csv, which must not exist.
+            meshcat: The page; a new one on this machine by default.
+
+        Raises:
+            InputError: If the task's station has no pose of six numbers, or the file exists or cannot be written.
+        """
+        check_new(out, "file")
+        if out.suffix not in (".npz", ".csv"):
+            raise InputError(f"{out} must end in .npz or .csv")
+        self.task, self.out = EnvConfig.resolve(task, environment).make_task(), out
+        if self.task.workcell_kind != "workcell":
+            raise InputError(f"{task} has no tool that can be led: demonstrate a task that inserts a part")
+        builder = DiagramBuilder()
+        self.station = builder.AddNamedSystem("station", make_station(self.task))
+        builder.ExportInput(self.station.get_desired_pose_input_port(), "desired_pose")
+        meshcat = add_meshcat(builder, self.station.GetOutputPort("query")) if meshcat is None else meshcat
+        self.simulator = Simulator(builder.Build())
+        self.demonstrations: list[tuple[np.ndarray, np.ndarray]] = []
+        self.successes: list[bool | None] = []
+        self._period = self.station.control_period
+        self._pristine = self.simulator.get_context().Clone()
+        self._is_slow = False
+        view = set_camera(meshcat, self.task)
+        self._gauge = None if view is None else ForceGauge(meshcat, view, self.task.collision.above)
+        self.panel = MeshcatPanel(meshcat, SLIDERS, BUTTONS)
+
+    def reset(self) -> None:
+        """Start a demonstration: reset robot and parts, and set the sliders to zero."""
+        context = self.simulator.get_mutable_context()
+        context.SetTimeStateAndParametersFrom(self._pristine)
+        self.start = np.zeros(POSE_SIZE)
+        if isinstance(self.task, InsertionTask):
+            self.start = np.asarray(self.task.start_pose(np.random.default_rng(0)))
+        self.station.set_pose(context, self.start)
+        self.command, self.offset = self.start.copy(), np.zeros(POSE_SIZE)
+        self._fix_command()
+        self.simulator.Initialize()
+        self.steps, self.recording = 0, _Recording()
+        self.panel.reset()
+
+    def run(self, log: Callable[[str], None], real_time: bool = True, max_steps: int = 10**9) -> None:
+        """Follow the page until its end button; write each demonstration when it is kept.
+
+        Args:
+            log: Function that shows a message.
+            real_time: Run in real time, or in slow motion; otherwise as fast as possible.
+            max_steps: Largest number of control steps.
+        """
+        self.reset()
+        for _ in range(max_steps):
+            self._set_rate((SLOW_RATE if self._is_slow else 1.0) if real_time else 0.0)
+            self.step()
+            for button in BUTTONS:
+                while self.panel.take_click(button):
+                    if button == END:
+                        return
+                    self._press(button, log)
+
+    def step(self) -> None:
+        """Advance by a control step: move the command towards the sliders, and record it."""
+        command, offset = self.command, self.offset
+        self.panel.apply_gamepad(self._period)
+        self.offset = self.panel.read()
+        max_change = MAX_SPEED * self._period
+        self.command = command + np.clip(self.start + self.offset - command, -max_change, max_change)
+        has_moved = not np.array_equal(self.command, command)
+        if has_moved and self._steps_since_snapshot() >= round(UNDO_TIME / self._period):
+            context = self.simulator.get_context().Clone()
+            samples, resting = len(self.recording.commands), self.recording.resting
+            self.recording.snapshots.append(_Snapshot(context, self.steps, command, offset, samples, resting))
+        self._fix_command()
+        self.recording.add(self.command, self._period)
+        self.steps += 1
+        self.simulator.AdvanceTo(self.steps * self._period)
+        if self._gauge is not None and self.steps % FORCE_STEPS == 0:
+            self._gauge.show(self._force())
+
+    def undo(self) -> None:
+        """Take back the last second of motion: robot, parts, command and sliders.
+
+        Rests before it stay. At most `MAX_UNDOS` seconds can be taken back.
+        """
+        snapshots = self.recording.snapshots
+        if not snapshots:
+            return
+        if len(snapshots) > 1 and self._steps_since_snapshot() < round(0.5 * UNDO_TIME / self._period):
+            snapshots.pop()
+        snapshot = snapshots.pop()
+        self.steps, self.command, self.offset = snapshot.steps, snapshot.command, snapshot.offset
+        self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(snapshot.context)
+        self.simulator.Initialize()
+        del self.recording.commands[snapshot.samples :]
+        self.recording.resting = snapshot.resting
+        self.panel.set(self.offset)
+
+    def keep(self) -> str:
+        """Keep the demonstration, and write all demonstrations.
+
+        Returns:
+            A sentence on the demonstration.
+
+        Raises:
+            InputError: If it is too short, or the file cannot be written; it is not kept then.
+        """
+        if self.steps < MIN_STEPS:
+            raise InputError("nothing was shown yet: move the sliders or press the keys first")
+        is_success = self.is_success()
+        commands = np.array(self.recording.commands)
+        demonstrations = [*self.demonstrations, (self._period * np.arange(len(commands)), commands)]
+        _to_demonstrations(demonstrations).save(self.out)
+        self.demonstrations = demonstrations
+        self.successes.append(is_success)
+        end = {None: "", True: ", at the target", False: ", NOT at the target"}[is_success]
+        duration = (self.steps - 1) * self._period
+        lasts = f"{duration:.1f} s, {self.demonstrations[-1][0][-1]:.1f} s of them without rests"
+        return f"kept demonstration {len(self.demonstrations)}: {lasts}{end}; {self.out}"
+
+    def is_success(self) -> bool | None:
+        """Return True if the workpiece is at its target; None if the task does not define success by its pose."""
+        task = self.task
+        if not isinstance(task, InsertionTask):
+            return None
+        success = next((term for term in task.termination_terms() if term.termination == "success"), None)
+        if success is None or list(success.inputs) != [task.workpiece]:
+            return None
+        plant = self.station.plant
+        context = plant.GetMyContextFromRoot(self.simulator.get_context())
+        X = plant.GetFrameByName(task.workpiece).CalcPose(context, plant.GetFrameByName(task.fixture))
+        rotation = X.rotation().ToAngleAxis()
+        return bool(success.condition(np.concatenate([X.translation(), rotation.angle() * rotation.axis()])))
+
+    def summarize(self) -> dict[str, Any]:
+        """Replay the mean of the demonstrations, draw it with its spread, and return statistics."""
+        demonstrations = _to_demonstrations(self.demonstrations)
+        steps = round(float(np.mean([times[-1] for times, _ in self.demonstrations])) / self._period) + 1
+        outputs = np.stack(demonstrations.resampled(steps).outputs)
+        mean, spread = outputs.mean(axis=0), outputs.std(axis=0)
+        self._draw_tube(mean, spread)
+        self.reset()
+        context = self.simulator.get_mutable_context()
+        self.simulator.set_target_realtime_rate(0.0)
+        self.station.set_pose(context, mean[0])
+        for n, pose in enumerate(mean):
+            self.command = pose
+            self._fix_command()
+            self.simulator.AdvanceTo((n + 1) * self._period)
+        bounds = demonstrated_bounds(demonstrations)
+        return {
+            "demonstrations": len(self.demonstrations),
+            "at the target": sum(is_success is True for is_success in self.successes),
+            "seconds": round(steps * self._period, 2),
+            "widest spread": spread.max(axis=0).round(5).tolist(),
+            "lowest": bounds.lower[0].round(5).tolist(),
+            "highest": bounds.upper[0].round(5).tolist(),
+            "the mean alone succeeds": self.is_success(),
+        }
+
+    def _fix_command(self) -> None:
+        port = self.simulator.get_system().GetInputPort("desired_pose")
+        port.FixValue(self.simulator.get_mutable_context(), self.command)
+
+    def _set_rate(self, rate: float) -> None:
+        """Set the target rate relative to real time."""
+        if rate != self.simulator.get_target_realtime_rate():
+            self.simulator.set_target_realtime_rate(rate)
+            # Without this Drake would speed up or wait until the new rate held for the whole time since the start.
+            self.simulator.ResetStatistics()
+
+    def _press(self, button: str, log: Callable[[str], None]) -> None:
+        if button == KEEP:
+            try:
+                log(self.keep())
+            except InputError as error:
+                log(str(error))
+                return
+            self.reset()
+        elif button == DISCARD:
+            log("discarded")
+            self.reset()
+        elif button == UNDO:
+            self.undo()
+        elif button == SLOW:
+            self._is_slow = not self._is_slow
+
+    def _steps_since_snapshot(self) -> float:
+        """Return the control steps since the last snapshot, infinity if there is none."""
+        snapshots = self.recording.snapshots
+        return self.steps - snapshots[-1].steps if snapshots else np.inf
+
+    def _force(self) -> np.ndarray:
+        """Return the force on the part, (3,) in the world [N]."""
+        context = self.station.GetMyContextFromRoot(self.simulator.get_context())
+        force = self.station.get_wrench_output_port().Eval(context)[:3]
+        return np.asarray(self.task.workcell().X_WT.rotation().multiply(force))
+
+    def _draw_tube(self, mean: np.ndarray, spread: np.ndarray) -> None:
+        X_WT: RigidTransform = self.task.workcell().X_WT
+        for number, factor in enumerate((0.0, 2.0, -2.0)):
+            points = X_WT.multiply((mean[:, :3] + factor * spread[:, :3]).T)
+            color = Rgba(0.1, 0.3, 0.8, 1.0 if number == 0 else 0.4)
+            self.panel.meshcat.SetLine(f"/guiderail/learned/{number}", points, 3.0 if number == 0 else 1.0, color)
+
+
+def _to_demonstrations(recorded: list[tuple[np.ndarray, np.ndarray]]) -> Demonstrations:
+    return Demonstrations([times for times, _ in recorded], [outputs for _, outputs in recorded], NAMES)
+
+
+def record_demonstrations(
+    task: str,
+    environment: Mapping[str, Any],
+    out: Path,
+    log: Callable[[str], None],
+    *,
+    wait: bool = True,
+) -> dict[str, Any]:
+    """Open the page, wait for a browser, and record demonstrations until the operator ends it.
+
+    Args:
+        task: Name of the task, or a task folder.
+        environment: Environment options.
+        out: File of the demonstrations; see `DemonstrationRecorder`.
+        log: Function that shows a message.
+        wait: Wait for a browser to connect.
+
+    Returns:
+        The file, and statistics of the demonstrations.
+
+    Raises:
+        InputError: As `DemonstrationRecorder`, or if no demonstration was kept.
+    """
+    recorder = DemonstrationRecorder(task, environment, out)
+    meshcat, limit = recorder.panel.meshcat, recorder.task.collision.above
+    log(f"Demonstrate at {page_address(meshcat)}.")
+    keys = ", ".join(
+        f"{slider.keys[0][-1]} and {slider.keys[1][-1]} {name.split()[0]}" for name, slider in SLIDERS.items()
+    )
+    log(f"Keys: {keys}; Enter keeps, Backspace discards, U undoes, M is slow motion, Escape ends.")
+    log(f"Sliders and buttons: Open Controls, upper right. The arrow is the force; at {limit:g} N the bar is full.")
+    while wait and meshcat.GetNumActiveConnections() == 0:
+        time.sleep(0.1)
+    try:
+        recorder.run(log)
+    except KeyboardInterrupt:
+        log("ended")
+    if not recorder.demonstrations:
+        raise InputError("nothing was kept: press Enter at the end of each demonstration")
+    return {"out": str(out), **recorder.summarize()}
