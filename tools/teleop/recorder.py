@@ -29,7 +29,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.bounds import demonstrated_bounds
+from guiderail.models.primitives.bounds import compute_bounds
 from guiderail.tools.datasets.paths import check_new
 from guiderail.tools.teleop.teleoperator import MeshcatPanel, Slider, page_address, set_camera
 
@@ -337,7 +337,7 @@ class DemonstrationRecorder:
             self.command = pose
             self._fix_command()
             self.simulator.AdvanceTo((n + 1) * self._period)
-        bounds = demonstrated_bounds(demonstrations)
+        bounds = compute_bounds(demonstrations)
         return {
             "demonstrations": len(self.demonstrations),
             "at the target": sum(is_success is True for is_success in self.successes),
