@@ -10,13 +10,13 @@ from guiderail.tools.tables import write_table
 
 
 def figure_2_2(out: Path) -> dict[str, Any]:
-    """Its states, what inputs do in each, where they end, and the constraints in the order that they apply."""
+    """Draw the template: states, input mappings, transitions, and constraints in the order of their application."""
     template = make_template(PouringConfig())
     rows = []
     for state in template.states:
-        following = [f"{to} where {condition}" for start, to, condition in list_edges(template) if start == state.name]
+        following = [f"{to} if {condition}" for start, to, condition in list_edges(template) if start == state.name]
         lines = "; ".join(state_lines(state))
-        rows.append({"state": state.name, "what it does": lines, "goes on to": "; ".join(following)})
+        rows.append({"state": state.name, "mappings and constraints": lines, "transitions": "; ".join(following)})
     picture = out / "figure_2_2.png"
     table = write_table(out / "figure_2_2", rows)
     draw(template, picture)

@@ -18,7 +18,14 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.experiments.study import Job, ratio, run_study
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import draw_runs, legend, new_figure
-from research.figures.runs import episodes_of, figure_study, learning_curves, leave, said, settings_table
+from research.figures.runs import (
+    episodes_of,
+    figure_study,
+    learning_curves,
+    numbers_of_seeds,
+    save_results,
+    settings_table,
+)
 from research.figures.thesis import TABLE_3_2
 
 METHODS = {
@@ -29,20 +36,20 @@ METHODS = {
 }
 NAMES = {method: name for method, (name, _) in METHODS.items()}
 FORCE = {"sct": ("with the cost of force", "#2ca02c"), "sct_no_force": ("without it", "#d62728")}
-ENDINGS = ("success", "spill", "collision")
-TICKS = (1, 10, 20, 50, 100, 200, 500)  # episodes
+ENDINGS = ("success", "spill", "collision")  # terminations that are counted
+TICKS = (1, 10, 20, 50, 100, 200, 500)  # ticks of the axis of episodes
 POURING = (
     "an iiwa in simulation; the preset 'pouring'; an action lasts 10 control steps, and 40 where the reward is sparse; "
     "the template's inputs are 1.7 times as fast there"
 )
 CLAMP = (
-    "in simulation, on rails, SAC with the clamp preset; a hidden offset of the table of 1.8 to 2.2 mm per run and six "
-    "grasp offsets of up to 1 mm; the thesis: a real robot, five sessions of 70 episodes"
+    "in simulation, on the gantry, SAC with the preset sac_gridclamp; a hidden table offset of 1.8 to 2.2 mm per run "
+    "and six grasp offsets of up to 1 mm; the thesis: a real robot, five sessions of 70 episodes"
 )
 
 
 def figure_3_4(out: Path) -> dict[str, Any]:
-    """The scene as its camera sees it, with the frames of the thermos's tip and of the mug's."""
+    """Render the scene with the frames of the tips of thermos and mug."""
     env: Any = make_environment("Pouring", {"guidance": "sct"}, render_mode="rgb_array")
     env.reset(seed=0)
     diagram, task = env.unwrapped.task.diagram, env.unwrapped.task.declaration
@@ -61,36 +68,36 @@ def figure_3_4(out: Path) -> dict[str, Any]:
         axis.annotate(name, (u, v), xytext=(8, 10), textcoords="offset points", color="black", fontsize=9)
         rows.append({"frame": name} | dict(zip("xyz", X_WF.translation().tolist(), strict=True)))
     axis.set_axis_off()
-    return leave(out, "figure_3_4", figure, rows)
+    return save_results(out, "figure_3_4", figure, rows)
 
 
 def figure_3_7(out: Path, seeds: int = 5, episodes: int | None = None) -> dict[str, Any]:
-    """RL-SCT-Shaped with SAC alone, as on the thesis's robot: success, spills and return."""
+    """Draw success, spills and return of RL-SCT-Shaped with SAC, as on the thesis's robot."""
     rows = _pouring(out, "sac", seeds, episodes, ("rl_sct_shaped",))
     figure, (axes,) = new_figure(1, 3, (13, 4.2))
     runs, (name, shade) = episodes_of(rows, "rl_sct_shaped"), METHODS["rl_sct_shaped"]
     values = {"success rate": [run["termination"] == "success" for run in runs]}
     values |= {"spill rate": [run["termination"] == "spill" for run in runs], "return": [run["return"] for run in runs]}
-    for axis, (words, series) in zip(axes, values.items(), strict=True):
+    for axis, (quantity, series) in zip(axes, values.items(), strict=True):
         draw_runs(axis, series, colour=shade, label=f"{name} ({len(runs)} runs)")
-        axis.set(xlabel="episode", ylabel=f"{words} (mean of 10)")
-        if words.endswith("rate"):
+        axis.set(xlabel="episode", ylabel=f"{quantity} (mean of 10)")
+        if quantity.endswith("rate"):
             axis.set_ylim(-0.04, 1.04)
-    return {**leave(out, "figure_3_7", figure, rows), **_poured(rows), "condition": POURING}
+    return {**save_results(out, "figure_3_7", figure, rows), **_run_numbers(rows), "condition": POURING}
 
 
 def figure_3_5(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """SAC: success, spill and collision rate over the episodes."""
+    """Draw success, spill and collision rate over the episodes with SAC."""
     return _endings(out, "3_5", "sac", seeds, episodes)
 
 
 def figure_3_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """TQC: the same."""
+    """Draw success, spill and collision rate over the episodes with TQC."""
     return _endings(out, "3_6", "tqc", seeds, episodes)
 
 
 def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Episodes before ten in a row succeeded, and how many of a hundred spilled or collided, with both learners."""
+    """Draw episodes to convergence and the shares of spills and collisions with both learners."""
     figure, axes = new_figure(3, 2, (9, 9))
     tables = {algorithm: _pouring(out, algorithm, seeds, episodes) for algorithm in ("sac", "tqc")}
     for column, (algorithm, rows) in enumerate(tables.items()):
@@ -98,7 +105,7 @@ def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
         for axis, key, label in zip(
             axes[:, column],
             ("training_episodes_to_convergence", "spill_percent", "collision_percent"),
-            ("episodes before ten in a row", "% of episodes that end in a spill", "% that end in a collision"),
+            ("episodes to convergence", "% of episodes that end in a spill", "% that end in a collision"),
             strict=True,
         ):
             _boxes(axis, rows, key)
@@ -112,25 +119,25 @@ def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
         for axis in row:
             axis.set_ylim(-0.05 * top, top)
     return {
-        **leave(out, "figure_3_8", figure, pd.concat(tables.values())),
-        **{f"{name}, {key}": value for name, rows in tables.items() for key, value in _poured(rows).items()},
+        **save_results(out, "figure_3_8", figure, pd.concat(tables.values())),
+        **{f"{name}, {key}": value for name, rows in tables.items() for key, value in _run_numbers(rows).items()},
         "condition": POURING,
     }
 
 
 def table_3_2(out: Path) -> dict[str, Any]:
-    """The learners' settings for templates: the thesis's, and those of the presets that are named after it."""
+    """Compare the thesis's learner settings for templates with those of the presets."""
     return settings_table(out / "table_3_2", TABLE_3_2, ("pouring", "sac_gridclamp"))
 
 
 def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """What is known about pouring, once as a reward and once as a template; and what that comes to while learning."""
+    """Compare prior knowledge about pouring as a reward function and as a template, with the endings in training."""
     template = make_template(PouringConfig())
     collision = f"collision {TERMINAL['collision']:g}"
-    far = f"{APPROACH:g} a metre gained; turning about any axis -0.25 a radian; {collision}"
+    far = f"{APPROACH:g} per metre gained; turning about any axis -0.25 per radian; {collision}"
     near = (
-        f"{APPROACH:g} a metre gained; {NEAR_BONUS:g} a decision within {1e3 * NEAR:g} mm; "
-        f"tilting towards the mug {TILT / 4:g} a radian, turning otherwise -0.25; {collision}"
+        f"{APPROACH:g} per metre gained; {NEAR_BONUS:g} per action within {1e3 * NEAR:g} mm; "
+        f"tilting towards the mug {TILT / 4:g} per radian, turning otherwise -0.25; {collision}"
     )
     found = _pouring(out, "sac", seeds, episodes, ("rl_shaped", "rl_sct_shaped"))
     rows = [
@@ -141,24 +148,24 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
         }
         for state in template.states
     ]
-    came = {
+    endings = {
         method: ", ".join(f"{runs[f'{ending}_percent'].mean():.0f} % {ending}" for ending in ENDINGS)
         + f" (runs: {len(runs)})"
         for method, runs in found.groupby("method")
     }
-    known = {"reward function": came["rl_shaped"], "shared control template": came["rl_sct_shaped"]}
-    rows.append({"state": "what it comes to (SAC)", **known})
+    described = {"reward function": endings["rl_shaped"], "shared control template": endings["rl_sct_shaped"]}
+    rows.append({"state": "endings in training (SAC)", **described})
     picture = out / "table_3_3.png"
     draw(template, picture)
     table = write_table(out / "table_3_3", rows)
-    return {"picture": str(picture), "table": str(table), **_poured(found), "condition": POURING}
+    return {"picture": str(picture), "table": str(table), **_run_numbers(found), "condition": POURING}
 
 
 def _pouring(
     out: Path, algorithm: str, seeds: int, episodes: int | None, methods: tuple[str, ...] = tuple(METHODS)
 ) -> pd.DataFrame:
-    """A row for each run: of whatever seeds the folder has, and of more where those are fewer than `seeds`."""
-    study = figure_study(f"pouring_{algorithm}", seeds=seeds, episodes=episodes, methods=methods, judged=False)
+    """Return a row for each run: of all seeds in the folder, and of new ones if those are fewer than `seeds`."""
+    study = figure_study(f"pouring_{algorithm}", seeds=seeds, episodes=episodes, methods=methods, evaluate=False)
     wanted = {}
     for method, known in study.methods.items():
         folder = Job(study, method, study.seeds[0], out).folder.path
@@ -184,33 +191,33 @@ def _endings(out: Path, number: str, algorithm: str, seeds: int, episodes: int |
         axis.set(xlabel="episode", ylabel=f"{ending} rate (mean of 10)", xscale="log", ylim=(-0.04, 1.04))
         axis.xaxis.set_major_formatter("{x:g}")
     legend(figure, axes[0])
-    return {**leave(out, f"figure_{number}", figure, rows), **_poured(rows), "condition": POURING}
+    return {**save_results(out, f"figure_{number}", figure, rows), **_run_numbers(rows), "condition": POURING}
 
 
 def _boxes(axis: Axes, rows: pd.DataFrame, key: str) -> None:
-    """A box and every run's own point; a run that never got there is an open one at its last episode."""
-    for place, (method, (_, shade)) in enumerate(METHODS.items()):
+    """Draw a box and a point for every run; a run that did not converge is an open point at its last episode."""
+    for position, (method, (_, shade)) in enumerate(METHODS.items()):
         of_method = rows[rows["method"] == method]
-        there = of_method[key].dropna().astype(float)
+        reached = of_method[key].dropna().astype(float)
         never = of_method[of_method[key].isna()]["training_episodes"]
-        if len(there):
-            axis.boxplot([there], positions=[place], widths=0.5, showfliers=False, medianprops={"color": "0.2"})
-        axis.scatter([place] * len(there), there, color=shade, s=22, zorder=3)
-        axis.scatter([place] * len(never), never, facecolors="none", edgecolors=shade, marker="^", s=40)
+        if len(reached):
+            axis.boxplot([reached], positions=[position], widths=0.5, showfliers=False, medianprops={"color": "0.2"})
+        axis.scatter([position] * len(reached), reached, color=shade, s=22, zorder=3)
+        axis.scatter([position] * len(never), never, facecolors="none", edgecolors=shade, marker="^", s=40)
         if len(never):
-            axis.annotate("never", (place, max(never)), xytext=(0, 6), textcoords="offset points", ha="center")
+            axis.annotate("never", (position, max(never)), xytext=(0, 6), textcoords="offset points", ha="center")
     axis.set_xticks(range(len(METHODS)), NAMES.values(), fontsize=7)
     axis.axvline(1.5, color="0.8", linewidth=0.8)
     axis.set_xlim(-0.6, len(METHODS) - 0.4)
     axis.margins(y=0.15)
 
 
-def _poured(rows: pd.DataFrame) -> dict[str, str]:
-    """Each run's own numbers."""
-    return said(
+def _run_numbers(rows: pd.DataFrame) -> dict[str, str]:
+    """Return the numbers of each run."""
+    return numbers_of_seeds(
         rows,
         {
-            "training_episodes_to_convergence": ("converged after episode", "{}"),
+            "training_episodes_to_convergence": ("episodes to convergence", "{}"),
             "training_ended_in_spill": ("episodes that ended in a spill", "{}"),
             "training_ended_in_collision": ("episodes that ended in a collision", "{}"),
         },
@@ -219,14 +226,14 @@ def _poured(rows: pd.DataFrame) -> dict[str, str]:
 
 
 def figure_3_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Success, mean squared force of each episode, and its length."""
+    """Draw success, mean squared force and length of each episode."""
     return _clamp(
         out,
         "figure_3_10",
         figure_study("grid_clamp_figures", seeds=seeds, episodes=episodes),
         {"success": "success", "mean_squared_force": "mean squared force [N²]", "steps": "control steps of 20 ms"},
         {
-            "training_episodes_to_convergence": ("converged after episode", "{}"),
+            "training_episodes_to_convergence": ("episodes to convergence", "{}"),
             "success_rate": ("held-out success", "{:.0%}"),
             "training_mean_squared_force": ("mean squared force of each seed [N²]", "{:.1f}"),
         },
@@ -234,22 +241,27 @@ def figure_3_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[
 
 
 def figure_3_11(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """The rewards gained: each by its own reward, so that one is not above the other for being better."""
+    """Draw the return of each reward function. The two scales differ and cannot be compared."""
     return _clamp(
         out,
         "figure_3_11",
-        figure_study("grid_clamp_figures", seeds=seeds, episodes=episodes, judged=False),
+        figure_study("grid_clamp_figures", seeds=seeds, episodes=episodes, evaluate=False),
         {"return": "return of an episode"},
         {"training_mean_return_last_10": ("return of the last ten episodes, each seed", "{:.1f}")},
     )
 
 
 def _clamp(
-    out: Path, name: str, study: Any, columns: Mapping[str, str], words: Mapping[str, tuple[str, str]]
+    out: Path, name: str, study: Any, columns: Mapping[str, str], numbers: Mapping[str, tuple[str, str]]
 ) -> dict[str, Any]:
     rows = run_study(study, out)
     size = (13.0, 4.0) if len(columns) > 1 else (7.0, 4.2)
     figure, _ = learning_curves(rows, columns, (1, len(columns)), size, lines=FORCE)
     names = {method: name for method, (name, _) in FORCE.items()}
     ratios = {k: v for one in study.ratios for k, v in ratio(rows, one).items()} if len(columns) > 1 else {}
-    return {**leave(out, name, figure, rows), **said(rows, words, names), **ratios, "condition": CLAMP}
+    return {
+        **save_results(out, name, figure, rows),
+        **numbers_of_seeds(rows, numbers, names),
+        **ratios,
+        "condition": CLAMP,
+    }

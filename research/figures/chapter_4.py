@@ -1,4 +1,4 @@
-"""Figures 4.2 to 4.8 and table 4.1: what KGRL's null space is, and what it is for."""
+"""Figures 4.2 to 4.8 and table 4.1: exploration in the null space of a KMP, and learning with KGRL."""
 
 from pathlib import Path
 from typing import Any
@@ -17,24 +17,24 @@ from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.experiments.study import run_study
 from guiderail.tools.visualization.curves import draw_world
 from guiderail.tools.visualization.style import colour, label, new_figure
-from research.figures.runs import figure_study, learning_curves, leave, said, settings_table
+from research.figures.runs import figure_study, learning_curves, numbers_of_seeds, save_results, settings_table
 from research.figures.thesis import TABLE_4_1
 
 DURATION, STEPS, COMPONENTS = 6.0, 200, 8
-MODULATED_AT = 3.2  # s, as in the thesis
-NEARBY = 0.5  # s before and after that; the kernel's length is as much
+MODULATED_AT = 3.2  # time of the action, as in the thesis [s]
+NEARBY = 0.5  # time before and after the action, equal to the kernel's length scale [s]
 MOVED_ELSEWHERE = f"moved_most_over_{NEARBY:g}_s_away"
 LOWER, UPPER = np.array([-0.56, -0.26]), np.array([0.56, 0.42])
-TASK, HOLD = "NarrowPassage", 5  # control steps of an action, unless a figure says otherwise
+TASK, ACTION_REPEAT = "NarrowPassage", 5  # default control steps of an action
 METHODS = ("residual", "safe_residual", "kgrl")
 CONNECTOR = (
-    "in simulation, on rails; a hidden offset of 1.0 to 1.5 mm per run and a few tenths per episode; the robust "
-    "preset, actions in x and y held ten control steps; the thesis's reward and 5 per millimetre of depth"
+    "in simulation, on the gantry; a hidden offset of 1.0 to 1.5 mm per run and a few tenths per episode; the "
+    "preset tqc_contact, actions in x and y for ten control steps; the thesis's reward and 5 per millimetre of depth"
 )
 
 
 def synthetic_demonstrations(seed: int = 0, count: int = 6) -> Demonstrations:
-    """Two-dimensional motions over an arch that agree at both ends and once between, and differ most at the top."""
+    """Return planar demonstrations over an arch, with little spread at both ends and most at the top."""
     random = np.random.default_rng(seed)
     times = np.linspace(0, DURATION, STEPS)
     phase = times / DURATION
@@ -47,7 +47,7 @@ def synthetic_demonstrations(seed: int = 0, count: int = 6) -> Demonstrations:
 
 
 def explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> np.ndarray:
-    """A motion (N, O) with a normally distributed null-space action at every step."""
+    """Return a motion, (N, O), with a normally distributed null-space action at every step."""
     random = np.random.default_rng(seed)
     return np.array(
         [primitive.predict(n, gain * random.standard_normal(2) / np.sqrt(3)).output for n in range(primitive.num_steps)]
@@ -55,10 +55,10 @@ def explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> np.ndarray:
 
 
 def figure_4_2(out: Path) -> dict[str, Any]:
-    """Demonstrations with their mixture, the effect of one action, and of random ones, inside a rectangle.
+    """Draw demonstrations with their mixture, and motions with one action and with random ones, inside bounds.
 
-    The table has how far each motion is from the one without actions: at `MODULATED_AT`, and more than `NEARBY` away
-    from it at most.
+    The table has the distance of each motion to the one without actions: at `MODULATED_AT`, and the largest one more
+    than `NEARBY` away from it.
     """
     demonstrations = synthetic_demonstrations()
     reference = ReferenceTrajectory.from_demonstrations(demonstrations, components=COMPONENTS)
@@ -93,10 +93,10 @@ def figure_4_2(out: Path) -> dict[str, Any]:
         if axis is not first:
             axis.add_patch(Rectangle(tuple(LOWER), *(UPPER - LOWER), fill=False, color="firebrick", linestyle="--"))
         axis.set(title=title, xlabel="x", ylabel="y", aspect="equal", xlim=(-0.65, 0.65), ylim=(-0.35, 0.6))
-    action_dims = np.sqrt(((paths - paths.mean(0)) ** 2).mean((0, 2)))
-    agreement = float(np.corrcoef(action_dims, np.sqrt((reference.standard_deviations**2).mean(1)))[0, 1])
+    explored = np.sqrt(((paths - paths.mean(0)) ** 2).mean((0, 2)))
+    agreement = float(np.corrcoef(explored, np.sqrt((reference.standard_deviations**2).mean(1)))[0, 1])
     return {
-        **leave(out, "figure_4_2", figure, rows),
+        **save_results(out, "figure_4_2", figure, rows),
         "max_commanded_violation": max(row["max_commanded_violation"] for row in rows),
         "exploration_follows_the_demonstrated_spread": agreement,
     }
@@ -107,7 +107,7 @@ def _violation(primitive: LcNsKmp, path: np.ndarray) -> float:
 
 
 def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:
-    """Two standard deviations of each component, in the plane."""
+    """Draw two standard deviations of each component in the plane."""
     mixture = fit_mixture(demonstrations.times[0], np.stack(demonstrations.outputs), COMPONENTS, 0)
     scale = mixture.scale[1:]
     for mean, covariance in zip(mixture.means, mixture.covariances, strict=True):
@@ -119,28 +119,28 @@ def _draw_mixture(axis: Any, demonstrations: Demonstrations) -> None:
 
 
 def figure_4_3(out: Path, name: str = "figure_4_3") -> dict[str, Any]:
-    """The plane: walls, zone, obstacle, goal and demonstrations."""
+    """Draw walls, zone, obstacle, goal and demonstrations of the narrow passage."""
     figure, ((axis,),) = new_figure(1, 1, (4.6, 6.0))
     draw_world(axis)
-    world = PassageGeometry()
-    for words, place in {
-        "restricted\nzone": (world.zone_x + 0.02, 0.1),
-        "obstacle": (world.obstacle[0] + world.obstacle_radius, world.obstacle[1]),
-        "goal": (world.goal[0] + world.goal_radius, world.goal[1]),
+    geometry = PassageGeometry()
+    for text, point in {
+        "restricted\nzone": (geometry.zone_x + 0.02, 0.1),
+        "obstacle": (geometry.obstacle[0] + geometry.obstacle_radius, geometry.obstacle[1]),
+        "goal": (geometry.goal[0] + geometry.goal_radius, geometry.goal[1]),
     }.items():
-        axis.annotate(words, place, xytext=(4, 0), textcoords="offset points", fontsize=8, va="center")
+        axis.annotate(text, point, xytext=(4, 0), textcoords="offset points", fontsize=8, va="center")
     fields = ("start", "goal", "goal_radius", "gap_x", "obstacle", "obstacle_radius", "zone_x")
-    rows = [{"what": field.replace("_", " "), "metres": str(getattr(world, field))} for field in fields]
-    return leave(out, name, figure, rows)
+    rows = [{"quantity": field.replace("_", " "), "metres": str(getattr(geometry, field))} for field in fields]
+    return save_results(out, name, figure, rows)
 
 
 def table_4_1(out: Path) -> dict[str, Any]:
-    """TQC's settings: the thesis's, and those of the presets that are named after it."""
+    """Compare the thesis's settings of TQC with those of the presets."""
     return settings_table(out / "table_4_1", TABLE_4_1, ("tqc_fast", "tqc_contact"))
 
 
 def random_episodes(env: Any, seed: int, episodes: int) -> list[dict[str, Any]]:
-    """Rows, with paths, of episodes of uniformly random actions."""
+    """Run episodes of uniformly random actions; return their rows with paths."""
     random = np.random.default_rng(seed)
     size = env.action_space.shape
 
@@ -151,31 +151,31 @@ def random_episodes(env: Any, seed: int, episodes: int) -> list[dict[str, Any]]:
 
 
 def figure_4_4(out: Path, seeds: int = 3, episodes: int = 10) -> dict[str, Any]:
-    """Where random exploration takes the robot, and how that depends on how long an action lasts.
+    """Draw the positions that random exploration reaches, for two action repeats.
 
     Args:
-        out: the folder.
-        seeds: of the random actions.
-        episodes: of each seed.
+        out: Folder.
+        seeds: Number of seeds of the random actions.
+        episodes: Episodes of each seed.
     """
     figure, (axes,) = new_figure(1, 3, (11, 5.2))
     rows: list[dict[str, Any]] = []
     for axis, kind in zip(axes, METHODS, strict=True):
         draw_world(axis)
         axis.set_title(label(kind))
-        for action_repeat in (HOLD, 1):
+        for action_repeat in (ACTION_REPEAT, 1):
             env: Any = make_environment(TASK, {"guidance": kind, "action_repeat": action_repeat})
-            action_dims: list[dict[str, Any]] = []
+            episode_rows: list[dict[str, Any]] = []
             for seed in range(seeds):
                 env.reset(seed=seed)
-                action_dims += random_episodes(env, seed, episodes)
+                episode_rows += random_episodes(env, seed, episodes)
             env.close()
-            counted = summary(pd.DataFrame(action_dims), COUNTED)
+            counted = summary(pd.DataFrame(episode_rows), COUNTED)
             rows.append({"method": label(kind), "action_repeat": action_repeat, **counted})
-            for row in action_dims if action_repeat == HOLD else ():
+            for row in episode_rows if action_repeat == ACTION_REPEAT else ():
                 axis.plot(*row["measured"].T, ".", markersize=1.5, color=colour(kind), alpha=0.35)
     return {
-        **leave(out, "figure_4_4", figure, rows),
+        **save_results(out, "figure_4_4", figure, rows),
         **{
             f"{row['method']}, an action lasts {row['action_repeat']}": f"{row['success_rate']:.0%} succeed"
             for row in rows
@@ -190,7 +190,7 @@ COUNTED = (
 
 
 def figure_4_5(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Success, return and its two costs while learning."""
+    """Draw success, return and its two costs while learning."""
     rows = run_study(figure_study("narrow_passage", seeds=seeds, episodes=episodes), out)
     columns = {
         "success": "success",
@@ -200,23 +200,23 @@ def figure_4_5(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
     }
     figure, _ = learning_curves(rows, columns, (2, 2), (10, 7))
     return {
-        **leave(out, "figure_4_5", figure, rows),
-        **said(rows, {"training_success_rate": ("success of each seed", "{:.0%}")}),
-        "condition": f"an action lasts {HOLD} control steps, and walls do not let the robot slide; figure 4.4 "
+        **save_results(out, "figure_4_5", figure, rows),
+        **numbers_of_seeds(rows, {"training_success_rate": ("success of each seed", "{:.0%}")}),
+        "condition": f"an action lasts {ACTION_REPEAT} control steps, and walls do not let the robot slide; figure 4.4 "
         "shows the other case",
     }
 
 
 def figure_4_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Collisions with the walls and violations of the constraint, per episode of learning."""
+    """Draw wall collisions and constraint violations per training episode."""
     rows = run_study(figure_study("narrow_passage", seeds=seeds, episodes=episodes), out)
-    columns = {"collisions": "wall collisions per episode", "max_measured_violation": "worst violation [m]"}
+    columns = {"collisions": "wall collisions per episode", "max_measured_violation": "max. violation [m]"}
     figure, axes = learning_curves(rows, columns, (1, 2), (10, 4), window=1)
     axes[0, 1].axhline(0, color="firebrick", linewidth=0.8)
     counts = ["training_collisions", "training_measured_violating_episodes", "training_episodes"]
     total = rows.groupby("method", sort=False)[counts].sum()
     return {
-        **leave(out, "figure_4_6", figure, rows),
+        **save_results(out, "figure_4_6", figure, rows),
         **{
             label(kind): f"{collisions} collisions, {violating} episodes in the zone, of {number}"
             for kind, collisions, violating, number in total.itertuples()
@@ -225,39 +225,39 @@ def figure_4_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
 
 
 def figure_4_7(out: Path, seeds: int = 3, episodes: int = 30) -> dict[str, Any]:
-    """Return, obstacle cost and success over 30 episodes, where all that the policy sees is a picture."""
+    """Draw return, obstacle cost and success over 30 episodes with image observations."""
     study = figure_study(
         "narrow_passage",
         seeds=seeds,
         episodes=episodes,
         methods=["kgrl"],
-        env={"action_repeat": HOLD, "observation": "image"},
+        env={"action_repeat": ACTION_REPEAT, "observation": "image"},
         folder="runs/NarrowPassage/{method}-image-tqc_fast-{episodes}-{seed}",
     )
     rows = run_study(study, out)
     columns = {"return": "return", "reward_obstacle_cost": "obstacle cost", "success": "success"}
     figure, _ = learning_curves(rows, columns, (1, 3), (13, 3.8))
-    words = {
+    numbers = {
         "training_success_rate": ("success of each seed", "{:.0%}"),
         "training_avoids_obstacle_from": ("obstacle avoided from episode", "{}"),
     }
     return {
-        **leave(out, "figure_4_7", figure, rows),
-        **said(rows, words),
-        "condition": f"an action lasts {HOLD} control steps; pixels are averaged five by five",
+        **save_results(out, "figure_4_7", figure, rows),
+        **numbers_of_seeds(rows, numbers),
+        "condition": f"an action lasts {ACTION_REPEAT} control steps; pixels are averaged five by five",
     }
 
 
 def figure_4_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """KGRL: success, return, interaction force and episode length."""
+    """Draw success, return, contact force and episode length of KGRL at the connector."""
     rows = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes, methods=["kgrl"]), out)
     columns = {"success": "success", "return": "return", "mean_force": FORCE, "steps": "control steps"}
     figure, _ = learning_curves(rows, columns, (2, 2), (10, 7))
-    return {**leave(out, "figure_4_8", figure, rows), **said(rows, LEARNED), "condition": CONNECTOR}
+    return {**save_results(out, "figure_4_8", figure, rows), **numbers_of_seeds(rows, LEARNED), "condition": CONNECTOR}
 
 
 FORCE = "mean contact force [N]"
 LEARNED = {
-    "training_episodes_to_convergence": ("converged after episode", "{}"),
+    "training_episodes_to_convergence": ("episodes to convergence", "{}"),
     "success_rate": ("held-out success", "{:.0%}"),
 }

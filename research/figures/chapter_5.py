@@ -1,4 +1,4 @@
-"""Figures 5.2 to 5.10: how smoothly KGRL and sKGRL explore, and what they learn."""
+"""Figures 5.2 to 5.10: smoothness and learning of KGRL and sKGRL."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,27 +27,34 @@ from guiderail.tools.visualization.camera import draw_frames, record_frames
 from guiderail.tools.visualization.curves import draw_world
 from guiderail.tools.visualization.episode_spec import EpisodeSpec
 from guiderail.tools.visualization.style import colour, label, new_figure
-from research.figures.chapter_4 import CONNECTOR, FORCE, HOLD, LEARNED, TASK, figure_4_3, random_episodes
-from research.figures.runs import episodes_of, figure_study, learning_curves, leave, mean_of_last, said
+from research.figures.chapter_4 import ACTION_REPEAT, CONNECTOR, FORCE, LEARNED, TASK, figure_4_3, random_episodes
+from research.figures.runs import (
+    episodes_of,
+    figure_study,
+    learning_curves,
+    mean_of_last,
+    numbers_of_seeds,
+    save_results,
+)
 
 METHODS = ("kgrl", "skgrl")
-VARIANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # ρ, m²
-SHOWN = 1e-6  # ρ of the thesis
-HOLDS = (1, 5)  # control steps of an action: the thesis's, and what is learned with here
-EPISODES = 10  # tried at most, until one fails or succeeds as figure 5.7 shows
-# Where the robot is when it is pushed (y, m), and by how much in x (m). The last of each kind leads into the zone.
+VARIANCES = (1e-4, 1e-6, 1e-8, 1e-10)  # ρ [m²]
+THESIS_VARIANCE = 1e-6  # ρ of the thesis [m²]
+ACTION_REPEATS = (1, 5)  # control steps of an action: in the thesis, and here
+EPISODES = 10  # maximum number of episodes until one ends as figure 5.7 shows
+# Position in y at the push, and displacement in x [m]. The last push of each position leads into the zone.
 PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10), (0.20, 0.15), (0.78, 0.20))
 
 
-def primitive_of(kind: str, variance: float = SHOWN) -> LcNsKmp:
-    """The narrow passage's primitive, with a history for sKGRL."""
+def primitive_of(kind: str, variance: float = THESIS_VARIANCE) -> LcNsKmp:
+    """Return the primitive of the narrow passage, with a history for sKGRL."""
     skill = make_prior_knowledge("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
     assert skill is not None
     return skill.primitive(history=kind == "skgrl")
 
 
 def figure_5_2(out: Path) -> dict[str, Any]:
-    """Reference windows, modified windows and the executed path of one exploring motion, both with the same RMS."""
+    """Draw reference windows, modified windows and the executed path of an exploring motion at the same RMS."""
     figure, (axes,) = new_figure(1, 2, (11, 6))
     rows: list[dict[str, Any]] = []
     for axis, kind in zip(axes, ("kgrl", "skgrl"), strict=True):
@@ -62,7 +69,7 @@ def figure_5_2(out: Path) -> dict[str, Any]:
             axis.plot(*windows[n].T, color="tomato", linewidth=0.8, alpha=0.8)
         axis.plot(*executed[:300].T, color="firebrick", linewidth=1.6)
         axis.set(title=f"{label(kind)} exploration", xlim=(0.2, 0.65), ylim=(0.03, 0.5))
-        # Where the last window said the robot would go next, and where it was then sent.
+        # Distance between the next point of the last window and the executed point.
         jumps = np.linalg.norm(executed[1:] - np.array([window[1] for window in windows[:-1]]), axis=1)
         rows.append(
             {
@@ -75,13 +82,13 @@ def figure_5_2(out: Path) -> dict[str, Any]:
         )
     smaller = rows[0]["mean_jump_between_windows"] / rows[1]["mean_jump_between_windows"]
     return {
-        **leave(out, "figure_5_2", figure, rows),
+        **save_results(out, "figure_5_2", figure, rows),
         "sKGRL's mean jump from window to window is smaller by": f"{smaller:.0f} times, at the same RMS",
     }
 
 
 def _explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> tuple[range, list[np.ndarray], np.ndarray]:
-    """Uniformly random actions at every step: the modified windows (H+1, 2), and the executed motion (N, 2)."""
+    """Apply uniformly random actions; return steps, modified windows (H+1, 2) and executed motion (N, 2)."""
     random = np.random.default_rng(seed)
     steps = range(primitive.num_steps)
     past = [primitive.reference.means[0]] * primitive.history
@@ -96,12 +103,12 @@ def _explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> tuple[range, li
 
 
 def _quiet(primitive: LcNsKmp) -> np.ndarray:
-    """The same motion without actions."""
+    """Return the motion without actions, (N, 2)."""
     return _explore(primitive, np.zeros(primitive.num_outputs), 0)[2]
 
 
 def _draw_spread(axis: Axes, primitive: LcNsKmp) -> None:
-    """One and two standard deviations of the demonstrations in x."""
+    """Draw one and two standard deviations of the demonstrations in x."""
     means, deviation = primitive.reference.means, primitive.reference.standard_deviations[:, 0]
     for width in (1, 2):
         axis.fill_betweenx(
@@ -115,19 +122,19 @@ def _draw_spread(axis: Axes, primitive: LcNsKmp) -> None:
 
 
 def figure_5_3(out: Path) -> dict[str, Any]:
-    """The plane again."""
+    """Draw the narrow passage, as figure 4.3."""
     return figure_4_3(out, "figure_5_3")
 
 
 def figure_5_4(out: Path) -> dict[str, Any]:
-    """Pushes where demonstrations differ and where they agree, some of them into the restricted zone."""
+    """Draw recovery from pushes at points of large and small demonstration variance, also into the restricted zone."""
     env: Any = make_environment(
         TASK, {"guidance": "skgrl", "action_repeat": 1, "history": 1, "history_source": "measured"}
     )
     nominal, _, _ = _run(env, None)
     figure, ((plane, time),) = new_figure(1, 2, (11, 5.6))
     draw_world(plane)
-    plane.plot(*nominal.T, color="black", linewidth=1.4, label="not pushed")
+    plane.plot(*nominal.T, color="black", linewidth=1.4, label="no push")
     period = env.unwrapped.trace.period
     time.plot(period * np.arange(len(nominal)), nominal[:, 0], color="black")
     rows: list[dict[str, Any]] = []
@@ -149,9 +156,9 @@ def figure_5_4(out: Path) -> dict[str, Any]:
     plane.legend(frameon=False, fontsize=8, loc="upper left")
     half = {height: [row["steps_to_half"] for row in rows if row["y"] == height] for height in (0.20, 0.54)}
     return {
-        **leave(out, "figure_5_4", figure, rows),
+        **save_results(out, "figure_5_4", figure, rows),
         "all reach the goal": bool(all(row["success"] for row in rows)),
-        "worst commanded violation": max(row["max_commanded_violation"] for row in rows),
+        "max. commanded violation": max(row["max_commanded_violation"] for row in rows),
         "steps until half recovered, where demonstrations differ": str(half[0.20]),
         "steps until half recovered, in the passage": str(half[0.54]),
         "condition": "the history is the measured pose (P = 1), the action zero",
@@ -159,7 +166,7 @@ def figure_5_4(out: Path) -> dict[str, Any]:
 
 
 def _run(env: Any, push: tuple[int, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """One episode without actions, pushed just before a step: measured and commanded path, and its row."""
+    """Run an episode without actions and with a push; return measured and commanded path and its row."""
 
     def act(observation: np.ndarray) -> np.ndarray:
         if push is not None and len(env.unwrapped.trace) == push[0]:
@@ -179,12 +186,12 @@ def _recovery(
     commanded: np.ndarray,
     row: dict[str, Any],
 ) -> dict[str, Any]:
-    """How fast, and how safely, the robot is back on its course."""
+    """Return the speed and the safety of the recovery from a push."""
     length = min(len(nominal), len(path))
-    away = np.abs(path[step:length, 0] - nominal[step:length, 0])
+    deviation = np.abs(path[step:length, 0] - nominal[step:length, 0])
 
     def steps_until(share: float) -> int | None:
-        below = np.flatnonzero(away < share * abs(push))
+        below = np.flatnonzero(deviation < share * abs(push))
         return int(below[0]) + 1 if len(below) else None
 
     return {
@@ -202,31 +209,39 @@ def _recovery(
 
 
 def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
-    """One motion of KGRL and five of sKGRL; jerk at the same exploration RMS over ρ, commanded and measured.
+    """Draw a motion of KGRL and five of sKGRL, and the ratio of jerks at the same exploration RMS over ρ.
 
     Args:
-        out: the folder.
-        seeds: of the random actions.
-        episodes: of each seed.
+        out: Folder.
+        seeds: Number of seeds of the random actions.
+        episodes: Episodes of each seed.
     """
     figure, (axes,) = new_figure(1, 3, (14, 5.4))
     rows: list[dict[str, Any]] = []
-    for action_repeat in HOLDS:
-        rough = _smoothness("kgrl", SHOWN, action_repeat, _wander("kgrl", SHOWN, action_repeat, range(seeds), episodes))
+    for action_repeat in ACTION_REPEATS:
+        rough = _smoothness(
+            "kgrl",
+            THESIS_VARIANCE,
+            action_repeat,
+            _explore_in_simulation("kgrl", THESIS_VARIANCE, action_repeat, range(seeds), episodes),
+        )
         rows.append(rough | {"times_below_kgrl_commanded": 1.0, "times_below_kgrl_measured": 1.0})
         for variance in VARIANCES:
             row = _smoothness(
-                "skgrl", variance, action_repeat, _wander("skgrl", variance, action_repeat, range(seeds), episodes)
+                "skgrl",
+                variance,
+                action_repeat,
+                _explore_in_simulation("skgrl", variance, action_repeat, range(seeds), episodes),
             )
             for column in ("commanded", "measured"):
                 row[f"times_below_kgrl_{column}"] = rough[f"jerk_{column}"] / row[f"jerk_{column}"]
             rows.append(row)
     for axis, kind, count, words in ((axes[0], "kgrl", 1, "one motion"), (axes[1], "skgrl", 5, "five motions")):
         draw_world(axis)
-        for row in _wander(kind, SHOWN, HOLDS[0], range(1), count):
+        for row in _explore_in_simulation(kind, THESIS_VARIANCE, ACTION_REPEATS[0], range(1), count):
             axis.plot(*row["commanded"].T, linewidth=1, color=colour(kind) if count == 1 else None)
         axis.set_title(f"{label(kind)}, {words}")
-    for action_repeat, shade in zip(HOLDS, ("tab:blue", "tab:orange"), strict=True):
+    for action_repeat, shade in zip(ACTION_REPEATS, ("tab:blue", "tab:orange"), strict=True):
         for column, style in (("commanded", "o-"), ("measured", "x--")):
             times = [
                 row[f"times_below_kgrl_{column}"]
@@ -239,33 +254,33 @@ def figure_5_5(out: Path, seeds: int = 3, episodes: int = 5) -> dict[str, Any]:
     axes[2].set(xlabel="history variance ρ [m²]", ylabel="KGRL's mean jerk / sKGRL's, at the same exploration RMS")
     axes[2].legend(frameon=False, fontsize=8)
     return {
-        **leave(out, "figure_5_5", figure, rows),
+        **save_results(out, "figure_5_5", figure, rows),
         **{
-            f"jerk below KGRL's at ρ = {row['history_variance']:.0e}, action held {row['action_repeat']}": (
+            f"jerk below KGRL's at ρ = {row['history_variance']:.0e}, action repeat {row['action_repeat']}": (
                 f"{row['times_below_kgrl_commanded']:.0f} times commanded, "
                 f"{row['times_below_kgrl_measured']:.0f} times measured"
             )
             for row in rows
             if row["method"] != "KGRL"
         },
-        "condition": "gains give every method the same RMS for its hold, one demonstration deviation",
+        "condition": "gains give every method an RMS of one demonstration deviation at its action repeat",
     }
 
 
-def _wander(
+def _explore_in_simulation(
     kind: str, variance: float, action_repeat: int, seeds: Sequence[int], episodes: int
 ) -> list[dict[str, Any]]:
-    """Episodes of random actions in the simulated plane, gains calibrated to an RMS of one standard deviation."""
+    """Run episodes of random actions, with gains calibrated to an RMS of one standard deviation."""
     gains = tuple(rms_gains(primitive_of(kind, variance), action_repeat=action_repeat).tolist())
     arguments = {"guidance": kind, "action_repeat": action_repeat, "history_variance": variance, "gains": gains}
     env = make_environment(TASK, arguments)
-    action_dims = [row for seed in seeds for row in random_episodes(env, seed, episodes)]
+    episode_rows = [row for seed in seeds for row in random_episodes(env, seed, episodes)]
     env.close()
-    return action_dims
+    return episode_rows
 
 
-def _smoothness(kind: str, variance: float, action_repeat: int, action_dims: list[dict[str, Any]]) -> dict[str, Any]:
-    primitive, rows = primitive_of(kind, variance), pd.DataFrame(action_dims)
+def _smoothness(kind: str, variance: float, action_repeat: int, episode_rows: list[dict[str, Any]]) -> dict[str, Any]:
+    primitive, rows = primitive_of(kind, variance), pd.DataFrame(episode_rows)
     quiet = _quiet(primitive)
     deviation = np.sqrt((primitive.reference.standard_deviations**2).mean(0))
     moved = [((path - quiet[: len(path)]) / deviation) ** 2 for path in rows["commanded"]]
@@ -281,15 +296,15 @@ def _smoothness(kind: str, variance: float, action_repeat: int, action_dims: lis
 
 
 def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Return and its two costs, and jerk while learning.
+    """Draw return, its two costs, and jerk while learning.
 
-    Drawn for runs whose first ten episodes each keep to one random action; the table also has those that explore anew
-    at every decision, as sKGRL then depends on the seed.
+    The runs in the picture repeat one random action in each of the first ten episodes. The table also has runs with
+    a new random action at every step, with which the success of sKGRL depends on the seed.
     """
     groups = {}
     for words, preset in (
         ("first ten episodes constant", "tqc_cheap_correlated"),
-        ("exploring anew at every decision", "tqc_fast"),
+        ("a new action at every step", "tqc_fast"),
     ):
         study = figure_study(
             "narrow_passage",
@@ -297,7 +312,7 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
             episodes=episodes,
             methods=METHODS,
             learner=LearnerChoice(preset=preset, episodes=60),
-            folder=f"runs/NarrowPassage/{{method}}-hold-5-observation-state-{preset}-{{episodes}}-{{seed}}",
+            folder=f"runs/NarrowPassage/{{method}}-state-{preset}-{{episodes}}-{{seed}}",
         )
         groups[words] = run_study(study, out)
     columns = {
@@ -308,60 +323,62 @@ def figure_5_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
     }
     figure, axes = learning_curves(next(iter(groups.values())), columns, (2, 2), (10, 7))
     axes[1, 1].set_yscale("log")
-    found: dict[str, Any] = {}
-    for words, rows in groups.items():
+    result: dict[str, Any] = {}
+    for exploration, rows in groups.items():
         for kind in METHODS:
             avoided = each(rows[rows["method"] == kind], "training_avoids_obstacle_from")
-            found[f"{label(kind)}, {words}: obstacle avoided from episode"] = avoided
-            found[f"{label(kind)}, {words}: return of the last ten"] = mean_of_last(rows, kind, "return")
-            found[f"{label(kind)}, {words}: action cost"] = mean_of_last(rows, kind, "reward_action_cost")
+            result[f"{label(kind)}, {exploration}: obstacle avoided from episode"] = avoided
+            result[f"{label(kind)}, {exploration}: return of the last ten"] = mean_of_last(rows, kind, "return")
+            result[f"{label(kind)}, {exploration}: action cost"] = mean_of_last(rows, kind, "reward_action_cost")
         kgrl, skgrl = (mean_of_last(rows, kind, "return") for kind in METHODS)
         higher = "yes" if skgrl > kgrl else "no, not here"
-        found[f"sKGRL has the higher return, as in the thesis ({words})"] = higher
+        result[f"sKGRL has the higher return, as in the thesis ({exploration})"] = higher
     return {
-        **leave(out, "figure_5_6", figure, pd.concat([t.assign(exploration=words) for words, t in groups.items()])),
-        **found,
-        "condition": f"an action lasts {HOLD} control steps; the obstacle's cost is part of the return",
+        **save_results(
+            out, "figure_5_6", figure, pd.concat([t.assign(exploration=words) for words, t in groups.items()])
+        ),
+        **result,
+        "condition": f"an action lasts {ACTION_REPEAT} control steps; the obstacle's cost is part of the return",
     }
 
 
 def figure_5_7(out: Path, episodes: int | None = None) -> dict[str, Any]:
-    """sKGRL at the connector: an episode before anything is learned, that fails, and one after; four moments each."""
+    """Render four moments of a failing episode before learning and of a successful one after it (sKGRL, connector)."""
     found = run_study(
-        figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], judged=False), out
+        figure_study("connector_figures", seeds=1, episodes=episodes, methods=["skgrl"], evaluate=False), out
     )
     learned = EpisodeSpec.of_run(Path(found["folder"].iloc[0]))
     unlearned = replace(learned, policy=partial(BaselinePolicy, uniform_random), acting="before learning")
     figure, axes = new_figure(2, 4, (13, 6.2))
     rows = []
-    for shown, panels, letter in ((unlearned, axes[0], "A"), (learned, axes[1], "B")):
-        row, frames = record_frames(_first(shown, success=shown is learned), len(panels))
+    for spec, panels, letter in ((unlearned, axes[0], "A"), (learned, axes[1], "B")):
+        row, frames = record_frames(_first(spec, success=spec is learned), len(panels))
         draw_frames(panels, frames, letter)
-        kept = ("success", "termination", "steps", "peak_force", "max_commanded_violation")
-        rows.append({"episode": shown.acting} | {key: row[key] for key in kept})
+        columns = ("success", "termination", "steps", "peak_force", "max_commanded_violation")
+        rows.append({"episode": spec.acting} | {key: row[key] for key in columns})
     return {
-        **leave(out, "figure_5_7", figure, rows),
+        **save_results(out, "figure_5_7", figure, rows),
         **{f"{row['episode']}, the episode ends in": row["termination"] for row in rows},
         "condition": CONNECTOR,
     }
 
 
-def _first(shown: EpisodeSpec, *, success: bool) -> EpisodeSpec:
-    """The first held-out episode that ends as is meant: white actions find the hole now and then. Nothing is drawn."""
-    env = make_environment(shown.task, shown.environment)
-    env.reset(seed=shown.run_seed)
+def _first(spec: EpisodeSpec, *, success: bool) -> EpisodeSpec:
+    """Return the first held-out episode with the given success. Random actions sometimes succeed as well."""
+    env = make_environment(spec.task, spec.environment)
+    env.reset(seed=spec.run_seed)
     try:
         for k in range(EPISODES):
-            act = shown.policy(env)  # anew, as where it is shown: who acts at random goes on in his stream otherwise
-            if bool(rollout(env, act, seed=shown.seed + k, held_out=True)["success"]) == success:
-                return replace(shown, seed=shown.seed + k)
+            act = spec.policy(env)  # a new random stream, as in the rendered episode
+            if bool(rollout(env, act, seed=spec.seed + k, held_out=True)["success"]) == success:
+                return replace(spec, seed=spec.seed + k)
     finally:
         env.close()
-    raise InputError(f"{EPISODES} episodes {shown.acting} all ended alike: take more --episodes")
+    raise InputError(f"{EPISODES} episodes {spec.acting} all ended alike: take more --episodes")
 
 
 def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
-    """Where exploring motions go: x and y over time, commanded and measured."""
+    """Draw x and y of exploring motions over time, commanded and measured."""
     figure, axes = new_figure(2, 2, (11, 6.4))
     rows: list[dict[str, Any]] = []
     for index, kind in enumerate(METHODS):
@@ -385,23 +402,23 @@ def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:
             axis.axhline(bound, color="firebrick", linewidth=0.8)
         axis.set_ylim(-1.2e3 * ALIGNMENT, 1.2e3 * ALIGNMENT)
     return {
-        **leave(out, "figure_5_8", figure, rows),
+        **save_results(out, "figure_5_8", figure, rows),
         "demonstrations": len(bnc_connector.load().outputs),
-        "condition": "random actions in x and y, held ten control steps, gains calibrated by authority",
+        "condition": "random actions in x and y for ten control steps, gains calibrated by authority",
     }
 
 
 def figure_5_9(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Success and return of both while learning, and held-out success afterwards."""
+    """Draw success and return of KGRL and sKGRL while learning; the numbers have the held-out success."""
     rows = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes), out)
     columns = {"success": "success", "return": "return", "mean_force": FORCE}
     figure, _ = learning_curves(rows, columns, (1, 3), (13, 4))
-    return {**leave(out, "figure_5_9", figure, rows), **said(rows, LEARNED), "condition": CONNECTOR}
+    return {**save_results(out, "figure_5_9", figure, rows), **numbers_of_seeds(rows, LEARNED), "condition": CONNECTOR}
 
 
 def figure_5_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Mean jerk of the first ten training episodes, linear and angular, commanded and measured."""
-    found = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes, judged=False), out)
+    """Draw the mean jerk of the first ten training episodes, linear and angular, commanded and measured."""
+    found = run_study(figure_study("connector_figures", seeds=seeds, episodes=episodes, evaluate=False), out)
     figure, (axes,) = new_figure(1, 2, (10, 4.4))
     rows: list[dict[str, Any]] = []
     for axis, part, unit in zip(axes, ("linear", "angular"), ("m/s³", "rad/s³"), strict=True):
@@ -417,7 +434,7 @@ def figure_5_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[
         axis.set(yscale="log", ylabel=f"mean {part} jerk [{unit}]")
     median = {(row["part"], row["which"], row["method"]): row["median"] for row in rows}
     return {
-        **leave(out, "figure_5_10", figure, rows),
+        **save_results(out, "figure_5_10", figure, rows),
         **{
             f"sKGRL's {part} jerk below KGRL's, {which}": (
                 f"{median[part, which, 'kgrl'] / max(median[part, which, 'skgrl'], 1e-12):.1f} times"
@@ -426,6 +443,6 @@ def figure_5_10(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[
             for which in ("commanded", "measured")
         },
         "condition": CONNECTOR
-        + "; each of the first eight episodes keeps to one action, which is smooth through either; gains calibrated by "
-        "authority, not by RMS (figure 5.5 and the study smoothness compare white actions at the same RMS)",
+        + "; each of the first eight episodes repeats one action, which is smooth with both; gains calibrated by "
+        "authority, not by RMS (figure 5.5 and research.smoothness compare random actions at the same RMS)",
     }

@@ -1,4 +1,4 @@
-"""What figures about learning share: their studies' runs, and how those are drawn."""
+"""Runs and learning curves of the figures that train."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,36 +23,36 @@ def figure_study(
     seeds: int,
     episodes: int | None = None,
     methods: Sequence[str] | None = None,
-    judged: bool = True,
-    **changed: Any,
+    evaluate: bool = True,
+    **changes: Any,
 ) -> Study:
-    """A study that comes along, as a figure asks for it.
+    """Return a shipped study with the changes that a figure needs.
 
     Args:
-        name: of the study.
-        seeds: how many, from the study's first.
-        episodes: of each run; the study's own number unless given.
-        methods: those of the study unless given; ones that it doesn't have are guidance of that name.
-        judged: whether its policies are judged.
-        changed: other fields.
+        name: Name of the study.
+        seeds: Number of seeds, from the study's first.
+        episodes: Episodes of each run; the study's own number by default.
+        methods: Methods; those of the study by default. A method that it lacks is guidance of that name.
+        evaluate: Whether its policies are evaluated.
+        changes: Other fields of the study.
     """
     study = load_study(study_path(name))
     first = study.seeds[0]
     known = {m: study.methods.get(m, Method(env={"guidance": m})) for m in methods or study.methods}
     if episodes is not None:
         known = {m: one.model_copy(update={"learner": LearnerChoice()}) for m, one in known.items()}
-        changed["learner"] = changed.get("learner", study.learner).model_copy(update={"episodes": episodes})
-    changed |= {} if judged else {"eval_set": ()}
-    return study.model_copy(update={"methods": known, "seeds": tuple(range(first, first + seeds)), **changed})
+        changes["learner"] = changes.get("learner", study.learner).model_copy(update={"episodes": episodes})
+    changes |= {} if evaluate else {"eval_set": ()}
+    return study.model_copy(update={"methods": known, "seeds": tuple(range(first, first + seeds)), **changes})
 
 
 def episodes_of(rows: pd.DataFrame, method: str) -> list[pd.DataFrame]:
-    """The training episodes of every run of one method."""
+    """Return the training episodes of every run of one method."""
     return [RunFolder(Path(folder)).episodes() for folder in rows[rows["method"] == method]["folder"]]
 
 
 def mean_of_last(rows: pd.DataFrame, method: str, column: str, episodes: int = 10) -> float:
-    """The mean over seeds and the last episodes."""
+    """Return the mean of a column over seeds and the last episodes."""
     return float(np.mean([run[column].tail(episodes) for run in episodes_of(rows, method)]))
 
 
@@ -65,30 +65,30 @@ def learning_curves(
     lines: Mapping[str, tuple[str, str]] | None = None,
     window: int = 5,
 ) -> tuple[Figure, np.ndarray]:
-    """A panel for each column of `episodes.csv` (name → label), a curve a method: the mean over seeds and their range.
+    """Draw a panel for each column of `episodes.csv`, with a curve for each method: mean and range over seeds.
 
     Args:
-        rows: of the study.
-        columns: what is drawn.
-        shape: of the panels.
-        size: of the figure, inches.
-        lines: a label and a colour for each method; those of its guidance unless given.
-        window: episodes that a point averages.
+        rows: Rows of the study's table.
+        columns: Label of each column.
+        shape: Rows and columns of panels.
+        size: Size of the figure [inches].
+        lines: Label and colour of each method; those of its guidance by default.
+        window: Number of episodes that a point averages.
     """
     lines = lines or {method: (label(method), colour(method)) for method in dict.fromkeys(rows["method"])}
     figure, axes = new_figure(*shape, size)
     runs = {method: episodes_of(rows, method) for method in lines}
-    for axis, (column, words) in zip(axes.flat, columns.items(), strict=True):
+    for axis, (column, axis_label) in zip(axes.flat, columns.items(), strict=True):
         for method, (name, shade) in lines.items():
             draw_runs(axis, [run[column] for run in runs[method]], colour=shade, label=name, window=window)
-        axis.set(xlabel="episode", ylabel=words)
+        axis.set(xlabel="episode", ylabel=axis_label)
     if len(lines) > 1:
         legend(figure, axes.flat[0])
     return figure, axes
 
 
-def leave(out: Path, name: str, figure: Figure, rows: Any) -> dict[str, Any]:
-    """Writes a figure's picture and the table behind it; says where."""
+def save_results(out: Path, name: str, figure: Figure, rows: Any) -> dict[str, Any]:
+    """Write a figure's picture and table; return their paths."""
     table = pd.DataFrame(rows, dtype=object).drop(columns="folder", errors="ignore")
     return {
         "picture": str(save_figure(figure, out / f"{name}.png")),
@@ -96,13 +96,13 @@ def leave(out: Path, name: str, figure: Figure, rows: Any) -> dict[str, Any]:
     }
 
 
-def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], measured_with: Sequence[str]) -> dict[str, Any]:
-    """A table of learners' settings: the thesis's beside its preset's, and what was measured with here.
+def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], presets: Sequence[str]) -> dict[str, Any]:
+    """Write a table of learner settings: the thesis's, those of its presets, and further presets.
 
     Args:
-        path: of the table, without its ending.
-        thesis: its values by preset and setting.
-        measured_with: further presets.
+        path: Path of the table, without its ending.
+        thesis: Values of the thesis by preset and setting.
+        presets: Names of further presets.
     """
     settings = dict.fromkeys(name for values in thesis.values() for name in values)
     rows = []
@@ -110,7 +110,7 @@ def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], measured
         row: dict[str, Any] = {"setting": name.replace("_", " ")}
         for preset, values in thesis.items():
             row |= {f"thesis, {preset}": values.get(name), preset: getattr(PRESETS[preset], name)}
-        rows.append(row | {preset: getattr(PRESETS[preset], name) for preset in measured_with})
+        rows.append(row | {preset: getattr(PRESETS[preset], name) for preset in presets})
     other = [
         f"{preset}: {name} {getattr(PRESETS[preset], name)}, not {value}"
         for preset, values in thesis.items()
@@ -123,11 +123,19 @@ def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], measured
     }
 
 
-def said(rows: pd.DataFrame, columns: Mapping[str, tuple[str, str]], names: Mapping[str, str] | None = None) -> dict:
-    """Each seed's own numbers: column → words and format; `names` are what to call the methods."""
-    found = {}
+def numbers_of_seeds(
+    rows: pd.DataFrame, columns: Mapping[str, tuple[str, str]], names: Mapping[str, str] | None = None
+) -> dict:
+    """Return the numbers of each seed as text, by method and column.
+
+    Args:
+        rows: Rows of the study's table.
+        columns: Label and number format of each column.
+        names: Names of the methods; the labels of their guidance by default.
+    """
+    numbers = {}
     for method, group in rows.groupby("method", sort=False):
         name = label(str(method)) if names is None else names[str(method)]
-        for column, (words, form) in columns.items():
-            found[f"{name}, {words}"] = each(group, column, form)
-    return found
+        for column, (column_label, form) in columns.items():
+            numbers[f"{name}, {column_label}"] = each(group, column, form)
+    return numbers

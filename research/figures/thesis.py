@@ -1,4 +1,4 @@
-"""What the thesis says of each figure and table, in few words: it is printed beside what comes out here."""
+"""Summary of the thesis's result in each figure and table, which is printed with the reproduced one."""
 
 THESIS = {
     "2.2": "three states, Translational, Tilt and Pour; three inputs",
@@ -34,7 +34,7 @@ THESIS = {
     "table 4.1": "TQC in simulation and on the real robot",
 }
 
-# Hyperparameters by the preset that holds them; `discount` is of a decision, which lasts one control step there.
+# Settings by preset. An action lasts one control step there, so that gamma is that of a control step.
 TABLE_3_2 = {
     "table_3_2_iiwa": {
         "learning_rate": 8e-4, "buffer_size": 1_000_000, "gamma": 0.95, "tau": 0.02, "train_freq": 8,

@@ -1,4 +1,4 @@
-"""Records the BNC connector's demonstrations in simulation, those that insert and those that search."""
+"""Recording of the connector's demonstrations in simulation: insertion and search."""
 
 from __future__ import annotations
 
@@ -20,13 +20,17 @@ from guiderail.models.objects.bnc_connector.demonstrations import NAMES, NUM_STE
 from guiderail.systems.recorder import Recording
 
 TIMES = CONTROL_PERIOD * np.arange(NUM_STEPS + 1)
-# [s] with which the demonstrations in this package were recorded.
-TIME_STEP = CONTROL_PERIOD / 4
+TIME_STEP = CONTROL_PERIOD / 4  # time step of the shipped demonstrations [s]
 
 
 @dataclass(frozen=True)
 class Session:
-    """What is demonstrated, and where it is kept."""
+    """Set of demonstrated motions.
+
+    Attributes:
+        motions: Returns the motions, (M, N, 6), of a seed and times, (N,).
+        path: File of the shipped recording.
+    """
 
     motions: Callable[[int, np.ndarray], np.ndarray]
     path: Path
@@ -37,20 +41,20 @@ SEARCH_SESSION = Session(bnc_search.demonstrator_motions, bnc_search.PATH)
 
 
 def record_one(motion: np.ndarray) -> tuple[Recording, bool]:
-    """One motion (N, 6) through the rails' impedance, and whether the plug was locked in the end."""
+    """Drive a motion, (N, 6), through the gantry's impedance; return the recording and whether the plug is locked."""
     workcell = BncWorkcell()
     driven, recording = drive_along(GantryStation(workcell, time_step=TIME_STEP), TIMES, motion)
     return recording, workcell.is_locked(workcell.plug_in_locked_frame(driven.station.plant, driven.plant_context))
 
 
 def record_session(session: Session, seed: int) -> list[Recording] | None:
-    """All demonstrations of a session; None if one of them doesn't end locked."""
+    """Record all demonstrations of a session; return None if one of them does not end locked."""
     recorded = [record_one(motion) for motion in session.motions(seed, TIMES)]
     return [recording for recording, _ in recorded] if all(is_locked for _, is_locked in recorded) else None
 
 
 def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
-    """The arrays of the demonstrations' file: the first session in which every demonstration ends locked."""
+    """Return the arrays of the first session in which every demonstration ends locked."""
     for seed in seeds:
         if (recordings := record_session(session, seed)) is not None:
             break
@@ -64,18 +68,18 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
         "times": recordings[0].times,
         "outputs": stacked("desired_pose"),
         "names": np.array(NAMES),
-        # What was measured is kept to single precision: a nanometre.
+        # Measured values are stored in single precision, a nanometre.
         "measured": stacked("pose").astype(np.float32),
         "wrench": stacked("wrench").astype(np.float32),
         "contact_force": stacked("contact_force")[..., 0].astype(np.float32),
         "seed": np.array(seed),
         "stiffness": np.array(Impedance().stiffness),
         "frame": np.array("T: the locked plug on the nominal jack; [x y z Rz Ry Rx], R = Rz Ry Rx"),
-        "source": np.array("scripted demonstrator on the rails station, through its impedance; outputs are commands"),
+        "source": np.array("scripted motion on the gantry station, through its impedance; outputs are commands"),
     }
 
 
 def main(folder: Path | None = None, session: Session = INSERT_SESSION) -> None:
-    """Writes the file of a session into a folder, its own unless given."""
+    """Write the file of a session into a folder; that of the package by default."""
     arrays: dict[str, Any] = record(session, range(100))
     np.savez_compressed((folder or session.path.parent) / session.path.name, **arrays)

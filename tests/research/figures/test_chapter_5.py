@@ -1,4 +1,4 @@
-"""What a figure shows is what it says."""
+"""The selection of episodes of figure 5.7."""
 
 import numpy as np
 import pytest
@@ -12,26 +12,26 @@ from research.figures.chapter_5 import _first
 
 
 def sometimes(rng, size):
-    """One action an episode, to the goal or away from it."""
+    """Return a policy with one action per episode, to the goal or away from it."""
     action = np.full(size, rng.choice([-1.0, 1.0]))
     return lambda observation: action
 
 
-def acting(seed):
+def random_spec(seed):
     return EpisodeSpec("Bead", {}, lambda env: BaselinePolicy(sometimes, env, seed=seed), "at random", "", seed=5)
 
 
 @pytest.mark.parametrize("success", [True, False])
-def test_the_first_episode_that_ends_so_ends_so_where_it_is_shown(success):
-    found = _first(acting(seed=3), success=success)
-    env = make_environment(found.task, found.environment)
-    env.reset(seed=found.run_seed)
-    row = rollout(env, found.policy(env), seed=found.seed, held_out=True)
+def test_selected_episode_ends_as_requested_when_repeated(success):
+    selected = _first(random_spec(seed=3), success=success)
+    env = make_environment(selected.task, selected.environment)
+    env.reset(seed=selected.run_seed)
+    row = rollout(env, selected.policy(env), seed=selected.seed, held_out=True)
     env.close()
     assert bool(row["success"]) == success
 
 
-def test_an_episode_that_only_who_goes_on_would_have_is_none():
-    """Whoever acts at random begins anew where he is shown: with this seed, away from the goal."""
+def test_selection_uses_a_new_random_stream_per_episode():
+    """With this seed the first action of a new stream leads away from the goal."""
     with pytest.raises(InputError, match="all ended alike"):
-        _first(acting(seed=6), success=True)
+        _first(random_spec(seed=6), success=True)

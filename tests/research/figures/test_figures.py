@@ -1,3 +1,5 @@
+"""The figures of the thesis."""
+
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +24,12 @@ def test_every_figure_has_a_function(figure):
     assert callable(find_figure(figure))
 
 
-def test_every_figure_says_what_the_thesis_says():
+def test_every_figure_has_the_result_of_the_thesis():
     assert set(THESIS) == set(FIGURES)
 
 
 @pytest.mark.parametrize("figure", ["2.2", "3.4", "5.3", "table 3.2", "table 4.1"])
-def test_a_figure_that_needs_no_learning_is_a_picture_or_a_table(figure, tmp_path):
+def test_figure_without_learning_is_a_picture_or_a_table(figure, tmp_path):
     result = reproduce(figure, out=tmp_path)
     assert result["the thesis"] == THESIS[figure]
     if "table" in figure:
@@ -37,19 +39,19 @@ def test_a_figure_that_needs_no_learning_is_a_picture_or_a_table(figure, tmp_pat
         assert Path(result["picture"]).stat().st_size > 10_000
 
 
-def test_a_camera_projects_where_it_looks():
+def test_camera_projects_its_target_to_the_center():
     camera = Camera((640, 480), np.pi / 2, look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3)))
-    there = camera.project(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]]))
-    np.testing.assert_allclose(there, [[320.0, 240.0], [560.0, 240.0], [320.0, 0.0]], atol=1e-9)
+    points = camera.project(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 0.0, 2.0]]))
+    np.testing.assert_allclose(points, [[320.0, 240.0], [560.0, 240.0], [320.0, 0.0]], atol=1e-9)
 
 
-def test_figure_4_2_shows_a_primitive_that_keeps_its_constraints(tmp_path):
+def test_figure_4_2_satisfies_the_constraints(tmp_path):
     result = reproduce("4.2", out=tmp_path)
     rows = read_table(tmp_path / "figure_4_2.csv")
     assert rows["max_commanded_violation"].max() <= 1e-9
     once = rows[rows["panel"].str.startswith("A2")]
     assert (once["max_commanded_violation"] > -1e-9).any()
-    # One action changes the motion nearby: half a second away it is not a sixth of what it is there.
+    # One action changes the motion locally: half a second away less than a sixth as much.
     assert (once[MOVED_ELSEWHERE] < once["moved_at_3.2_s"] / 6).all()
     assert (once[MOVED_ELSEWHERE] > 0.0).all()
     assert (rows.loc[~rows.index.isin(once.index), MOVED_ELSEWHERE] > 0.05).all()
@@ -57,7 +59,7 @@ def test_figure_4_2_shows_a_primitive_that_keeps_its_constraints(tmp_path):
     assert (tmp_path / "figure_4_2.png").stat().st_size > 10_000
 
 
-def test_figure_5_4_shows_that_pushes_are_recovered_from(tmp_path):
+def test_figure_5_4_recovers_from_pushes(tmp_path):
     reproduce("5.4", out=tmp_path)
     rows = read_table(tmp_path / "figure_5_4.csv")
     assert rows["success"].all()
@@ -68,7 +70,7 @@ def test_figure_5_4_shows_that_pushes_are_recovered_from(tmp_path):
 
 
 def finished(out, study, method, seed, endings):
-    """A run of a study that is there already, by how its episodes ended."""
+    """Write a finished run of a study with the given endings of episodes."""
     words = {"s": "success", "p": "spill", "c": "collision", "t": "time_limit"}
     learner = study.learner.model_copy(update={"episodes": len(endings)})
     methods = {method: study.methods[method].model_copy(update={"learner": type(learner)()})}
@@ -88,7 +90,7 @@ def finished(out, study, method, seed, endings):
     Policy([layer], {"format": FORMAT, **limits}).save(job.folder.path)
 
 
-def test_the_figures_are_drawn_from_the_studys_runs_and_from_every_seed_there_is(tmp_path):
+def test_pouring_figures_use_every_finished_seed(tmp_path):
     for algorithm in ("sac", "tqc"):
         study = load_study(study_path(f"pouring_{algorithm}"))
         for method in METHODS:
@@ -97,16 +99,16 @@ def test_the_figures_are_drawn_from_the_studys_runs_and_from_every_seed_there_is
         finished(tmp_path, study, "rl_sct_shaped", study.seeds[0] + 3, "s" * 12)
     for figure in ("3.5", "3.6", "table 3.3"):
         result = reproduce(figure, seeds=1, episodes=12, out=tmp_path)
-        assert result["RL-SCT-Shaped, converged after episode"] == "2, 0"
-        assert result["RL-Shaped, converged after episode"] == "never"
+        assert result["RL-SCT-Shaped, episodes to convergence"] == "2, 0"
+        assert result["RL-Shaped, episodes to convergence"] == "never"
         assert result["RL-Shaped, episodes that ended in a collision"] == "10"
         assert (tmp_path / f"{'table_3_3' if 'table' in figure else 'figure_' + figure.replace('.', '_')}.png").exists()
-    assert reproduce("3.8", seeds=1, episodes=12, out=tmp_path)["tqc, RL-SCT-Sparse, converged after episode"] == "2"
+    assert reproduce("3.8", seeds=1, episodes=12, out=tmp_path)["tqc, RL-SCT-Sparse, episodes to convergence"] == "2"
     table = (tmp_path / "table_3_3.md").read_text()
-    assert all(word in table for word in ("translational", "tilt", "pour", "TiltTowards", "15 a metre"))
+    assert all(word in table for word in ("translational", "tilt", "pour", "TiltTowards", "15 per metre"))
 
 
-def test_the_force_of_the_grid_clamp_is_compared_seed_by_seed(tmp_path):
+def test_grid_clamp_figure_has_the_force_of_each_seed(tmp_path):
     study = load_study(study_path("grid_clamp_figures"))
     for method in study.methods:
         finished(tmp_path, study, method, 0, "t" + "s" * 11)

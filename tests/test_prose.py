@@ -1,0 +1,123 @@
+"""Prose of docstrings, comments, help texts and pages."""
+
+import ast
+import io
+import re
+import subprocess
+import tokenize
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FRAGMENT = re.compile(r"(Of|What|How|Where|Whether|Who|Whoever|That)\b(?![^.]*\?)")  # a question is no fragment
+WORD = re.compile(r"\b(whoever|nobody|somebody|anew)\b", re.IGNORECASE)
+# Folders and files that are checked.
+CHECKED = (
+    "CONTRIBUTING.md",
+    "README.md",
+    "diagrams/hardware/",
+    "docs/bibliography.md",
+    "docs/concepts/",
+    "docs/glossary.md",
+    "docs/index.md",
+    "docs/results",
+    "docs/robot.md",
+    "docs/start.md",
+    "docs/tasks/",
+    "docs/tutorials/",
+    "docs/use.md",
+    "models/primitives/",
+    "models/templates/",
+    "research/",
+    "src/",
+    "systems/",
+    "tests/research/",
+    "tests/test_",
+    "tools/cli/",
+    "tools/learning/",
+)
+# Calls whose text arguments are shown as help.
+HELP_CALLS = {"Option", "Argument", "add_argument", "Field", "opt", "arg"}
+NOT_CHECKED = ("tests/test_prose.py", "CHANGELOG.md", "docs/changelog.md")
+
+
+def tracked(*endings):
+    """Return the checked files of git with one of the endings."""
+    names = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split("\0")
+    files = [ROOT / name for name in names if name.endswith(endings) and name.startswith(CHECKED)]
+    return [path for path in files if path.is_file() and str(path.relative_to(ROOT)) not in NOT_CHECKED]
+
+
+def docstrings(tree):
+    """Yield line and text of every docstring."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            text = ast.get_docstring(node)
+            if text:
+                yield node.body[0].lineno, text
+
+
+def help_texts(tree):
+    """Yield line and text of the string arguments of calls that declare options."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) in HELP_CALLS:
+            for argument in [*node.args, *(keyword.value for keyword in node.keywords)]:
+                if isinstance(argument, ast.Constant) and isinstance(argument.value, str):
+                    yield argument.lineno, argument.value
+
+
+def comments(source):
+    """Yield line and text of every comment."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
+
+
+def report(violations):
+    """Return a message that counts and lists violations."""
+    counts = ", ".join(f"{count} × {word}" for word, count in Counter(word for _, _, word in violations).most_common())
+    return "\n".join([f"{len(violations)}: {counts}", *(f"{path}:{line}: {word}" for path, line, word in violations)])
+
+
+def test_no_docstring_begins_with_a_fragment():
+    violations = []
+    for path in tracked(".py"):
+        for line, text in docstrings(ast.parse(path.read_text(encoding="utf-8"))):
+            if found := FRAGMENT.match(text):
+                violations.append((path.relative_to(ROOT), line, found[1]))
+    assert not violations, report(violations)
+
+
+def test_docstrings_comments_and_help_have_no_banned_words():
+    violations = []
+    for path in tracked(".py"):
+        source = path.read_text(encoding="utf-8")
+        tree = ast.parse(source)
+        for line, text in (*docstrings(tree), *help_texts(tree), *comments(source)):
+            for offset, part in enumerate(text.splitlines()):
+                violations += [(path.relative_to(ROOT), line + offset, word.lower()) for word in WORD.findall(part)]
+    assert not violations, report(violations)
+
+
+def test_pages_have_no_banned_words():
+    violations = []
+    for path in tracked(".md"):
+        for line, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            violations += [(path.relative_to(ROOT), line, word.lower()) for word in WORD.findall(text)]
+    assert not violations, report(violations)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_fragment"),
+    [("Whether it is so.", True), ("What is known.", True), ("Whatever.", False), ("Return what is known.", False)],
+)
+def test_fragment_is_found_at_the_beginning(text, is_fragment):
+    assert (FRAGMENT.match(text) is not None) == is_fragment
