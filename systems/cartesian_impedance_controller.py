@@ -102,8 +102,8 @@ class CartesianImpedanceController(LeafSystem):
             tool_centre: Frame P.
             gains: Impedance parameters.
             period: Period of the command check [s], positive.
-            stiffness_frame: Frame in whose axes the gains are given, T by default. If this frame rotates, the impedance
-                is not strictly passive: turning the axes of a loaded spring can add energy.
+            stiffness_frame: Frame that defines the axes of the gains, T by default. If this frame rotates, the
+                impedance is not strictly passive: turning the axes of a loaded spring can add energy.
             compensate_gravity: False if the robot's own controller compensates gravity.
             timeout: Age above which a desired pose is stale [s], positive.
 

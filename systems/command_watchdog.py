@@ -10,8 +10,8 @@ from guiderail.systems.support.last_valid_pose import LastValidPose
 class CommandWatchdog(LeafSystem):
     """Output the desired pose while it is valid, otherwise the last valid one.
 
-    For robots whose controller has no command timeout. A command is valid while it is finite, not older than the
-    timeout, and not more than one period in the future; see `LastValidPose`.
+    For robot controllers without a command timeout. A command is valid while it is finite, not older than the timeout,
+    and not more than one period in the future; see `LastValidPose`.
 
     .. pydrake_system::
 

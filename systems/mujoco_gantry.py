@@ -48,7 +48,7 @@ class DivergedError(RuntimeError):
 
 
 class MovedBodies(NamedTuple):
-    """Bodies of a plant whose poses the engine computes: the fixture, the tool, and the workpiece fixed to the tool."""
+    """Bodies of a plant with poses from the engine: the fixture, the tool, and the workpiece fixed to the tool."""
 
     fixture: RigidBody
     tool: RigidBody
@@ -66,7 +66,7 @@ class _Nominal(NamedTuple):
 
 
 class MujocoGantry(LeafSystem):
-    """Simulate a MuJoCo model whose first six joints are x, y, z, Rz, Ry, Rx of a tool in a target frame T.
+    """Simulate a MuJoCo model of a tool with the six joints x, y, z, Rz, Ry, Rx in a target frame T.
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
 

@@ -16,7 +16,7 @@ class Recording:
     """Samples of named signals.
 
     Args:
-        times: Start times of the N control periods at whose ends the signals were sampled, (N,) [s].
+        times: Start times of the N recorded control periods, (N,) [s]; the signals are sampled at their ends.
         signals: Samples of each signal by name, (N, size).
     """
 

@@ -246,7 +246,7 @@ class StatusWatchdog(LeafSystem):
         return EventStatus.Succeeded()
 
     def _next_offset(self, measured: float, evaluation: _Evaluation, state: np.ndarray, now: float) -> float:
-        """Return the clock offset [s] after a status whose measured offset is `measured`."""
+        """Return the clock offset [s] after a status with the measured offset `measured`."""
         is_synchronized = evaluation.fault in ACCEPTABLE_FAULTS and np.isfinite(state[_STATUS_TIME])
         is_late = evaluation.fault == Fault.STALE and now - state[_RECEIPT_TIME] <= self._limits.max_age
         if not (is_synchronized or is_late):

@@ -14,7 +14,7 @@ def declare_cache(
     *,
     prerequisites_of_calc: set[DependencyTicket],
 ) -> CacheEntry:
-    """Declare a cache entry whose value is computed by `calc`.
+    """Declare a cache entry with a value computed by `calc`.
 
     Args:
         system: System under construction.

@@ -11,7 +11,7 @@ from guiderail.models.common.errors import InputError
 
 
 class SignalPorts:
-    """Vector input ports of a system, one per named signal, whose names are constructor arguments.
+    """Vector input ports of a system, one per signal named in a constructor argument.
 
     Args:
         system: System under construction; ports are declared in the order in which names first appear.

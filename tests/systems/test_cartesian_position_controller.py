@@ -22,7 +22,7 @@ def arm():
 
 
 class Commanded:
-    """Controller whose joint command starts at `START` or at given joint positions."""
+    """Controller with its joint command initially at `START` or at given joint positions."""
 
     def __init__(self, arm, q_start=None, **options):
         self.plant, model = arm

@@ -155,13 +155,13 @@ def test_outputs_are_not_computed_again_between_two_checks():
             super()._calc_safe_pose(context, output)
 
     builder = DiagramBuilder()
-    action_repeat = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
+    hold = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
     time_hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
     system = builder.AddSystem(Counted(PERIOD, TIMEOUT))
-    builder.Connect(action_repeat.get_output_port(), system.get_desired_pose_input_port())
+    builder.Connect(hold.get_output_port(), system.get_desired_pose_input_port())
     builder.Connect(time_hold.get_output_port(), system.get_command_time_input_port())
     for name, port in (
-        ("command", action_repeat.get_input_port()),
+        ("command", hold.get_input_port()),
         ("time", time_hold.get_input_port()),
         ("pose", system.get_pose_input_port()),
     ):

@@ -9,7 +9,7 @@ BLOCKED = TERMINATIONS.index("blocked")
 
 
 class Episode:
-    """Monitor with one signal value per control step, whose output is read as by an environment."""
+    """Monitor with one signal value per control step; its output is read as by an environment."""
 
     def __init__(self, *conditions, size=1):
         self.system = EpisodeMonitor(conditions, PERIOD)

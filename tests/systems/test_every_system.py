@@ -164,7 +164,7 @@ def test_every_port_has_a_documented_getter(system):
             assert getattr(system, f"_{name}_port") is port
             returned = method()
         else:
-            # Ports whose names are constructor arguments share one getter by name.
+            # Ports named by constructor arguments share one getter by name.
             (method,) = (m for m in methods.values() if "name" in inspect.signature(m).parameters)
             returned = method(name)
         assert returned is port

@@ -11,7 +11,7 @@ PERIOD, TIMEOUT = 0.125, 0.5
 
 
 class Rig:
-    """Monitor whose heartbeat input is set before each step."""
+    """Monitor with a heartbeat input that is set before each step."""
 
     def __init__(self):
         self.system = HeartbeatMonitor(period=PERIOD, timeout=TIMEOUT)

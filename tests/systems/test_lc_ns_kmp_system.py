@@ -75,9 +75,9 @@ def loop(history):
     builder = DiagramBuilder()
     p = primitive(history)
     system = builder.AddSystem(LcNsKmpSystem(p, np.array([20.0, 20.0]), PERIOD))
-    action_repeat = builder.AddSystem(ZeroOrderHold(PERIOD, 2))
-    builder.Connect(action_repeat.get_output_port(), system.get_null_space_action_input_port())
-    builder.ExportInput(action_repeat.get_input_port(), "action")
+    hold = builder.AddSystem(ZeroOrderHold(PERIOD, 2))
+    builder.Connect(hold.get_output_port(), system.get_null_space_action_input_port())
+    builder.ExportInput(hold.get_input_port(), "action")
     if history:
         buffer = builder.AddSystem(HistoryBuffer(2, history, PERIOD))
         start = builder.AddSystem(ConstantVectorSource(p.reference.means[0]))
@@ -142,10 +142,10 @@ def test_fallback_satisfies_the_constraints_of_its_step():
     G = np.tile(LinearConstraints.box([-np.inf, -np.inf], [0.0, np.inf]).G, (50, 1, 1))
     p = LcNsKmp(primitive().reference, history=0, horizon=8, constraints=LinearConstraints(G, c))
 
-    def never(*arguments):
+    def unsolvable(*arguments):
         raise UnsolvableError("no")
 
-    p.predict = never
+    p.predict = unsolvable
     system = LcNsKmpSystem(p, None, PERIOD)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -160,12 +160,12 @@ def test_fallback_satisfies_the_constraints_of_its_step():
 def test_last_command_is_output_when_no_nearest_point_is_found(monkeypatch):
     p = primitive(history=0, upper=0.5)
 
-    def never(*arguments):
+    def unsolvable(*arguments):
         raise UnsolvableError("no")
 
     system = LcNsKmpSystem(p, None, PERIOD)
-    p.predict = never
-    monkeypatch.setattr(LinearConstraints, "nearest", never)
+    p.predict = unsolvable
+    monkeypatch.setattr(LinearConstraints, "nearest", unsolvable)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
@@ -178,10 +178,10 @@ def test_last_command_is_output_when_no_nearest_point_is_found(monkeypatch):
 def test_first_fallback_satisfies_the_constraints():
     p = primitive(history=0, upper=-0.5)
 
-    def never(*arguments):
+    def unsolvable(*arguments):
         raise UnsolvableError("no")
 
-    p.predict = never
+    p.predict = unsolvable
     system = LcNsKmpSystem(p, None, PERIOD)
     context = system.CreateDefaultContext()
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
@@ -191,7 +191,7 @@ def test_first_fallback_satisfies_the_constraints():
 def test_initialization_restores_step_and_initial_command():
     p = primitive(history=0)
 
-    def never(*arguments):
+    def unsolvable(*arguments):
         raise UnsolvableError("no")
 
     predict = p.predict
@@ -200,7 +200,7 @@ def test_initialization_restores_step_and_initial_command():
     context = simulator.get_mutable_context()
     action = system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
     simulator.AdvanceTo(20.5 * PERIOD)
-    p.predict = never
+    p.predict = unsolvable
     context.SetTime(0.0)
     action.GetMutableData()  # invalidates the cache
     simulator.Initialize()

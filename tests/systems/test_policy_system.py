@@ -36,9 +36,9 @@ class Loop:
         builder = DiagramBuilder()
         counter = builder.AddSystem(Counter())
         self.system = builder.AddSystem(PolicySystem(policy, 1, 1, action_repeat * PERIOD))
-        self.action_repeat = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
+        self.hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
         builder.Connect(counter.get_output_port(), self.system.get_observation_input_port())
-        builder.Connect(self.system.get_action_output_port(), self.action_repeat.get_input_port())
+        builder.Connect(self.system.get_action_output_port(), self.hold.get_input_port())
         self.simulator = Simulator(builder.Build())
         self.context = self.simulator.get_mutable_context()
         self.pristine = self.context.Clone()
@@ -51,15 +51,15 @@ class Loop:
     def read(self, system):
         return float(system.get_output_port().Eval(system.GetMyContextFromRoot(self.context))[0])
 
-    def held(self, steps):
+    def run(self, steps):
         """Return the action during each of the next control steps."""
-        held = []
+        actions = []
         for _ in range(steps):
             # In the middle of a step all events of its first instant are over.
             n = int(self.context.get_time() / PERIOD + 0.5)
             self.simulator.AdvanceTo((n + 0.5) * PERIOD)
-            held.append(self.read(self.action_repeat))
-        return held
+            actions.append(self.read(self.hold))
+        return actions
 
 
 def tenth(observation):
@@ -68,7 +68,7 @@ def tenth(observation):
 
 def test_action_is_set_before_discrete_updates_of_its_instant():
     """The policy observes the counter before the instant; the hold samples the new action at the same instant."""
-    assert Loop(tenth).held(5) == [0.0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]
+    assert Loop(tenth).run(5) == [0.0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]
 
 
 def test_discrete_update_would_delay_the_action_by_one_period():
@@ -85,28 +85,28 @@ def test_discrete_update_would_delay_the_action_by_one_period():
             discrete_state.set_value(tenth(self.observation.Eval(context)))
 
     builder = DiagramBuilder()
-    counter, late, action_repeat = (builder.AddSystem(s) for s in (Counter(), Late(), ZeroOrderHold(PERIOD, 1)))
+    counter, late, hold = (builder.AddSystem(s) for s in (Counter(), Late(), ZeroOrderHold(PERIOD, 1)))
     builder.Connect(counter.get_output_port(), late.get_input_port())
-    builder.Connect(late.get_output_port(), action_repeat.get_input_port())
+    builder.Connect(late.get_output_port(), hold.get_input_port())
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(3.5 * PERIOD)
-    assert action_repeat.get_output_port().Eval(action_repeat.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
+    assert hold.get_output_port().Eval(hold.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
 
 
 def test_action_is_constant_until_the_next_action_period():
     calls = []
     loop = Loop(lambda observation: calls.append(observation) or tenth(observation), action_repeat=4)
-    assert loop.held(10) == [0.0] * 4 + [4 / 16] * 4 + [8 / 16] * 2
+    assert loop.run(10) == [0.0] * 4 + [4 / 16] * 4 + [8 / 16] * 2
     assert [c.tolist() for c in calls] == [[0.0], [4.0], [8.0]]
 
 
 def test_action_is_zero_before_the_first_update_and_after_reset():
     loop = Loop(lambda observation: np.ones(1))
     assert loop.read(loop.system) == 0.0
-    assert loop.held(3) == [1.0] * 3
+    assert loop.run(3) == [1.0] * 3
     loop.reset()
     assert loop.read(loop.system) == 0.0
-    assert loop.held(2) == [1.0] * 2
+    assert loop.run(2) == [1.0] * 2
 
 
 def test_no_direct_feedthrough():
@@ -121,7 +121,7 @@ def test_policy_gets_the_observation_of_an_environment():
         observations.append(observation)
         return np.zeros(1)
 
-    Loop(policy).held(1)
+    Loop(policy).run(1)
     image = ImageRgba8U(4, 3)
     image.mutable_data[:] = np.arange(48, dtype=np.uint8).reshape(3, 4, 4)
     builder = DiagramBuilder()
@@ -136,7 +136,7 @@ def test_policy_gets_the_observation_of_an_environment():
 
 
 def test_action_is_clipped_to_the_action_space():
-    assert Loop(lambda observation: np.array([3.0])).held(1) == [1.0]
+    assert Loop(lambda observation: np.array([3.0])).run(1) == [1.0]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_action_is_clipped_to_the_action_space():
 def test_policy_error_is_raised_when_no_action_is_returned(returned):
     loop = Loop(lambda observation: returned)
     with pytest.raises(PolicyError, match="the robot must stop"):
-        loop.held(1)
+        loop.run(1)
     assert loop.read(loop.system) == 0.0
 
 
@@ -154,7 +154,7 @@ def test_exception_of_the_policy_is_propagated():
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        Loop(broken).held(1)
+        Loop(broken).run(1)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ CLOCK = 1000.0  # robot time at local time zero [s]
 
 
 class Rig:
-    """Watchdog of a robot whose joints move at 0.1 rad/s, with a status just before each check."""
+    """Watchdog of a robot with joint velocities of 0.1 rad/s, with a status just before each check."""
 
     def __init__(self, limits=LIMITS):
         self.system = StatusWatchdog(limits, period=PERIOD)

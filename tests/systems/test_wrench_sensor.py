@@ -18,7 +18,7 @@ R_WAXES = RotationMatrix(RollPitchYaw(0.3, -0.2, 0.9))
 
 
 class SwingingTool:
-    """Pendulum whose bob is welded to its rod at the wrist, with a centre of compliance off the centre of mass."""
+    """Pendulum with a bob welded to its rod at the wrist; the centre of compliance is off the centre of mass."""
 
     def __init__(self, time_constant=0.0):
         builder = DiagramBuilder()
