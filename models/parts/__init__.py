@@ -1,1 +1,1 @@
-"""Parts that somebody brings along: two mesh files, and what a simulation needs to know of them."""
+"""Insertion tasks from mesh files: reading, checks, convex decomposition, symmetry and a demonstrator."""

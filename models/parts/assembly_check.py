@@ -1,4 +1,4 @@
-"""How a plug fits its socket: where both overlap, how much room is between their walls, how far out is clear."""
+"""Geometric checks of a plug and its socket: overlap, clearance between walls, and the way to the target."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.parts.convex_decomposition import as_arrays, as_solid
-from guiderail.models.parts.mesh_file import Part, need
+from guiderail.models.parts.convex_decomposition import to_arrays, to_manifold
+from guiderail.models.parts.mesh_file import Part, require_module
 
-ACROSS = 0.5  # a wall's normal has less than this along the axis
-# Faces that rest on each other overlap by rounding; deeper is a fault [m].
-RESTING = 2e-6
-_SAMPLES = 4000
+MAX_WALL_SLOPE = 0.5  # largest component along the axis of the normal of a wall
+MAX_RESTING_OVERLAP = 2e-6  # overlap of faces that rest on each other, by rounding [m]
+_SAMPLES = 4000  # points on the walls of a part
 
 
 @dataclass(frozen=True)
-class Motion:
-    """How a plug comes to its target, along z and about it.
+class InsertionMotion:
+    """Motion of a plug to its target along z, with a turn about z at the end.
 
     Attributes:
-        travel: how far above the target it starts [m].
-        rim: at what height its lowest point is level with the socket's highest [m].
-        turn: by how much it turns at the end, counter-clockwise as seen from above [rad].
+        travel: Height of the start above the target [m].
+        rim: Height at which the plug's lowest point is level with the socket's highest [m].
+        turn: Angle of the turn, counter-clockwise as seen from above [rad].
     """
 
     travel: float
@@ -33,39 +32,39 @@ class Motion:
     turn: float = 0.0
 
     def path(self, steps: int = 24) -> list[tuple[float, float]]:
-        """Heights [m] and turns [rad] from the rim to the target."""
+        """Return heights [m] and angles [rad] from the rim to the target."""
         down = [(float(z), -self.turn) for z in np.linspace(self.rim, 0.0, steps)]
         turning = np.linspace(-self.turn, 0.0, steps)[1:] if self.turn else np.empty(0)
         return down + [(0.0, float(angle)) for angle in turning]
 
 
-def solids(part: Part) -> list[Any]:
-    """A part's bodies as solids.
+def make_solids(part: Part) -> list[Any]:
+    """Return the bodies of a part as `manifold3d` solids.
 
     Raises:
-        InputError: if one of them has faces that cross each other.
+        InputError: If a body has faces that cross each other.
     """
-    found = []
+    solids = []
     for vertices, triangles in part.bodies:
-        solid = as_solid(vertices, triangles)
+        solid = to_manifold(vertices, triangles)
         if solid.is_empty():
             raise InputError(
                 f"{part.path.name} has faces that cross each other (manifold3d: {solid.status()}): unite its bodies "
-                "where it was drawn, and export it again"
+                "in the CAD model and export it again"
             )
-        found.append(solid)
-    return found
+        solids.append(solid)
+    return solids
 
 
-def turned(solid: Any, height: float, angle: float) -> Any:
-    """A solid turned by `angle` [rad] about z and lifted by `height` [m]."""
+def move_solid(solid: Any, height: float, angle: float) -> Any:
+    """Return a solid turned by `angle` [rad] about z and lifted by `height` [m]."""
     return solid.rotate((0.0, 0.0, float(np.rad2deg(angle)))).translate((0.0, 0.0, 1e3 * height))
 
 
-def overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float, np.ndarray]:
-    """How thick the thickest overlap of two parts is [m], about, and where (3,) [m].
+def measure_overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float, np.ndarray]:
+    """Return the approximate thickness [m] and the position (3,) [m] of the thickest overlap of two parts.
 
-    The thickness of an overlap is twice its volume by its surface, that of a sheet.
+    The thickness is that of a sheet: twice the volume divided by the surface.
     """
     thickest, where = 0.0, np.zeros(3)
     for one in first:
@@ -75,50 +74,50 @@ def overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float, np.ndar
                 thickness = 2e-3 * common.volume() / area if area > 0.0 else 0.0
                 if thickness > thickest:
                     thickest = thickness
-                    where = as_arrays(common)[0].mean(axis=0)
+                    where = to_arrays(common)[0].mean(axis=0)
     return thickest, where
 
 
-def centre_of_mass(part: Part) -> np.ndarray:
-    """Of a part of one density, (3,) [m]; it lies on the axis of what is the same after a part of a turn."""
-    trimesh = need("trimesh")
+def compute_centre_of_mass(part: Part) -> np.ndarray:
+    """Return the centre of mass (3,) [m] of a part with uniform density."""
+    trimesh = require_module("trimesh")
     meshes = [trimesh.Trimesh(vertices, triangles, process=False) for vertices, triangles in part.bodies]
     volumes = np.array([mesh.volume for mesh in meshes])
     return volumes @ np.array([mesh.center_mass for mesh in meshes]) / volumes.sum()
 
 
 def check_target(plug: Part, socket: Part) -> None:
-    """Refuses parts that overlap where the plug should be.
+    """Check that the parts do not overlap with the plug at its target.
 
     Raises:
-        InputError: saying by how much, and where.
+        InputError: If they do, with the depth and the position.
     """
-    thickness, where = overlap(solids(plug), solids(socket))
-    if thickness > RESTING:
+    thickness, where = measure_overlap(make_solids(plug), make_solids(socket))
+    if thickness > MAX_RESTING_OVERLAP:
         raise InputError(
             f"the parts overlap at the target by about {1e3 * thickness:.2g} mm, around {np.round(1e3 * where, 1)} mm "
-            "in the target frame: draw them assembled in one frame, or say with --place where the plug goes"
+            "in the target frame: draw them assembled in one frame, or place the plug with --plug-pose"
         )
 
 
-def motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3) -> Motion:
-    """From how high the plug comes: `clear` [m] above the socket.
+def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3) -> InsertionMotion:
+    """Return the motion of a plug from `clear` [m] above the socket, with a `turn` [rad] at the end.
 
     Raises:
-        InputError: if it is above the socket at the target already.
+        InputError: If the plug at its target does not reach into the socket.
     """
     rim = float(socket.bounds[1, 2] - plug.bounds[0, 2])
     if rim < 5e-4:
         raise InputError(
-            f"the plug ends {max(-rim, 0.0) * 1e3:.1f} mm above the socket at the target and goes into nothing: draw "
-            "them assembled, say with --place where it goes, or with --axis which way it comes out"
+            f"the plug ends {max(-rim, 0.0) * 1e3:.1f} mm above the socket at the target and is not inserted: draw "
+            "them assembled, place the plug with --plug-pose, or give the direction in which it comes out with --axis"
         )
-    return Motion(travel=rim + clear, rim=rim, turn=turn)
+    return InsertionMotion(travel=rim + clear, rim=rim, turn=turn)
 
 
-def side_clearance(plug: Part, socket: Part) -> float:
-    """The least distance between walls along the axis at the target [m]."""
-    trimesh = need("trimesh")
+def measure_side_clearance(plug: Part, socket: Part) -> float:
+    """Return the smallest distance between walls along the axis at the target [m]; infinite without such walls."""
+    trimesh = require_module("trimesh")
     meshes = [_walls(part) for part in (plug, socket)]
     least = np.inf
     for one, other in (meshes, meshes[::-1]):
@@ -128,42 +127,43 @@ def side_clearance(plug: Part, socket: Part) -> float:
         points, faces = trimesh.sample.sample_surface(one, count, seed=0)
         points = np.concatenate([points, one.vertices])
         normals = np.concatenate([one.face_normals[faces], one.vertex_normals])
-        # Walls of the two that face each other: a distance to the back of a wall, or past a corner, is none.
-        near, distance, face = nearest_on_surface(points, other.triangles)
+        # Only walls that face each other: the distance to the back of a wall or past a corner does not count.
+        nearest, distance, face = find_nearest_on_surface(points, other.triangles)
         facing = np.einsum("ij,ij->i", normals, other.face_normals[face]) < -0.7
-        towards = np.einsum("ij,ij->i", normals, near - points) > -1e-9
+        towards = np.einsum("ij,ij->i", normals, nearest - points) > -1e-9
         if (facing & towards).any():
             least = min(least, float(distance[facing & towards].min()))
     return least
 
 
 def _walls(part: Part) -> Any:
-    trimesh = need("trimesh")
+    trimesh = require_module("trimesh")
     mesh = trimesh.util.concatenate([trimesh.Trimesh(v, t, process=False) for v, t in part.bodies])
-    return mesh.submesh([np.flatnonzero(np.abs(mesh.face_normals[:, 2]) < ACROSS)], append=True, only_watertight=False)
+    walls = np.flatnonzero(np.abs(mesh.face_normals[:, 2]) < MAX_WALL_SLOPE)
+    return mesh.submesh([walls], append=True, only_watertight=False)
 
 
-def nearest_on_surface(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nearest point (P, 3), its distance (P,) and its triangle (P,) for points (P, 3) and triangles (T, 3, 3)."""
-    trimesh = need("trimesh")
+def find_nearest_on_surface(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the nearest points (P, 3) on triangles (T, 3, 3), their distances (P,) and triangles (P,)."""
+    trimesh = require_module("trimesh")
     nearest, distances, faces = np.zeros_like(points), np.full(len(points), np.inf), np.zeros(len(points), int)
     chunk = max(1, 400_000 // max(len(triangles), 1))
     for start in range(0, len(points), chunk):
-        some = points[start : start + chunk]
-        pairs = np.repeat(some, len(triangles), axis=0)
-        on = trimesh.triangles.closest_point(np.tile(triangles, (len(some), 1, 1)), pairs)
-        apart = np.linalg.norm(on - pairs, axis=1).reshape(len(some), -1)
-        best = apart.argmin(axis=1)
-        rows = slice(start, start + len(some))
-        nearest[rows] = on.reshape(len(some), -1, 3)[np.arange(len(some)), best]
-        distances[rows], faces[rows] = apart.min(axis=1), best
+        block = points[start : start + chunk]
+        pairs = np.repeat(block, len(triangles), axis=0)
+        closest = trimesh.triangles.closest_point(np.tile(triangles, (len(block), 1, 1)), pairs)
+        separation = np.linalg.norm(closest - pairs, axis=1).reshape(len(block), -1)
+        best = separation.argmin(axis=1)
+        rows = slice(start, start + len(block))
+        nearest[rows] = closest.reshape(len(block), -1, 3)[np.arange(len(block)), best]
+        distances[rows], faces[rows] = separation.min(axis=1), best
     return nearest, distances, faces
 
 
-def in_the_way(plug: Part, socket: Part, motion: Motion) -> list[tuple[float, float]]:
-    """For each of the plug's bodies how much it overlaps the socket at most on its way [m], and at what height [m]."""
-    fixed, found = solids(socket), []
-    for body in solids(plug):
-        most = max(((overlap([turned(body, z, a)], fixed)[0], z) for z, a in motion.path()), key=lambda one: one[0])
-        found.append(most)
-    return found
+def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list[tuple[float, float]]:
+    """Return the largest overlap with the socket on the way [m] and its height [m] for each body of the plug."""
+    fixed, obstructions = make_solids(socket), []
+    for body in make_solids(plug):
+        overlaps = [(measure_overlap([move_solid(body, z, a)], fixed)[0], z) for z, a in motion.path()]
+        obstructions.append(max(overlaps, key=lambda overlap: overlap[0]))
+    return obstructions

@@ -1,8 +1,8 @@
-"""A solid cut into convex pieces that together are exactly the solid.
+"""Exact decomposition of a solid into convex pieces.
 
-Contact of a compliant mesh needs tetrahedra, of which a convex piece has few; a solid that is no more than tolerably
-like its pieces would lose clearances of a tenth of a millimetre. So it is cut along its own faces where it is concave,
-as a sculptor's saw would, and no surface moves.
+Contact of a compliant mesh needs tetrahedra, of which a convex piece has few. An approximate decomposition would lose
+clearances of a tenth of a millimetre. The solid is therefore cut along its own faces at concave edges, and no surface
+moves.
 """
 
 from __future__ import annotations
@@ -12,36 +12,39 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.parts.mesh_file import need
+from guiderail.models.parts.mesh_file import require_module
 
-MOST_PIECES = 150
-_SLIVER = 1e-6  # of the whole volume: less is rounding
-_CONVEX = 1e-4  # of its volume: what lacks no more than that is convex
-_FLAT = 1e-2  # [rad] an edge that is less concave than this is none
-_TRIED = 6  # planes at each cut
-_SMALLEST_FACE = 2e-4  # [mm²] Drake makes a plane of each face, and fails at one of 5e-5
-_DIGITS = 9  # of an OBJ file's metres: what is flat before it is rounded may not be so after
-_SCALE = 1e3  # manifold3d's tolerances are made for millimetres
+MAX_PIECES = 150
+_SLIVER = 1e-6  # part of the whole volume below which a piece is a rounding error
+_CONVEX = 1e-4  # part of its volume by which a convex piece may differ from its hull
+_FLAT = 1e-2  # angle below which an edge does not count as concave [rad]
+_MAX_PLANES = 6  # planes tried at each cut
+_SMALLEST_FACE = 2e-4  # [mm²] Drake computes the plane of each face, and fails at 5e-5
+_DIGITS = 9  # digits of metres in an OBJ file; a face may only be flat before it is rounded
+_SCALE = 1e3  # from metres to millimetres, for which the tolerances of manifold3d are meant
 
 
-def as_solid(vertices: np.ndarray, triangles: np.ndarray) -> Any:
-    """A `manifold3d.Manifold` in millimetres of vertices (V, 3) [m] and triangles (T, 3)."""
-    manifold3d = need("manifold3d")
+def to_manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
+    """Return a `manifold3d.Manifold` in millimetres from vertices (V, 3) [m] and triangles (T, 3)."""
+    manifold3d = require_module("manifold3d")
     mesh = manifold3d.Mesh64(np.ascontiguousarray(vertices * _SCALE), np.ascontiguousarray(triangles, dtype=np.uint64))
     mesh.merge()
     return manifold3d.Manifold(mesh)
 
 
-def as_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) [m] and triangles (T, 3) of a solid."""
+def to_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices (V, 3) [m] and triangles (T, 3) of a solid."""
     mesh = solid.to_mesh64()
     return np.asarray(mesh.vert_properties)[:, :3] / _SCALE, np.asarray(mesh.tri_verts).astype(int)
 
 
-def convex_pieces(solid: Any, most: int = MOST_PIECES) -> list[Any] | None:
-    """Cuts a solid into convex ones; None if it takes more than `most`, or what no cut finds would be filled.
+def cut_into_convex_pieces(solid: Any, most: int = MAX_PIECES) -> list[Any] | None:
+    """Cut a solid into convex pieces.
 
-    Each cut is along the plane of a face beside a concave edge, whichever leaves least to be cut.
+    Each cut is along the plane of a face at a concave edge: the one that leaves the smallest concave volume.
+
+    Returns:
+        The pieces; None if more than `most` are necessary, or if they would fill a concavity that no cut removes.
     """
     total, filled, todo, pieces = solid.volume(), 0.0, [solid], []
     while todo:
@@ -55,18 +58,18 @@ def convex_pieces(solid: Any, most: int = MOST_PIECES) -> list[Any] | None:
                 filled += hollow
             else:
                 todo += cut
-        # Edges that are too flat to be seen one by one may be a bore.
+        # Edges that are each too flat to count as concave may form a bore.
         if len(pieces) + len(todo) > most or filled > 2.0 * _CONVEX * total:
             return None
     return pieces
 
 
 def _with_large_faces(convex: Any) -> Any:
-    """A convex solid less the vertices that make faces too small for Drake: those on a line, or next to another."""
-    from pydrake.geometry import Convex  # half a second that whoever reads a folder need not wait for
+    """Return a convex solid without the vertices whose faces are too small for Drake: on an edge, or near another."""
+    from pydrake.geometry import Convex  # imported here because it takes half a second
 
-    manifold3d = need("manifold3d")
-    points = as_arrays(convex)[0]
+    manifold3d = require_module("manifold3d")
+    points = to_arrays(convex)[0]
     while len(points) > 4:
         points = np.round(points, _DIGITS)
         hull = Convex(np.ascontiguousarray(points.T), "piece").GetConvexHull()
@@ -75,9 +78,9 @@ def _with_large_faces(convex: Any) -> Any:
         if smallest <= _SMALLEST_FACE:
             points = np.delete(points, corner, axis=0)
             continue
-        # What Drake takes for one face may be several triangles in the file, one of them next to nothing.
+        # A face of Drake's hull may be several triangles in the file, one of them almost without area.
         written = manifold3d.Manifold.hull_points(np.ascontiguousarray(points * _SCALE))
-        vertices, triangles = as_arrays(written)
+        vertices, triangles = to_arrays(written)
         smallest, corner = _smallest_face(vertices, np.insert(triangles, 0, 3, axis=1).ravel().tolist())
         if smallest > _SMALLEST_FACE:
             return written
@@ -86,9 +89,9 @@ def _with_large_faces(convex: Any) -> Any:
 
 
 def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
-    """The smallest triangle's area [mm²] where each polygon is a fan, as Drake makes it, and which corner is on a line.
+    """Return the smallest triangle's area [mm²] with polygons cut into fans, as in Drake, and its flattest corner.
 
-    `faces` has for each polygon how many corners, and which.
+    `faces` holds the number of corners and the corners of each polygon.
     """
     smallest, corner, start = np.inf, 0, 0
     while start < len(faces):
@@ -106,27 +109,27 @@ def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
 
 
 def _hollow(solid: Any) -> float:
-    """The volume that a solid lacks to be convex [mm³]."""
+    """Return the volume between a solid and its convex hull [mm³]."""
     return float(solid.hull().volume() - solid.volume())
 
 
 def _best_cut(solid: Any, total: float) -> list[Any] | None:
-    best, found = None, np.inf
-    # A plane in which faces lie cuts through rounding errors: beside it, it may not.
-    beside = 1e-5 * total ** (1 / 3)
+    best, smallest = None, np.inf
+    # A cut in the plane of faces meets rounding errors, which a cut slightly next to it may avoid.
+    shift_size = 1e-5 * total ** (1 / 3)
     for normal, distance in _planes(solid):
-        for shift in (0.0, beside, -beside):
+        for shift in (0.0, shift_size, -shift_size):
             halves = solid.split_by_plane(normal, distance + shift)
             parts = [part for half in halves for part in half.decompose() if part.volume() > _SLIVER * total]
-            if len(parts) > 1 and (left := sum(map(_hollow, parts))) < found - _SLIVER * total:
-                best, found = parts, left
+            if len(parts) > 1 and (left := sum(map(_hollow, parts))) < smallest - _SLIVER * total:
+                best, smallest = parts, left
     return best
 
 
 def _planes(solid: Any) -> list[tuple[np.ndarray, float]]:
-    """Planes of faces beside concave edges, those with the longest edges first."""
-    trimesh = need("trimesh")
-    vertices, triangles = as_arrays(solid)
+    """Return planes of faces at concave edges, those with the longest edges first."""
+    trimesh = require_module("trimesh")
+    vertices, triangles = to_arrays(solid)
     mesh = trimesh.Trimesh(vertices * _SCALE, triangles, process=False)
     concave = ~mesh.face_adjacency_convex & (mesh.face_adjacency_angles > _FLAT)
     faces = np.unique(mesh.face_adjacency[concave])
@@ -142,4 +145,4 @@ def _planes(solid: Any) -> list[tuple[np.ndarray, float]]:
     lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     inside = [(np.abs(ends @ normals[i] - distances[i]) < 1e-4 * mesh.scale).all(axis=1) for i in first]
     order = np.argsort([-(lengths * one).sum() for one in inside], kind="stable")
-    return [(normals[first[i]], float(distances[first[i]])) for i in order[:_TRIED]]
+    return [(normals[first[i]], float(distances[first[i]])) for i in order[:_MAX_PLANES]]

@@ -1,4 +1,4 @@
-"""A part from a mesh file: read, brought to metres, and refused in a sentence where it is no solid."""
+"""Mesh files of parts: read in metres and checked to be solids, and written with their SDF models."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.objects.sdf import ContactMaterial, at, collision, convex_mesh, mesh, model, visual
+from guiderail.models.objects.triangle_mesh import TriangleMesh
 
 ENDINGS = (".stl", ".obj", ".glb", ".step", ".stp")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
-"""What one unit of a file is [m]."""
+"""Length of one unit of a file [m]."""
 
-SMALLEST, LARGEST = 1e-3, 0.5  # [m] of a part that an arm inserts, its longest side
-_KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # formats that say their unit, and in what they are read
+SMALLEST, LARGEST = 1e-3, 0.5  # bounds of the longest side of a part that an arm inserts [m]
+_KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that define one
 
 
 @dataclass(frozen=True)
@@ -25,8 +27,8 @@ class Part:
     """A solid of one or several bodies.
 
     Attributes:
-        path: where it came from.
-        bodies: vertices (V, 3) [m] and triangles (T, 3) of each, counter-clockwise as seen from outside.
+        path: Mesh file.
+        bodies: Vertices (V, 3) [m] and triangles (T, 3) of each body, counter-clockwise as seen from outside.
     """
 
     path: Path
@@ -34,20 +36,20 @@ class Part:
 
     @property
     def bounds(self) -> np.ndarray:
-        """The lowest and the highest corner, (2, 3) [m]."""
+        """Lowest and highest corner of the bounding box, (2, 3) [m]."""
         points = np.concatenate([vertices for vertices, _ in self.bodies])
         return np.stack([points.min(axis=0), points.max(axis=0)])
 
-    def moved(self, rotation: np.ndarray, translation: np.ndarray) -> Part:
-        """The part with every point p at R p + t; rotation (3, 3), translation (3,) [m]."""
+    def transform(self, rotation: np.ndarray, translation: np.ndarray) -> Part:
+        """Return the part with every point p at R p + t; rotation (3, 3), translation (3,) [m]."""
         return Part(self.path, tuple((v @ rotation.T + translation, t) for v, t in self.bodies))
 
 
-def need(module: str) -> Any:
-    """A library that only onboarding needs.
+def require_module(module: str) -> Any:
+    """Import an optional library for meshes.
 
     Raises:
-        InputError: if it is not installed.
+        InputError: If it is not installed.
     """
     try:
         return import_module(module)
@@ -55,30 +57,30 @@ def need(module: str) -> Any:
         raise InputError(f"meshes need {module}, which is not installed: pip install 'guiderail[onboard]'") from None
 
 
-def unit_of(path: Path, given: str | None) -> str | None:
-    """The unit of a file: what its format says, or what was given; None where nobody said.
+def find_unit(path: Path, given: str | None) -> str | None:
+    """Return the unit of a file, from its format or as given; None if neither determines it.
 
     Raises:
-        InputError: for a unit that there isn't, or one that the format contradicts.
+        InputError: If the given unit is unknown, or contradicts the format.
     """
     if given is not None and given not in UNITS:
         raise InputError(f"there is no unit {given!r}: choose one of {', '.join(UNITS)}")
     known = _KNOWN.get(path.suffix.lower())
     if known and given not in (None, known):
-        raise InputError(f"{path.name} is read in metres, as its format says: leave --unit {given} out")
+        raise InputError(f"{path.name} is read in metres, as its format defines: remove --unit {given}")
     return known or given
 
 
 def load_part(path: Path, unit: str) -> Part:
-    """Reads a mesh file.
+    """Read a mesh file.
 
     Args:
-        path: of STL, OBJ, GLB, or STEP where cascadio is installed.
-        unit: one of `UNITS`, of the file's numbers.
+        path: STL, OBJ or GLB file, or a STEP file if cascadio is installed.
+        unit: Unit of the file's numbers, one of `UNITS`.
 
     Raises:
-        InputError: if the file can't be read, or is not watertight, is hollow, inside out or of a size that no arm
-            inserts.
+        InputError: If the file can't be read, or the part is not watertight, hollow, inside out, or of a size that no
+            arm inserts.
     """
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
@@ -90,32 +92,32 @@ def load_part(path: Path, unit: str) -> Part:
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     mesh.update_faces(mesh.nondegenerate_faces())
     if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"{path} holds vertices that are no numbers: export it again")
+        raise InputError(f"{path} holds vertices that are NaN or infinite: export it again")
     size = float(mesh.extents.max()) * UNITS[unit]
     if not SMALLEST <= size <= LARGEST:
         fitting = [name for name, scale in UNITS.items() if SMALLEST <= size / UNITS[unit] * scale <= LARGEST]
         remedy = f"is its unit {' or '.join(fitting)}?" if fitting else f"give parts of {SMALLEST} to {LARGEST} m"
         raise InputError(f"{path.name} would be {size:.3g} m long with --unit {unit}: {remedy}")
     bodies = []
-    found = mesh.split(only_watertight=False, repair=False)
-    for body in found:
-        _check_body(path, body, found)
+    parts = mesh.split(only_watertight=False, repair=False)
+    for body in parts:
+        _check_body(path, body, parts)
         bodies.append((np.asarray(body.vertices) * UNITS[unit], np.asarray(body.faces)))
     return Part(path, tuple(bodies))
 
 
 def _read(path: Path) -> Any:
-    trimesh = need("trimesh")
+    trimesh = require_module("trimesh")
     if path.suffix.lower() in (".step", ".stp"):
-        need("cascadio")
+        require_module("cascadio")
     try:
         return trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # whatever a damaged file makes a parser raise
+    except Exception as error:  # a parser may raise anything for a damaged file
         raise InputError(f"{path} can't be read as a mesh ({brief(str(error))}): export it again") from error
 
 
 def _encloses(outer: Any, inner: Any) -> bool:
-    """Whether a body with its faces outwards is around another, as far as their boxes tell."""
+    """Return True if the bounding box of a body with outward faces encloses that of another body."""
     (low, high), (inner_low, inner_high) = outer.bounds, inner.bounds
     return bool(outer.volume > 0.0 and (low < inner_low).all() and (inner_high < high).all())
 
@@ -128,8 +130,8 @@ def _check_body(path: Path, body: Any, bodies: Sequence[Any]) -> None:
         where = body.bounds.mean(axis=0).round(3).tolist()
         what = f"{open_edges} open edges" if open_edges else "edges that more than two triangles share"
         raise InputError(
-            f"{path.name} is not watertight ({what}, in the body around {where}): close it where it was drawn, or by "
-            "a repair such as Meshlab's or Blender's 3D-print toolbox, and export it again"
+            f"{path.name} is not watertight ({what}, in the body around {where}): close it in the CAD model, or "
+            "repair it with MeshLab or Blender's 3D-print toolbox, and export it again"
         )
     if not body.is_winding_consistent:
         raise InputError(
@@ -137,10 +139,58 @@ def _check_body(path: Path, body: Any, bodies: Sequence[Any]) -> None:
         )
     if body.volume <= 0.0 and any(_encloses(other, body) for other in bodies):
         raise InputError(
-            f"{path.name} has a closed cavity, around {body.bounds.mean(axis=0).round(3).tolist()}: fill it where it "
-            "was drawn, as nothing touches there, and export it again"
+            f"{path.name} has a closed cavity, around {body.bounds.mean(axis=0).round(3).tolist()}: fill it in the CAD "
+            "model, as nothing touches there, and export it again"
         )
     if body.volume <= 0.0:
         raise InputError(
             f"{path.name} is inside out, its triangles face inwards: flip its normals, and export it again"
         )
+
+
+class Surface(Protocol):
+    """Mesh with the contact parameters of one surface.
+
+    A `modulus` [Pa] makes it compliant, None rigid; `dissipation` is that of Hunt and Crossley [s/m].
+    """
+
+    file: str
+    modulus: float | None
+    friction: float
+    dissipation: float
+
+
+def obj_text(vertices: np.ndarray, triangles: np.ndarray) -> str:
+    """Return an OBJ file of vertices (V, 3) [m] and triangles (T, 3), without triangles of almost no area."""
+    corners = vertices[triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return TriangleMesh(vertices, triangles[area > 1e-10]).to_obj()
+
+
+def part_sdf(
+    name: str,
+    visual_file: str,
+    surfaces: Sequence[Surface],
+    *,
+    mass: float,
+    centre: Sequence[float],
+    gyration: float,
+    colour: str,
+) -> str:
+    """Return an SDF model of one link `name` with collision geometry `piece_0`, ….
+
+    Args:
+        name: Name of the model and its link.
+        visual_file: OBJ file of the visual geometry.
+        surfaces: Collision geometry; a compliant mesh is convex, a rigid one may be any mesh.
+        mass: Mass [kg].
+        centre: Centre of mass (3,) [m].
+        gyration: Radius of gyration [m].
+        colour: Colour as "r g b a".
+    """
+    contents = visual("visual", at(), mesh(visual_file), colour)
+    for number, surface in enumerate(surfaces):
+        geometry = mesh(surface.file) if surface.modulus is None else convex_mesh(surface.file)
+        material = ContactMaterial(surface.friction, surface.modulus, dissipation=surface.dissipation)
+        contents += collision(f"piece_{number}", at(), geometry, material)
+    return model(name, mass, centre, gyration, contents, source="guiderail from task.yaml")

@@ -16,8 +16,8 @@ from guiderail.diagrams.tasks.bnc_connector.options import HARD
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.units import MM
 from guiderail.models.control.wrench import center_of_pressure
+from guiderail.models.objects.bnc_connector.demonstrations import poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.bnc_connector.motion import poses
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
 from guiderail.systems.recorder import Recording
 from guiderail.tools.visualization.style import legend, new_figure, save_figure

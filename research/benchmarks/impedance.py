@@ -20,7 +20,7 @@ from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, POSE_SIZE
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.units import MM
-from guiderail.models.objects.bnc_connector.motion import insert_and_lock
+from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import summary

@@ -16,19 +16,18 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.insertion import COLLISION_FORCE
 from guiderail.models.parts.assembly_check import (
-    RESTING,
-    Motion,
-    centre_of_mass,
+    MAX_RESTING_OVERLAP,
+    InsertionMotion,
     check_target,
-    in_the_way,
-    motion,
-    side_clearance,
-    solids,
+    compute_centre_of_mass,
+    find_obstructions,
+    make_solids,
+    measure_side_clearance,
+    plan_motion,
 )
-from guiderail.models.parts.convex_decomposition import as_arrays, convex_pieces
-from guiderail.models.parts.mesh_file import UNITS, Part, load_part, unit_of
-from guiderail.models.parts.model_files import obj_text
-from guiderail.models.parts.symmetry import sides
+from guiderail.models.parts.convex_decomposition import cut_into_convex_pieces, to_arrays
+from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
+from guiderail.models.parts.symmetry import find_symmetries
 from guiderail.tools.files import check_writable, whole_folder
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
@@ -97,22 +96,22 @@ def read_parts(
     """
     if axis not in AXES:
         raise InputError(f"--axis is one of {', '.join(AXES)}, not {axis!r}: the way the plug comes out")
-    units = [unit_of(path, unit) for path in (plug, socket)]
+    units = [find_unit(path, unit) for path in (plug, socket)]
     if None in units:
         raise InputError(
             f"{(plug, socket)[units.index(None)].name} does not say its unit: give --unit {', '.join(UNITS)}"
         )
     first, second = (load_part(path, str(one)) for path, one in zip((plug, socket), units, strict=True))
     scale = UNITS[str(units[1])]
-    first = first.moved(_rotation(np.asarray(plug_pose[3:]) * DEGREE), np.asarray(plug_pose[:3]) * scale)
+    first = first.transform(_rotation(np.asarray(plug_pose[3:]) * DEGREE), np.asarray(plug_pose[:3]) * scale)
     z = np.array(AXES[axis], dtype=float)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
-    first, second = (part.moved(to_target, np.zeros(3)) for part in (first, second))
-    origin = np.array([*centre_of_mass(first)[:2], first.bounds[0, 2]])
+    first, second = (part.transform(to_target, np.zeros(3)) for part in (first, second))
+    origin = np.array([*compute_centre_of_mass(first)[:2], first.bounds[0, 2]])
     if centre is not None:
         origin[:2] = (to_target @ (np.asarray(centre, dtype=float) * scale))[:2]
-    return first.moved(np.eye(3), -origin), second.moved(np.eye(3), -origin)
+    return first.transform(np.eye(3), -origin), second.transform(np.eye(3), -origin)
 
 
 def _rotation(angles: np.ndarray) -> np.ndarray:
@@ -156,8 +155,8 @@ def create_task(
     _check_given(friction, scenario)
     parts = read_parts(plug, socket, unit, plug_pose, axis, centre)
     check_target(*parts)
-    path = motion(*parts, turn * DEGREE, CLEAR)
-    clearance = side_clearance(*parts)
+    path = plan_motion(*parts, turn * DEGREE, CLEAR)
+    clearance = measure_side_clearance(*parts)
     snapping = _snapping(*parts, path)
     say(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
     say(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
@@ -182,14 +181,14 @@ def _check_given(friction: float, scenario: Sequence[Path]) -> None:
             raise InputError(f"two scenarios are called {file.name}, and both go into one folder: rename one")
 
 
-def _snapping(plug: Part, socket: Part, path: Motion) -> frozenset[int]:
+def _snapping(plug: Part, socket: Part, path: InsertionMotion) -> frozenset[int]:
     """Numbers of the plug's bodies that overlap the socket on the way.
 
     Raises:
         InputError: if that is all there is of the plug: a rigid part that doesn't fit.
     """
-    ways = in_the_way(plug, socket, path)
-    blocked = frozenset(i for i, (depth, _) in enumerate(ways) if depth > RESTING)
+    ways = find_obstructions(plug, socket, path)
+    blocked = frozenset(i for i, (depth, _) in enumerate(ways) if depth > MAX_RESTING_OVERLAP)
     if blocked and len(blocked) == len(ways):
         depth, height = max(ways)
         raise InputError(
@@ -204,7 +203,7 @@ def _make(
     folder: Path,
     name: str,
     parts: tuple[Part, Part],
-    path: Motion,
+    path: InsertionMotion,
     clearance: float,
     snapping: frozenset[int],
     force_limit: float,
@@ -220,9 +219,9 @@ def _make(
     for file in scenario:
         shutil.copy(file, folder / file.name)
     numbers = {"name": name, "force_limit": force_limit, "friction": friction, "scenario": scenario, "path": path}
-    same, near = sides(*parts, path)
+    same, near = find_symmetries(*parts, path)
     numbers |= {"sides": same, "rim_sides": near}
-    say(f"the parts look the same from {len(same)} of 7 other sides, and the rim nearly so from {len(near)} more")
+    say(f"symmetry: {len(same)} of 7 candidate rotations and reflections, {len(near)} more approximately on the rim")
     contact, push, aligned = _choose_contact(folder, parts, numbers, clearance, snapping, say)
     file = _task_file(parts, contact, push, numbers)
     off = [insert(folder, file, offset=one, snapping=contact.snapping_pieces) for one in BESIDE]
@@ -265,7 +264,7 @@ def _choose_contact(
     for side, part in zip(("plug", "socket"), parts, strict=True):
         if snapping and side == "socket":
             continue  # what gives way is in the plug
-        cut = [convex_pieces(solid) for solid in solids(part)]
+        cut = [cut_into_convex_pieces(solid) for solid in make_solids(part)]
         if any(body is None for body in cut):
             say(f"{side}: too intricate to be cut into convex pieces")
             continue
@@ -335,7 +334,7 @@ def _write_pieces(folder: Path, parts: tuple[Part, Part], contact: Contact) -> N
     for old in [*folder.glob("plug_*.obj"), *folder.glob("socket_*.obj")]:
         old.unlink()
     for file, _, solid in contact.pieces:
-        (folder / file).write_text(obj_text(*as_arrays(solid)), encoding="utf-8")
+        (folder / file).write_text(obj_text(*to_arrays(solid)), encoding="utf-8")
 
 
 def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers: dict[str, Any]) -> Any:
@@ -357,7 +356,7 @@ def _task_file(parts: tuple[Part, Part], contact: Contact, push: float, numbers:
         models[name] = PartModel(
             source=part.path.name,
             visual=f"{name}.obj",
-            mass=round(max(1e-3, DENSITY * sum(solid.volume() for solid in solids(part)) * 1e-9), 6),
+            mass=round(max(1e-3, DENSITY * sum(solid.volume() for solid in make_solids(part)) * 1e-9), 6),
             centre=tuple(np.round(middle, 6).tolist()),
             gyration=round(float(np.sqrt(((vertices - middle) ** 2).sum(axis=1).mean())), 6),
             pieces=tuple(pieces),
@@ -395,7 +394,7 @@ def _size(part: Part) -> str:
 
 def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
     """The unit, asked for at a terminal where neither an argument nor the format says it."""
-    if given is not None or all(unit_of(path, None) for path in paths) or not sys.stdin.isatty():
+    if given is not None or all(find_unit(path, None) for path in paths) or not sys.stdin.isatty():
         return given
     if any(not path.is_file() for path in paths):
         return given  # which is said better where the files are read

@@ -21,8 +21,13 @@ from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform
 from guiderail.models.objects.bnc_connector.demonstrations import NAMES
-from guiderail.models.parts.assembly_check import nearest_on_surface
-from guiderail.models.parts.motion import NUM_DEMONSTRATIONS, demonstrator_motions, searching, straight
+from guiderail.models.parts.assembly_check import find_nearest_on_surface
+from guiderail.models.parts.demonstrator import (
+    NUM_DEMONSTRATIONS,
+    demonstrator_motions,
+    plan_search,
+    plan_straight_insertion,
+)
 from guiderail.models.primitives import Demonstrations
 from guiderail.systems.recorder import Recording
 
@@ -91,7 +96,7 @@ class Depths:
                 X_BW = body.EvalPoseInWorld(context).inverse()
                 inside = X_BW.multiply(points.T).T
                 snaps = any(inspector.GetName(one).split("::")[-1] in self._snapping for one in ids)
-                depth = float(nearest_on_surface(inside, self._surfaces[body.name()])[1].max())
+                depth = float(find_nearest_on_surface(inside, self._surfaces[body.name()])[1].max())
                 if snaps:
                     self.deepest_snap = max(self.deepest_snap, depth)
                 else:
@@ -120,7 +125,9 @@ def insert(
         measure_depth: whether depths are measured, which takes longer than the simulation.
     """
     numbers = file.motion
-    times, poses = straight(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
+    times, poses = (
+        plan_straight_insertion(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
+    )
     world = workcell(folder, file)
     station = GantryStation(world, time_step=file.time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
@@ -211,7 +218,7 @@ MOST_SESSIONS = 3  # of five attempts, until five have seated the plug
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
     """Writes the demonstrations' file; returns how many of them seat the plug."""
     numbers = file.motion
-    script = searching(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
+    script = plan_search(numbers.travel, numbers.rim, file.turn, numbers.push, numbers.press)
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
     good: list[np.ndarray] = []
     bad: list[np.ndarray] = []

@@ -8,7 +8,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.rewards import NUM_STEPS, POSE_CENTRE, POSE_SCALE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
-from guiderail.models.objects.bnc_connector.motion import RIM
+from guiderail.models.objects.bnc_connector.demonstrations import RIM
 from guiderail.models.objects.bnc_connector.search_demonstrations import HOLD_UNTIL, SEARCH
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 

@@ -20,7 +20,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.objects.insertion import COLLISION_FORCE, REPEATABILITY_STD
-from guiderail.models.parts.symmetry import SIDES
+from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import LinearConstraints
 
 FILE_NAME = "task.yaml"
@@ -197,8 +197,8 @@ class PartTaskFile(Options):
     @classmethod
     def _are_sides(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for name in value:
-            if name not in SIDES:
-                raise ValueError(f"there is no side {name!r}: {did_you_mean(name, SIDES)}")
+            if name not in SYMMETRIES:
+                raise ValueError(f"there is no side {name!r}: {did_you_mean(name, SYMMETRIES)}")
         return value
 
     @property

@@ -36,8 +36,8 @@ from guiderail.models.objects.insertion import (
     LEVER_SCALE,
     MIN_CONTACT_FORCE,
 )
-from guiderail.models.parts.model_files import part_sdf
-from guiderail.models.parts.symmetry import SIDES
+from guiderail.models.parts.mesh_file import part_sdf
+from guiderail.models.parts.symmetry import SYMMETRIES
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.center_of_pressure import CenterOfPressure
 from guiderail.systems.episode_monitor import TerminationTerm
@@ -155,7 +155,7 @@ class PartInsertion(InsertionTask):
     def _seen_from(self, names: Sequence[str]) -> Symmetry | None:
         action_dims = self.config.options["action_dims"]
         every = sides_of_the_rim(self.config.observation, range(POSE_SIZE) if action_dims is None else action_dims)
-        chosen = [number for number, name in enumerate(SIDES) if name in names]
+        chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
         return Symmetry(every[0][chosen], every[1][chosen]) if every is not None and chosen else None
 
     @classmethod

@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.objects.bnc_connector.geometry import MM
-from guiderail.models.objects.bnc_connector.motion import insert_and_lock
+from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.primitives import Demonstrations
 
 PATH = Path(__file__).with_name("bnc_connector.npz")
@@ -24,7 +23,31 @@ NUM_DEMONSTRATIONS = 5
 NUM_STEPS = 400
 NAMES = ("x [m]", "y [m]", "z [m]", "Rz [rad]", "Ry [rad]", "Rx [rad]")
 
-DEGREE = np.deg2rad(1.0)
+QUARTER_TURN = np.pi / 2
+# Plug heights in the locked frame, from the drawing's deep entry.
+CLEAR = 15.5 * MM  # the mouth well above the jack
+RIM = 10.5 * MM  # the mouth on the barrel's rim
+# Commands lie below the surface that stops them: under impedance control, the difference is the push.
+SEARCH_PUSH = 2.5 * MM
+SEAT_COMMAND = -6.0 * MM
+LOCK_COMMAND = -8.0 * MM
+
+# time [s], z [m], Rz [rad]
+WAYPOINTS = np.array(
+    [
+        [0.0, CLEAR, QUARTER_TURN],
+        [0.2, CLEAR, QUARTER_TURN],
+        [1.4, RIM - SEARCH_PUSH, QUARTER_TURN],
+        [3.6, RIM - SEARCH_PUSH - 0.5 * MM, QUARTER_TURN],
+        [4.4, SEAT_COMMAND, QUARTER_TURN],
+        [4.7, SEAT_COMMAND, QUARTER_TURN],
+        [6.8, LOCK_COMMAND, 0.0],
+        [7.1, LOCK_COMMAND, 0.0],
+        [7.6, 0.0, 0.0],
+        [8.0, 0.0, 0.0],
+    ]
+)
+
 # How much the hand varies, as standard deviations: above the jack, touching the rim, wandering over it, dropping in,
 # seated, turning, locked. Times are those of the motion's waypoints.
 _TIMES = [0.0, 1.2, 1.6, 3.4, 4.1, 4.8, 7.0, 8.0]  # [s]
@@ -39,6 +62,19 @@ _DEVIATIONS = {
 _CORRELATION = {"x": 0.22, "y": 0.22, "z": 0.35, "Rz": 0.5, "Ry": 0.3, "Rx": 0.3}  # [s] how quickly the hand wanders
 _CENTRING = 0.9  # five random curves have a mean of their own; this much of it is taken out: nobody knows a better path
 _TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # [s]: ahead of or behind the script by this much, for this long
+
+
+def poses(z: np.ndarray | float, yaw: np.ndarray | float) -> np.ndarray:
+    """Upright poses [x y z Rz Ry Rx] on the centre line, (N, 6)."""
+    z, yaw = np.broadcast_arrays(np.atleast_1d(z), yaw)
+    zero = np.zeros_like(z, dtype=float)
+    return np.stack([zero, zero, z, yaw, zero, zero], axis=1)
+
+
+def insert_and_lock() -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) and desired poses (N, 6) of the whole motion for a jack whose place is known."""
+    times, z, yaw = WAYPOINTS.T
+    return times, poses(z, yaw)
 
 
 def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:

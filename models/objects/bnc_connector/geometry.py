@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from guiderail.models.common.units import MM
 from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, equal_area_radius, lathe, strip
 
-MM = 1e-3
 FOLDER = Path(__file__).parent
 JACK_SDF = FOLDER / "bnc_jack.sdf"
 PLUG_SDF = FOLDER / "bnc_plug.sdf"

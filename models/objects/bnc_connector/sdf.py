@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.objects.bnc_connector.geometry import FOLDER, MM, BncDimensions, bore_mesh, ring_mesh, slot_mesh
+from guiderail.models.common.units import MM
+from guiderail.models.objects.bnc_connector.geometry import FOLDER, BncDimensions, bore_mesh, ring_mesh, slot_mesh
 from guiderail.models.objects.sdf import (
     ContactMaterial,
     at,

@@ -14,13 +14,21 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, correlated
-from guiderail.models.objects.bnc_connector.motion import CLEAR, LOCK_COMMAND, MM, QUARTER_TURN, RIM, SEAT_COMMAND
+from guiderail.models.common.units import DEGREE, MM
+from guiderail.models.objects.bnc_connector.demonstrations import (
+    CLEAR,
+    LOCK_COMMAND,
+    NUM_DEMONSTRATIONS,
+    QUARTER_TURN,
+    RIM,
+    SEAT_COMMAND,
+    correlated,
+)
 from guiderail.models.primitives import Demonstrations
 
 PATH = Path(__file__).with_name("bnc_search.npz")
 
-DEGREE = np.deg2rad(1.0)
+
 RADIUS = 2.5 * MM  # of the circle
 TURN = 0.3  # [s] for once around: much quicker than the search is long, so that no moment of it has a side
 SEARCH_PUSH = 1.5 * MM  # below the rim, against the impedance: a couple of newtons

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
+from guiderail.models.common.units import MM
 from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, lathe, strip
 
-MM = 1e-3
 FOLDER = Path(__file__).parent
 CLAMP_SDF = FOLDER / "grid_clamp.sdf"
 TABLE_SDF = FOLDER / "grid_table.sdf"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from guiderail.models.common.units import MM
 from guiderail.models.objects.grid_clamp.geometry import (
     CLAMP_SDF,
     FOLDER,
-    MM,
     TABLE_SDF,
     GridClampDimensions,
     bead_mesh,

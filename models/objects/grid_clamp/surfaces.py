@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from guiderail.models.objects.grid_clamp.geometry import MM, NUM_SIDES, GridClampDimensions, peg_mesh
+from guiderail.models.common.units import MM
+from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions, peg_mesh
 from guiderail.models.objects.grid_clamp.sdf import BEAD, FRICTION
 from guiderail.models.objects.surfaces import Box, Hull, Spring, Surface, ring_hulls
 

@@ -19,7 +19,8 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform
-from guiderail.models.objects.bnc_connector.motion import MM, insert_and_lock
+from guiderail.models.common.units import MM
+from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.models.robots.robot import find_robot
 
 WORKCELL = BncWorkcell()

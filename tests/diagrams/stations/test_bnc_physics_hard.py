@@ -8,8 +8,8 @@ from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
 from guiderail.models.common.units import MM
+from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.bnc_connector.motion import CLEAR, insert_and_lock, poses
 
 FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
 HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()

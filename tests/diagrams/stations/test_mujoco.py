@@ -12,7 +12,7 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.workcell import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.workcell import GridClampWorkcell
 from guiderail.models.common.units import MM
-from guiderail.models.objects.bnc_connector.motion import CLEAR, insert_and_lock, poses
+from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 
 pytest.importorskip("mujoco")
 import mujoco

@@ -6,8 +6,9 @@ import re
 import numpy as np
 import pytest
 
+from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector import sdf as write_bnc
-from guiderail.models.objects.bnc_connector.geometry import FOLDER, MM, BncDimensions
+from guiderail.models.objects.bnc_connector.geometry import FOLDER, BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION
 from guiderail.models.objects.grid_clamp import sdf as write_grid_clamp
 from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions

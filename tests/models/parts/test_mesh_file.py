@@ -1,4 +1,4 @@
-"""What is wrong with a mesh is one sentence with the remedy."""
+"""A faulty mesh is refused in one sentence with the remedy."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def hollow(mesh):
     return trimesh.util.concatenate([mesh, cavity])
 
 
-def inside_out_beside(mesh):
+def inside_out_next_to_another(mesh):
     return trimesh.util.concatenate([mesh, inside_out(box()).apply_translation((30.0, 0.0, 0.0))])
 
 
@@ -40,7 +40,7 @@ def one_flipped(mesh):
 
 
 @pytest.mark.parametrize("ending", ["stl", "obj"])
-def test_a_sound_part_comes_in_metres(ending, tmp_path):
+def test_load_part_returns_metres(ending, tmp_path):
     box().export(tmp_path / f"part.{ending}")
     part = load_part(tmp_path / f"part.{ending}", "mm")
     np.testing.assert_allclose(np.ptp(part.bounds, axis=0), [0.01, 0.01, 0.02])
@@ -48,23 +48,23 @@ def test_a_sound_part_comes_in_metres(ending, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("spoil", "unit", "says"),
+    ("spoil", "unit", "message"),
     [
         (hole, "mm", r"not watertight \(3 open edges.*close it"),
         (inside_out, "mm", "inside out.*flip its normals"),
-        (inside_out_beside, "mm", "inside out.*flip its normals"),
+        (inside_out_next_to_another, "mm", "inside out.*flip its normals"),
         (hollow, "mm", "has a closed cavity, around .*fill it"),
         (one_flipped, "mm", "face different ways.*recalculate"),
         (lambda mesh: mesh, "m", "would be 20 m long with --unit m: is its unit mm or cm"),
     ],
 )
-def test_a_fault_has_a_remedy(spoil, unit, says, tmp_path):
+def test_load_part_names_the_remedy_when_a_mesh_is_faulty(spoil, unit, message, tmp_path):
     spoil(box()).export(tmp_path / "part.stl")
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         load_part(tmp_path / "part.stl", unit)
 
 
-def test_a_file_that_is_no_mesh_is_refused(tmp_path):
+def test_load_part_refuses_files_without_a_mesh(tmp_path):
     (tmp_path / "part.stl").write_bytes(b"solid nothing\n")
     (tmp_path / "part.txt").write_text("")
     for name in ("part.stl", "part.txt", "none.stl"):

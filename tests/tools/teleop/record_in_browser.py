@@ -19,7 +19,7 @@ import numpy as np
 import websockets
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD as PERIOD
-from guiderail.models.objects.bnc_connector.motion import RIM, SEARCH_PUSH, SEAT_COMMAND
+from guiderail.models.objects.bnc_connector.demonstrations import RIM, SEARCH_PUSH, SEAT_COMMAND
 from guiderail.tools.environments import task_named
 from guiderail.tools.teleop.recorder import SLIDERS, DemonstrationRecorder
 

@@ -1,8 +1,8 @@
 import numpy as np
 
+from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector import demonstrations
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS, demonstrator_motions
-from guiderail.models.objects.bnc_connector.geometry import MM
 from research.generate.bnc_connector import TIMES as TIMES_RECORDED
 from research.generate.bnc_connector import record_one
 

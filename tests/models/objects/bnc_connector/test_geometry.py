@@ -12,9 +12,9 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform
 
+from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector.geometry import (
     FOLDER,
-    MM,
     BncDimensions,
     bore_mesh,
     ring_mesh,

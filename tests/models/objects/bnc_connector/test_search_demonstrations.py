@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.models.common.units import MM
 from guiderail.models.objects.bnc_connector import search_demonstrations as bnc_search
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS
-from guiderail.models.objects.bnc_connector.geometry import MM
 from research.generate.bnc_connector import TIMES, record_one
 
 SEARCHING = slice(0, round(bnc_search.SEARCH[1] / 0.02))

@@ -3,9 +3,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from guiderail.models.common.units import MM
 from guiderail.models.objects.grid_clamp.geometry import (
     FOLDER,
-    MM,
     GridClampDimensions,
     bead_mesh,
     hole_mesh,

@@ -1,7 +1,7 @@
-"""How a scripted demonstrator puts a plug in: straight for a test, searching for demonstrations.
+"""Scripted demonstrator of an insertion: a straight motion for tests, and a search for demonstrations.
 
-Poses are of the plug in the target frame, [x y z Rz Ry Rx]. A command lies below what stops the plug: under impedance
-control the difference is the push.
+Poses are those of the plug in the target frame, [x y z Rz Ry Rx]. A command lies below the surface that stops the plug:
+under impedance control the difference is the push.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from guiderail.models.common.units import DEGREE, MM
 from guiderail.models.objects.bnc_connector.demonstrations import correlated
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]
-INSERTION_SPEED = 12.0 * MM
-TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # [m] above and below the rim, and how fast it passes that [m/s]
+INSERTION_SPEED = 12.0 * MM  # [m/s]
+TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # height above and below the rim [m], and the speed there [m/s]
 TURN_SPEED = 45.0 * DEGREE  # [rad/s]
-SEARCH = 1.8  # [s] on the rim
-PAUSE = 0.3  # [s] after each part of the motion
+SEARCH = 1.8  # time on the rim [s]
+PAUSE = 0.3  # time after each part of the motion [s]
 NUM_DEMONSTRATIONS = 5
 
-# How much the hand varies, as standard deviations [m, rad], at the waypoints of `searching`: it wanders over the rim,
-# and is precise where the parts leave no choice.
+# Standard deviations of the hand [m, rad]: wide on the rim, narrow where the parts guide the motion.
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
 _NARROW = np.array([0.12 * MM, 0.12 * MM, 0.4 * MM, 0.5 * DEGREE, 0.15 * DEGREE, 0.15 * DEGREE])
-_CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # [s]
-_CENTRING = 0.9  # of the mean of five random curves that is taken out: nobody knows a better path
+_CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # correlation times of the deviations [s]
+_CENTRING = 0.9  # part of the mean of the five random curves that is removed
 
 
-def straight(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) and poses (N, 6): down, slowly past the rim, pushing, a turn where there is one, and to the target.
+def plan_straight_insertion(travel: float, rim: float, turn: float, push: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) and poses (N, 6) of an insertion: down, slowly past the rim, a push, a turn, and to the target.
 
     Args:
-        travel, rim: heights of the start, and of a plug that stands on the rim [m].
-        turn: at the bottom [rad].
-        push: commanded below the target [m].
+        travel: Height of the start [m].
+        rim: Height of a plug that stands on the rim [m].
+        turn: Angle of the turn at the bottom [rad].
+        push: Distance of the command below the target [m].
     """
     low = rim - TOUCH
     points = [
@@ -50,8 +50,16 @@ def straight(travel: float, rim: float, turn: float, push: float) -> tuple[np.nd
     return _poses([(0.0, travel, -turn), *points])
 
 
-def searching(travel: float, rim: float, turn: float, push: float, press: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) and poses (N, 6) of a demonstration: to the rim, a search on it, in, a turn where there is one."""
+def plan_search(travel: float, rim: float, turn: float, push: float, press: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (N,) and poses (N, 6) of a demonstration: to the rim, a search there, the insertion and a turn.
+
+    Args:
+        travel: Height of the start [m].
+        rim: Height of a plug that stands on the rim [m].
+        turn: Angle of the turn at the bottom [rad].
+        push: Distance of the command below the target [m].
+        press: Distance of the command below the rim in the search [m].
+    """
     down = (travel - rim + press) / DESCENT_SPEED + 0.3
     points = [
         (0.0, travel, -turn),
@@ -70,17 +78,17 @@ def searching(travel: float, rim: float, turn: float, push: float, press: float)
 def demonstrator_motions(
     seed: int, script: tuple[np.ndarray, np.ndarray], press_from: float, times: np.ndarray
 ) -> np.ndarray:
-    """Five searching motions (5, N, 6) at `times` (N,) [s]: like a hand, never twice the same.
+    """Return five different searches (5, N, 6) at `times` (N,) [s].
 
     Args:
-        seed: of the hand.
-        script: of `searching`.
-        press_from: height of the command above which the hand wanders [m].
-        times: of the control steps.
+        seed: Seed of the random deviations.
+        script: Times and poses of `plan_search`.
+        press_from: Height of the command above which the deviations are wide [m].
+        times: Times of the control steps [s].
     """
     rng = np.random.default_rng(seed)
-    at, poses = script
-    heights = np.interp(times, at, poses[:, 2])
+    script_times, poses = script
+    heights = np.interp(times, script_times, poses[:, 2])
     # From wide to narrow over the first 3 mm below the search.
     wide = np.clip((heights - press_from) / (3.0 * MM) + 1.0, 0.0, 1.0)[:, None]
     scale = wide * _WIDE + (1.0 - wide) * _NARROW
@@ -91,12 +99,12 @@ def demonstrator_motions(
         ]
     )
     wander = curves - _CENTRING * curves.mean(axis=0)
-    nominal = np.stack([np.interp(times, at, column) for column in poses.T], axis=1)
+    nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
     return nominal + scale * wander
 
 
 def _poses(points: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray]:
-    lasts, heights, turns = np.array(points).T
+    durations, heights, turns = np.array(points).T
     poses = np.zeros((len(points), POSE_SIZE))
     poses[:, 2], poses[:, 3] = heights, turns
-    return np.cumsum(lasts), poses
+    return np.cumsum(durations), poses

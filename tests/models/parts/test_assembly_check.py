@@ -1,0 +1,63 @@
+"""Parts are checked for overlap, clearance between walls and a free way to the target."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.parts.assembly_check import (
+    check_target,
+    find_obstructions,
+    make_solids,
+    measure_side_clearance,
+    plan_motion,
+)
+from guiderail.models.parts.mesh_file import Part, load_part
+
+pytest.importorskip("trimesh")
+pytest.importorskip("manifold3d")
+
+from oracles.parts import PARTS
+
+
+def load(name, folder):
+    return tuple(load_part(path, "mm") for path in PARTS[name]().write(folder))
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_side_clearance_equals_that_of_the_drawing(name, tmp_path):
+    assert measure_side_clearance(*load(name, tmp_path)) == pytest.approx(1e-3 * PARTS[name]().clearance, abs=2e-6)
+
+
+def test_check_target_refuses_overlapping_parts(tmp_path):
+    plug, socket = load("square_peg", tmp_path)
+    check_target(plug, socket)
+    shifted = plug.transform(np.eye(3), np.array([5e-4, 0.0, 0.0]))
+    with pytest.raises(InputError, match=r"overlap at the target by about 0\.\d+ mm.*--plug-pose"):
+        check_target(shifted, socket)
+
+
+def test_plan_motion_refuses_a_plug_above_its_socket(tmp_path):
+    plug, socket = load("square_peg", tmp_path)
+    assert plan_motion(plug, socket, 0.0).rim == pytest.approx(15e-3)
+    with pytest.raises(InputError, match=r"ends 5\.0 mm above the socket"):
+        plan_motion(plug.transform(np.eye(3), np.array([0, 0, 0.02])), socket, 0.0)
+
+
+def test_find_obstructions_finds_snaps_and_passes_turns(tmp_path):
+    plug, socket = load("snap_fit", tmp_path)
+    obstructions = find_obstructions(plug, socket, plan_motion(plug, socket, 0.0))
+    assert [depth > 2e-6 for depth, _ in obstructions] == [False, True, True]
+    plug, socket = load("bayonet", tmp_path)
+    turning, straight = (
+        find_obstructions(plug, socket, plan_motion(plug, socket, np.deg2rad(turn)))[0] for turn in (40, 0)
+    )
+    assert turning[0] < 2e-6 < straight[0]
+
+
+def test_make_solids_refuses_faces_that_cross():
+    tetrahedron = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) * 0.01
+    flat = np.array([[0, 1, 2], [0, 2, 1], [0, 1, 3]])
+    with pytest.raises(InputError, match="cross each other"):
+        make_solids(Part(Path("x.stl"), ((tetrahedron, flat),)))
