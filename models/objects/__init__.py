@@ -1,0 +1,1 @@
+"""Geometry, assets and demonstrations of the objects, one folder each."""

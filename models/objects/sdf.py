@@ -1,4 +1,4 @@
-"""The pieces of an object's SDF file: surfaces that touch, surfaces that are seen, and a model of one link."""
+"""SDF files of objects: collision and visual geometry, and models with one link."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-# A folder is removed when the last reference to it goes: a simulator may read a mesh long after it read the SDF file.
+# References that keep the folders: a simulator may read a mesh long after the SDF file.
 _FOLDERS: list[TemporaryDirectory[str]] = []
 
 
 @cache
 def generate_assets(files: Callable[..., dict[str, str]], *dimensions: Hashable) -> Path:
-    """The folder that holds `files(*dimensions)`, which gives what each file holds by its name."""
+    """Return a temporary folder with the files `files(*dimensions)`, a mapping from file name to content."""
     folder = TemporaryDirectory(prefix="guiderail-")
     _FOLDERS.append(folder)
     for name, content in files(*dimensions).items():
@@ -27,13 +27,22 @@ DRAKE_NAMESPACE = 'xmlns:drake="drake.mit.edu"'
 
 @dataclass(frozen=True)
 class ContactMaterial:
-    """How a surface gives way; `modulus` None is rigid. Moduli are of the contact model, not of the material."""
+    """Hydroelastic contact parameters of a surface; they are those of the contact model, not of a material.
+
+    Attributes:
+        friction: Coefficient of static and dynamic friction.
+        modulus: Pressure at full depth [Pa]; None: rigid.
+        resolution: Edge length of a curved primitive's mesh [m].
+        dissipation: Hunt-Crossley dissipation [s/m].
+        margin: Distance at which a compliant surface enters the contact computation [m], so that no step penetrates
+            deeply.
+    """
 
     friction: float
-    modulus: float | None = None  # [Pa] pressure at full depth
-    resolution: float | None = None  # [m] edge length of a curved primitive's mesh
-    dissipation: float = 1.0  # [s/m]
-    margin: float | None = None  # [m] by which a compliant surface is felt before it touches, so that no step leaps in
+    modulus: float | None = None
+    resolution: float | None = None
+    dissipation: float = 1.0
+    margin: float | None = None
 
 
 def _proximity(material: ContactMaterial) -> str:
@@ -55,32 +64,32 @@ def _proximity(material: ContactMaterial) -> str:
 
 
 def cylinder(radius: float, length: float) -> str:
-    """A cylinder [m] about z."""
+    """Return a cylinder [m] about z."""
     return f"<cylinder><radius>{radius:g}</radius><length>{length:g}</length></cylinder>"
 
 
 def box(x: float, y: float, z: float) -> str:
-    """A box by its sizes [m]."""
+    """Return a box with the given sizes [m]."""
     return f"<box><size>{x:g} {y:g} {z:g}</size></box>"
 
 
 def mesh(file: str) -> str:
-    """A surface from an OBJ file beside the SDF file."""
+    """Return a surface from an OBJ file in the folder of the SDF file."""
     return f"<mesh><uri>{file}</uri></mesh>"
 
 
 def convex_mesh(file: str) -> str:
-    """A convex solid from an OBJ file beside the SDF file, which may be compliant."""
+    """Return a convex solid, which may be compliant, from an OBJ file in the folder of the SDF file."""
     return f"<mesh><uri>{file}</uri><drake:declare_convex/></mesh>"
 
 
 def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, pitch: float = 0.0) -> str:
-    """A pose in the link [m, rad]."""
+    """Return a pose in the link [m, rad]."""
     return f"{x:g} {y:g} {z:g} 0 {pitch:.6g} 0"
 
 
 def collision(name: str, pose: str, geometry: str, material: ContactMaterial) -> str:
-    """A surface that touches."""
+    """Return a collision element."""
     return f"""
       <collision name="{name}">
         <pose>{pose}</pose>
@@ -90,7 +99,7 @@ def collision(name: str, pose: str, geometry: str, material: ContactMaterial) ->
 
 
 def visual(name: str, pose: str, geometry: str, color: str) -> str:
-    """A surface that is seen; `color` is "r g b a"."""
+    """Return a visual element; `color` is "r g b a"."""
     return f"""
       <visual name="{name}">
         <pose>{pose}</pose>
@@ -107,9 +116,15 @@ def model(
     contents: str,
     source: str = "guiderail.models.objects",
 ) -> str:
-    """A file with one model of one link, both called `name`; mass [kg], centre of mass (3,) and gyration [m].
+    """Return an SDF file with one model of one link.
 
-    `source` is what the file is written from, for whoever would change a number in it.
+    Args:
+        name: Name of the model and the link.
+        mass: Mass [kg].
+        centre: Centre of mass (3,) [m].
+        radius_of_gyration: Radius of gyration [m].
+        contents: Collision and visual elements.
+        source: Module or file that the dimensions come from, named in a comment.
     """
     inertia = mass * radius_of_gyration**2
     return f"""<?xml version="1.0"?>

@@ -1,4 +1,4 @@
-"""What touches what, as convex solids: for engines that collide nothing else."""
+"""Collision geometry as convex solids, for physics engines that support nothing else."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import numpy as np
 
 from guiderail.models.common.units import MM
 
-# Convex pieces that only meet catch what slides over their seam: there the nearest way out of a piece is sideways. So
-# each goes on for SHOULDER into its neighbours, and is BELOW their surface at its end: a way out at nine degrees.
+# A seam between convex pieces that only meet would catch a sliding body, because the shortest way out of a piece is
+# sideways there. Each piece therefore extends by SHOULDER into its neighbours and ends BELOW their surface, which makes
+# an angle of nine degrees.
 SHOULDER, BELOW = 0.3 * MM, 0.05 * MM
 
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A cylinder about its z."""
+    """Cylinder about its z axis."""
 
     radius: float  # [m]
     length: float  # [m]
@@ -23,7 +24,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Box:
-    """A box by its sizes."""
+    """Box with its sizes."""
 
     x: float  # [m]
     y: float  # [m]
@@ -32,18 +33,18 @@ class Box:
 
 @dataclass(frozen=True)
 class Hull:
-    """The convex hull of vertices (V, 3) [m]."""
+    """Convex hull of vertices (V, 3) [m]."""
 
     vertices: np.ndarray
 
 
 @dataclass(frozen=True)
 class Spring:
-    """What a surface gives way on, where the engine's own contact is too hard: a slide.
+    """Sprung slide of a surface, for an engine whose own contact is too hard.
 
     Attributes:
-        axis: along which it slides, (3,), in its body.
-        stiffness: [N/m].
+        axis: Direction of the slide (3,) in the body's frame.
+        stiffness: Stiffness [N/m].
     """
 
     axis: tuple[float, float, float]
@@ -52,16 +53,16 @@ class Spring:
 
 @dataclass(frozen=True)
 class Surface:
-    """A convex solid that touches.
+    """Convex solid of a body's collision geometry.
 
     Attributes:
-        name: of the solid, unlike any other's.
-        pair: which other surfaces it touches: those of the other body's with the same pair, and nothing else.
-        shape: what it is, in its own frame.
-        friction: of the pair.
-        position: of its frame in its body, (3,) [m].
-        pitch: of its frame, about the body's y [rad].
-        spring: what it is mounted on; None: on its body.
+        name: Unique name.
+        pair: Name of the pair; the surface collides with those surfaces of the other body that have the same pair.
+        shape: Shape in the surface's frame.
+        friction: Friction coefficient of the pair.
+        position: Position (3,) [m] of the frame in the body.
+        pitch: Rotation of the frame about the body's y axis [rad].
+        spring: Slide that carries the surface; None: it is fixed to the body.
     """
 
     name: str
@@ -74,14 +75,14 @@ class Surface:
 
 
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:
-    """The convex pieces of a ring about z with a polygon for every circle, whose corners are half a side from x.
+    """Return the convex pieces of a polygonal ring about z, whose first corner is half a side from x.
 
     Args:
-        profile: (K, 2), corners of its convex section as [radius of the circle inside the polygon, height] [m].
-        num_sides: of the polygon, as `triangle_mesh.lathe` counts them.
+        profile: Corners (K, 2) of the convex section as [radius of the circle inside the polygon, height] [m].
+        num_sides: Number of sides, as for `triangle_mesh.lathe`.
 
     Returns:
-        Vertices (4 K, 3) of each piece, shoulders included.
+        Vertices (4 K, 3) [m] of each piece, including shoulders.
     """
     radius, height = np.asarray(profile, dtype=float).T
     radius = radius / np.cos(np.pi / num_sides)

@@ -1,4 +1,4 @@
-"""A triangle mesh as it is written to a Wavefront OBJ file."""
+"""Triangle meshes for Wavefront OBJ files."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ import numpy as np
 
 
 def cylindrical(radius: np.ndarray | float, angle: np.ndarray | float, height: np.ndarray | float) -> np.ndarray:
-    """Points (N, 3) from cylindrical coordinates about z."""
+    """Return points (N, 3) from cylindrical coordinates about z."""
     radius, angle, height = np.broadcast_arrays(radius, angle, height)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
 
 
 def equal_area_radius(radius: float, num_sides: int) -> float:
-    """To the corners of the regular polygon that has the area of a circle of `radius`, both in [m]."""
+    """Return the radius [m] of the corners of the regular polygon with the area of a circle of `radius` [m]."""
     turn = 2.0 * np.pi / num_sides
     return radius * float(np.sqrt(turn / np.sin(turn)))
 
 
 def strip(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Quads between two polylines (N, 3), seen counter-clockwise from where `second` lies right of `first`."""
+    """Return quads between two polylines (N, 3), counter-clockwise as seen with `second` to the right of `first`."""
     return np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
 
 
 @dataclass(frozen=True)
 class TriangleMesh:
-    """Vertices (V, 3) [m] and triangles (T, 3) of vertex numbers, counter-clockwise as seen from outside."""
+    """Triangle mesh: vertices (V, 3) [m] and triangles (T, 3), counter-clockwise as seen from outside."""
 
     vertices: np.ndarray
     triangles: np.ndarray
 
     @staticmethod
     def from_quads(quads: np.ndarray) -> TriangleMesh:
-        """Splits quadrilaterals (Q, 4, 3), each counter-clockwise, in two; equal corners become one vertex."""
-        corners = np.round(np.asarray(quads, dtype=float), 9).reshape(-1, 3) + 0.0  # -0.0 and 0.0 are one corner
+        """Return the mesh of counter-clockwise quads (Q, 4, 3), each cut in two; equal corners become one vertex."""
+        corners = np.round(np.asarray(quads, dtype=float), 9).reshape(-1, 3) + 0.0  # -0.0 becomes 0.0
         vertices, numbers = np.unique(corners, axis=0, return_inverse=True)
         a, b, c, d = numbers.reshape(-1, 4).T
         triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
@@ -44,13 +44,13 @@ class TriangleMesh:
         return TriangleMesh(vertices, triangles[has_area])
 
     def normals(self) -> np.ndarray:
-        """Unit normal of every triangle, (T, 3)."""
+        """Return the unit normals (T, 3) of the triangles."""
         a, b, c = (self.vertices[self.triangles[:, i]] for i in range(3))
         normal = np.cross(b - a, c - a)
         return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def to_obj(self) -> str:
-        """The OBJ file: nanometre vertices and one flat normal a triangle, which renderers insist on."""
+        """Return an OBJ file with vertices in nanometre resolution and one normal a triangle, as renderers require."""
         lines = [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in self.vertices]
         lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in np.round(self.normals(), 4) + 0.0]
         for number, corners in enumerate(self.triangles + 1, start=1):
@@ -59,10 +59,12 @@ class TriangleMesh:
 
 
 def lathe(profile: Sequence[tuple[float, float]], num_sides: int) -> TriangleMesh:
-    """A surface about z with a regular polygon for every circle, its first corner half a side from x.
+    """Return a surface of revolution about z with regular polygons for circles, first corner half a side from x.
 
-    The surface is seen from the left of its profile: of (radius, height) with the radius to the right and the height
-    up, a wall that goes up is a bore's, one that goes down a shaft's.
+    Args:
+        profile: (radius, height) [m] of each circle. The outside is to the left of the profile, with the radius to the
+            right and the height up: a wall that goes up is that of a bore, one that goes down that of a shaft.
+        num_sides: Number of sides of the polygons.
     """
     angles = 2.0 * np.pi * (np.arange(num_sides + 1) + 0.5) / num_sides
     circles = [cylindrical(radius, angles, height) for radius, height in profile]

@@ -10,7 +10,7 @@ import numpy as np
 
 from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import DEGREE, MM
-from guiderail.models.objects.bnc_connector.demonstrations import correlated
+from guiderail.models.objects.bnc_connector.demonstrations import random_curves
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]
 INSERTION_SPEED = 12.0 * MM  # [m/s]
@@ -92,12 +92,7 @@ def demonstrator_motions(
     # From wide to narrow over the first 3 mm below the search.
     wide = np.clip((heights - press_from) / (3.0 * MM) + 1.0, 0.0, 1.0)[:, None]
     scale = wide * _WIDE + (1.0 - wide) * _NARROW
-    curves = np.stack(
-        [
-            np.stack([correlated(rng, times, length) for length in _CORRELATION], axis=1)
-            for _ in range(NUM_DEMONSTRATIONS)
-        ]
-    )
+    curves = random_curves(rng, times, _CORRELATION, NUM_DEMONSTRATIONS)
     wander = curves - _CENTRING * curves.mean(axis=0)
     nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
     return nominal + scale * wander

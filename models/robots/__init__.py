@@ -1,0 +1,1 @@
+"""Robots and end effectors: data, models, mounting and inverse kinematics."""

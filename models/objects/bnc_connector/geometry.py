@@ -1,15 +1,16 @@
-"""A BNC bayonet connector at true scale: a jack with two lugs, and a plug whose ring carries two slots.
+"""Geometry of a BNC bayonet connector at true scale: a jack with two lugs and a plug whose ring has two slots.
 
 Frames. The jack frame J lies at the bottom of the barrel's centre line, z along the barrel to its open end, x through
 the lugs. The plug frame P lies in the plane of the ring's mouth, z from the mouth to the cable, x through the entries
 of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by minus `detent_angle`, and is locked at
 X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
 
-Contact. The ring is two open rigid surfaces, a bore that only the barrel may touch and a pair of slots that only the
-lugs may touch: a third of the triangles of a closed ring, and five times faster. The jack's barrel and lugs are
-compliant primitives. A soft pad on the barrel stands for the gasket: it pushes the lugs into their detents.
+Contact. The ring has two open rigid surfaces: a bore that collides only with the barrel, and a pair of slots that
+collide only with the lugs. They have a third of the triangles of a closed ring and are five times faster. The jack's
+barrel and lugs are compliant primitives. A soft pad on the barrel models the gasket, which pushes the lugs into their
+detents.
 
-`python -m guiderail.models.objects.bnc_connector.sdf` writes the files beside this one that a simulator loads.
+`python -m guiderail.models.objects.bnc_connector.sdf` writes the SDF and OBJ files in this folder.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, eq
 FOLDER = Path(__file__).parent
 JACK_SDF = FOLDER / "bnc_jack.sdf"
 PLUG_SDF = FOLDER / "bnc_plug.sdf"
-BORE_SIDES = 24  # of the polygon that stands for the bore
+BORE_SIDES = 24  # sides of the polygon that approximates the bore
 
 
 @dataclass(frozen=True)
 class BncDimensions:
-    """The drawing, in metres and radians. Depths and heights of the slot are of the lug's centre, from the mouth."""
+    """Dimensions in metres and radians; depths and heights of the slot are those of the lug's centre from the mouth."""
 
     barrel_radius: float = 4.825 * MM
     barrel_height: float = 10.0 * MM
@@ -44,8 +45,8 @@ class BncDimensions:
     ring_radius: float = 7.0 * MM
     ring_length: float = 9.5 * MM
     mouth_chamfer: float = 0.4 * MM
-    slot_clearance: float = 0.125 * MM  # a side
-    slot_depth: float = 0.9 * MM  # how far the walls that the lugs touch go into the ring
+    slot_clearance: float = 0.125 * MM  # on each side
+    slot_depth: float = 0.9 * MM  # radial depth of the slots' walls
 
     entry_height: float = 3.4 * MM  # bottom of the straight entry
     entry_angle: float = np.deg2rad(6.0)  # where the ramp starts
@@ -58,19 +59,19 @@ class BncDimensions:
     pad_radius: float = 3.0 * MM
     pad_height: float = 0.6 * MM  # above the barrel's open end
     pad_thickness: float = 2.0 * MM
-    seat_height: float = 10.7 * MM  # the face in the plug that meets the pad, from the mouth
+    seat_height: float = 10.7 * MM  # height of the plug's face that meets the pad, from the mouth
     seat_width: float = 8.0 * MM
     seat_thickness: float = 2.0 * MM
-    shell_radius: float = 5.0 * MM  # the plug's back shell, that is held
+    shell_radius: float = 5.0 * MM  # shell by which the plug is held
     shell_length: float = 16.0 * MM
 
     @property
     def bore_clearance(self) -> float:
-        """Between barrel and bore, on each side."""
+        """Clearance between barrel and bore on each side."""
         return round(self.bore_radius - self.barrel_radius, 9)
 
     def with_bore_clearance(self, clearance: float) -> BncDimensions:
-        """The same connector with a wider or a narrower bore."""
+        """Return the connector with a bore of another clearance."""
         return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
 
     @property
@@ -80,32 +81,32 @@ class BncDimensions:
 
     @property
     def locked_height(self) -> float:
-        """Height of P in J when the lugs sit in the detents."""
+        """Height of P in J with the lugs in the detents."""
         return self.lug_height - self.detent_height
 
     @property
     def slot_radius(self) -> float:
-        """Radius at which the slot's outline is a plane drawing: a little outside the barrel."""
+        """Radius at which the slot's outline is unrolled, slightly outside the barrel."""
         return self.barrel_radius + 0.3 * MM
 
     @property
     def slot_half_width(self) -> float:
-        """Radius of the mill that would cut the slot."""
+        """Radius of the mill that cuts the slot."""
         return self.lug_radius + self.slot_clearance
 
 
 @dataclass(frozen=True)
 class SlotColumns:
-    """The slot unrolled: at each angle [rad], the walls below and above it [m]."""
+    """Unrolled slot: the heights of the walls below and above it [m] at each angle [rad]."""
 
     angles: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    num_entry: int  # columns 0 … num_entry span the entry, which is open towards the mouth
+    num_entry: int  # columns 0 … num_entry are the entry, which is open towards the mouth
 
 
 def slot_columns(dimensions: BncDimensions, num_entry: int = 6, num_ramp: int = 14, num_end: int = 3) -> SlotColumns:
-    """The walls that a mill of the slot's half width leaves when it follows the lug's path."""
+    """Return the walls that a mill of the slot's half width leaves along the lug's path."""
     d = dimensions
     radius, half_width = d.slot_radius, d.slot_half_width
     knots = np.array(
@@ -138,7 +139,7 @@ def slot_columns(dimensions: BncDimensions, num_entry: int = 6, num_ramp: int = 
 
     lower, upper = np.array([walls(arc) for arc in arcs]).T
     lower[: num_entry + 1] = walls(half_width + 1e-10)[0]  # the entry's right-hand wall ends where the ramp begins
-    lower[-1] = upper[-1] = 0.5 * (lower[-1] + upper[-1])  # the mill's round closes the slot
+    lower[-1] = upper[-1] = 0.5 * (lower[-1] + upper[-1])  # the round end of the slot
     return SlotColumns(arcs / radius, lower, upper, num_entry)
 
 
@@ -147,7 +148,7 @@ def _both_halves(quads: np.ndarray) -> np.ndarray:
 
 
 def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) -> np.ndarray:
-    """The slot's outline, from the mouth around the detent and back to the mouth, cut from the bore outwards."""
+    """Return the walls along the slot's outline, from the mouth around the detent and back to the mouth."""
     d, columns = dimensions, slot_columns(dimensions)
     entry_left, entry_right = columns.angles[0], columns.angles[columns.num_entry]
     ramp = slice(columns.num_entry, None)
@@ -168,14 +169,14 @@ def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) 
 def _faces_between_entries(
     dimensions: BncDimensions, radii: tuple[float, float], margin: float, height: float, num_sides: int
 ) -> np.ndarray:
-    """A flat ring from one slot's entry to the other's, facing the jack."""
+    """Return the flat ring between the entries of the slots, which faces the jack."""
     columns = slot_columns(dimensions)
     angles = np.linspace(columns.angles[columns.num_entry] + margin, np.pi + columns.angles[0] - margin, num_sides + 1)
     return strip(cylindrical(radii[1], angles, height), cylindrical(radii[0], angles, height))
 
 
 def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
-    """What the lugs touch: both slots' walls, and the mouth's face between the entries, chamfered at the entries."""
+    """Return the collision mesh of the lugs: the slots' walls, and the mouth's face with chamfers at the entries."""
     d = dimensions
     outer_radius = d.bore_radius + d.slot_depth
     walls = _slot_walls(d, outer_radius, d.mouth_chamfer)
@@ -186,9 +187,9 @@ def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
 
 
 def bore_mesh(dimensions: BncDimensions, num_sides: int = BORE_SIDES, equal_area: bool = False) -> TriangleMesh:
-    """What the barrel touches: the mouth's face, its chamfer and the bore.
+    """Return the collision mesh of the barrel: the mouth's face, its chamfer and the bore.
 
-    A polygon around the true circle, or with `equal_area` one of the circle's area.
+    The bore is a polygon around the true circle, or with `equal_area` a polygon of the same area.
     """
     d = dimensions
     corner = equal_area_radius(1.0, num_sides) if equal_area else 1.0 / float(np.cos(np.pi / num_sides))
@@ -202,7 +203,7 @@ def bore_mesh(dimensions: BncDimensions, num_sides: int = BORE_SIDES, equal_area
 
 
 def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:
-    """What one sees: the ring, its slots cut through so that the lugs can be watched."""
+    """Return the visual mesh of the ring, with slots cut through so that the lugs are visible."""
     d, columns = dimensions, slot_columns(dimensions)
     ramp = slice(columns.num_entry, None)
     plain_angles = np.linspace(columns.angles[-1], np.pi + columns.angles[0], 9)

@@ -1,4 +1,4 @@
-"""The SDF files of the BNC jack and plug, written from the drawing."""
+"""SDF and OBJ files of the BNC jack and plug."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from guiderail.models.objects.triangle_mesh import equal_area_radius
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 
 
-FRICTION = 0.2  # of metal on metal
-# Without it a step of 10 ms leaps as far into metal as the plug moves in it, and the next one throws the plug out. With
-# it, what slides fast is held back by more than friction (`python -m research.benchmarks engines`), the more the longer the step.
+FRICTION = 0.2  # metal on metal
+# Without a margin the plug penetrates by its motion in a step of 10 ms, and the next step ejects it. With one, fast
+# sliding is decelerated by more than friction, depending on the step (`python -m research.benchmarks engines`).
 MARGIN = 0.1 * MM
-# As stiff as brass. A softer barrel spreads a rim's load evenly, and a plug that stands beside the jack feels a torque
-# that no metal has (docs/experiments.md, "Where a plug on the rim feels its force").
+# Stiffness of brass. A softer barrel distributes the load of a rim, which results in a torque on a misaligned plug that
+# metal parts do not have (docs/experiments.md, "Where a plug on the rim feels its force").
 BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM, margin=MARGIN)
 LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
-PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket is a spring that slips
+PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket: a spring with little friction
 RING = ContactMaterial(friction=FRICTION)
 SEAT = ContactMaterial(friction=0.05)
 
@@ -41,7 +41,7 @@ PLUG_MASS = 0.03  # [kg]
 
 
 def barrel_sides(dimensions: BncDimensions) -> int:
-    """Of the polygon that Drake makes of the barrel: its sides are as long as the resolution hint, or shorter."""
+    """Return the number of sides of Drake's polygon of the barrel: each is at most as long as the resolution hint."""
     assert BARREL.resolution is not None
     return int(np.ceil(2.0 * np.pi * dimensions.barrel_radius / BARREL.resolution))
 
@@ -49,21 +49,25 @@ def barrel_sides(dimensions: BncDimensions) -> int:
 def jack_sdf(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> str:
-    """The jack: link `jack` is frame J. Geometry `barrel`, `pad`, `lug_0`, `lug_1`.
+    """Return the jack's model: link `jack` is frame J, with geometry `barrel`, `pad`, `lug_0` and `lug_1`.
 
-    The barrel touches as a polygon whose corners lie on the circle, or with `equal_area` as one of the circle's area.
+    The collision geometry of the barrel is a polygon in the circle, or with `equal_area` one of the same area.
     """
     d = dimensions
     barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
     place, barrel = at(z=d.barrel_height / 2), cylinder(d.barrel_radius, d.barrel_height)
-    touching = cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height) if equal_area else barrel
+    collision_barrel = (
+        cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height) if equal_area else barrel
+    )
     pad = (
         at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2),
         cylinder(d.pad_radius, d.pad_thickness),
     )
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_centre = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = collision("barrel", place, touching, barrel_material) + visual("barrel_visual", place, barrel, NICKEL)
+    contents = collision("barrel", place, collision_barrel, barrel_material) + visual(
+        "barrel_visual", place, barrel, NICKEL
+    )
     contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
         lug = (at(x=side * lug_centre, z=d.lug_height, pitch=np.pi / 2), cylinder(d.lug_radius, lug_length))
@@ -72,7 +76,7 @@ def jack_sdf(
 
 
 def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
-    """The plug: link `plug` is frame P. Geometry `bore`, `slots`, `seat`."""
+    """Return the plug's model: link `plug` is frame P, with geometry `bore`, `slots` and `seat`."""
     d, ring = dimensions, replace(RING, friction=friction)
     seat = (
         at(z=d.seat_height + d.seat_thickness / 2),
@@ -90,7 +94,7 @@ def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
 def files(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> dict[str, str]:
-    """What each file holds, by name."""
+    """Return the content of each file by name."""
     return {
         "bnc_bore.obj": bore_mesh(dimensions, equal_area=equal_area).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
@@ -103,14 +107,14 @@ def files(
 def folder_of(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> Path:
-    """Where the files of a connector lie: beside this one, or made to measure."""
+    """Return the folder with a connector's files: this one, or a temporary one for other dimensions."""
     if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
         return FOLDER
     return generate_assets(files, dimensions, friction, margin, equal_area)
 
 
 def main(folder: Path = FOLDER) -> None:
-    """Writes every file."""
+    """Write all files of the standard connector."""
     for name, content in files(BncDimensions()).items():
         (folder / name).write_text(content)
 

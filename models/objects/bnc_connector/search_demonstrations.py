@@ -1,9 +1,9 @@
-"""Five demonstrations of searching for a jack, inserting and locking a plug, for when its place is hardly known.
+"""Five demonstrations of searching for a jack at an uncertain position, inserting and locking the plug.
 
-Unlike in `bnc_connector`, the demonstrator really searches: presses lightly and goes round the place where the jack
-should be, each of the five times begun a fifth of a turn further, until it comes in and pushes. So at every moment of
-the search the five lie evenly on a circle. Their mean is its centre, and their covariance is the same in every
-direction and at every moment until the plug drops in: what a policy may do is worth the same all the while.
+The demonstrator circles around the expected position of the jack with a light push, each of the five times a fifth of a
+turn further, and then inserts the plug. At every time of the search the five lie evenly on a circle: their mean is its
+centre, and their covariance is the same in every direction until the plug drops in. An action of a policy therefore has
+the same effect in every direction of the whole search.
 
 `python -m research.generate connector-search-demonstrations` records them again.
 """
@@ -22,18 +22,18 @@ from guiderail.models.objects.bnc_connector.demonstrations import (
     QUARTER_TURN,
     RIM,
     SEAT_COMMAND,
-    correlated,
+    random_curves,
 )
 from guiderail.models.primitives import Demonstrations
 
 PATH = Path(__file__).with_name("bnc_search.npz")
 
 
-RADIUS = 2.5 * MM  # of the circle
-TURN = 0.3  # [s] for once around: much quicker than the search is long, so that no moment of it has a side
-SEARCH_PUSH = 1.5 * MM  # below the rim, against the impedance: a couple of newtons
-SEARCH = (1.2, 3.0)  # [s] from when the plug stands on the rim to when the demonstrator comes in
-HOLD_UNTIL, IN_BY = 3.6, 4.1  # [s] when the circle begins to shrink, and when it is gone
+RADIUS = 2.5 * MM  # radius of the circle
+TURN = 0.3  # period of the circle [s], much shorter than the search
+SEARCH_PUSH = 1.5 * MM  # distance of the command below the rim, about two newtons
+SEARCH = (1.2, 3.0)  # begin and end of the search [s]
+HOLD_UNTIL, IN_BY = 3.6, 4.1  # times when the circle begins to shrink and when it has vanished [s]
 
 # time [s], z [m], Rz [rad]
 WAYPOINTS = np.array(
@@ -50,7 +50,7 @@ WAYPOINTS = np.array(
         [8.0, 0.0, 0.0],
     ]
 )
-# How much the hand varies besides, as standard deviations: while it searches, when the plug is in, locked.
+# Standard deviations of the hand in addition to the circle: begin and end of the search, inserted, turned and locked.
 _TIMES = [0.0, HOLD_UNTIL, IN_BY, 7.0, 8.0]  # [s]
 _DEVIATIONS = {
     "x": np.array([0.05, 0.05, 0.15, 0.15, 0.10]) * MM,
@@ -60,22 +60,17 @@ _DEVIATIONS = {
     "Ry": np.array([0.3, 0.3, 0.3, 0.2, 0.15]) * DEGREE,
     "Rx": np.array([0.3, 0.3, 0.3, 0.2, 0.15]) * DEGREE,
 }
-_CORRELATION = 0.3  # [s] how quickly the hand wanders
+_CORRELATION = 0.3  # correlation time [s]
 
 
 def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
-    """Desired poses (M, N, 6) of a session of M demonstrations at `times` (N,) [s], in the locked frame."""
+    """Return the desired poses (M, N, 6) of M demonstrations at `times` (N,) [s], in the locked frame."""
     rng = np.random.default_rng(seed)
     script_times, z, yaw = WAYPOINTS.T
-    shrunk = np.clip((IN_BY - times) / (IN_BY - HOLD_UNTIL), 0.0, 1.0)
-    radius = RADIUS * shrunk**2 * (3.0 - 2.0 * shrunk)
+    remaining = np.clip((IN_BY - times) / (IN_BY - HOLD_UNTIL), 0.0, 1.0)
+    radius = RADIUS * remaining**2 * (3.0 - 2.0 * remaining)
     scale = np.stack([np.interp(times, _TIMES, deviation) for deviation in _DEVIATIONS.values()], axis=1)
-    wander = np.stack(
-        [
-            np.stack([correlated(rng, times, _CORRELATION) for _ in _DEVIATIONS], axis=1)
-            for _ in range(NUM_DEMONSTRATIONS)
-        ]
-    )
+    wander = random_curves(rng, times, [_CORRELATION] * len(_DEVIATIONS), NUM_DEMONSTRATIONS)
     motions = scale * (wander - wander.mean(axis=0))
     motions[..., 2] += np.interp(times, script_times, z)
     motions[..., 3] += np.interp(times, script_times, yaw)
@@ -87,5 +82,5 @@ def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
 
 
 def load() -> Demonstrations:
-    """What was commanded, five times 400 poses in the locked frame."""
+    """Load the commanded poses: five demonstrations of 400 poses in the locked frame."""
     return Demonstrations.load(PATH)

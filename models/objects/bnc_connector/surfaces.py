@@ -1,4 +1,4 @@
-"""The BNC connector as convex solids, from its drawing: the bore a ring of prisms, each slot what its mill left."""
+"""Collision geometry of the BNC connector as convex solids: rings and outlines of slots cut into prisms."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from guiderail.models.objects.bnc_connector.sdf import FRICTION, PAD
 from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hull, Spring, Surface, ring_hulls
 from guiderail.models.objects.triangle_mesh import cylindrical
 
-WIDEST = np.deg2rad(6.0)  # of a prism about the axis: its flat face is then 7 µm inside the circle
-# A rigid disc on a spring stands for the gasket. Drake's pad pushes so hard for its depth, within 15 % up to 0.6 mm.
+MAX_ANGLE = np.deg2rad(6.0)  # of a prism about the axis; its flat face is then 7 µm inside the circle
+# A rigid disc on a spring models the gasket, with the force of Drake's pad within 15 % up to 0.6 mm.
 PAD_STIFFNESS = 1.5e5  # [N/m]
 
 
 def jack_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list[Surface]:
-    """What of the jack touches, in its frame J."""
+    """Return the collision geometry of the jack in its frame J."""
     d = dimensions
     barrel = Surface(
         "barrel", "bore", Cylinder(d.barrel_radius, d.barrel_height), friction, (0.0, 0.0, d.barrel_height / 2)
@@ -39,7 +39,7 @@ def jack_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list
 
 
 def plug_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list[Surface]:
-    """What of the plug touches, in its frame P."""
+    """Return the collision geometry of the plug in its frame P."""
     d = dimensions
     surfaces = [
         Surface(f"{pair}_{number}", pair, Hull(vertices), friction)
@@ -51,7 +51,7 @@ def plug_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list
 
 
 def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
-    """The ring around the barrel, chamfered at the mouth: the same polygon as `bore_mesh`."""
+    """Return the pieces of the ring around the barrel, the same polygon as `bore_mesh`."""
     d = dimensions
     profile = [
         [d.bore_radius + d.mouth_chamfer, 0.0],
@@ -64,13 +64,13 @@ def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
 
 
 def slot_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
-    """What is left between the mouth and the ring's end once both slots are cut: prisms over, under and beside them."""
-    outlines = [*_over_the_slot(dimensions), *_under_the_ramp(dimensions), *_beside_the_slot(dimensions)]
+    """Return the pieces of the ring with both slots cut: prisms over, under and between the slots."""
+    outlines = [*_over_the_slot(dimensions), *_under_the_ramp(dimensions), *_between_the_slots(dimensions)]
     return [_prism(np.array(outline) + [turn, 0.0], dimensions) for turn in (0.0, np.pi) for outline in outlines]
 
 
 Outline = list[list[float]]
-"""Corners [angle, height] of a prism, in any order."""
+"""Corners [angle [rad], height [m]] of a prism in any order."""
 
 
 def _prism(outline: np.ndarray, d: BncDimensions) -> np.ndarray:
@@ -95,7 +95,7 @@ def _under_the_ramp(d: BncDimensions) -> list[Outline]:
     outlines = []
     for i in range(first, len(a) - 1):
         outline = [[a[i + 1], 0.0], [a[i + 1], wall[i + 1]], [a[i], wall[i]], [a[i + 1] + wide, BELOW]]
-        if i == first:  # chamfered where the entry begins
+        if i == first:  # chamfer at the entry
             outline += [[a[i], d.mouth_chamfer], [a[i] + chamfer, 0.0]]
         else:
             outline += [[a[i], 0.0], [a[i] - wide, BELOW]]
@@ -103,12 +103,12 @@ def _under_the_ramp(d: BncDimensions) -> list[Outline]:
     return outlines
 
 
-def _beside_the_slot(d: BncDimensions) -> list[Outline]:
-    """From where a slot ends to the other one's entry, which is chamfered."""
+def _between_the_slots(d: BncDimensions) -> list[Outline]:
+    """Return prisms from the end of a slot to the chamfered entry of the other one."""
     angles, top = slot_columns(d).angles, d.ring_length
     wide, chamfer = SHOULDER / d.slot_radius, d.mouth_chamfer / d.slot_radius
     begin, end = angles[-1], np.pi + angles[0]
-    edges = np.linspace(begin, end, 2 + int((end - begin) / WIDEST))
+    edges = np.linspace(begin, end, 2 + int((end - begin) / MAX_ANGLE))
     outlines = []
     for left, right in itertools.pairwise(edges):
         outline = [[left, 0.0], [right, top], [left, top]]
@@ -123,10 +123,10 @@ def _beside_the_slot(d: BncDimensions) -> list[Outline]:
 
 
 def _shoulders(d: BncDimensions, a: np.ndarray, wall: np.ndarray, i: int, facing: float, left: bool = True) -> Outline:
-    """Of the edge from column i to i + 1 of a wall that faces up (1) or down (−1): into the solid on both sides."""
+    """Return the shoulders of the edge from column i to i + 1 of a wall that faces up (1) or down (−1)."""
     wide, h = SHOULDER / d.slot_radius, facing * wall
     slope = (h[i + 1] - h[i]) / (a[i + 1] - a[i])
-    # To the right a wall may fall away below its line; to the left of the line the solid always reaches it.
+    # To the right the wall may be below the line of the edge; to the left the solid always reaches that line.
     right_surface = min(np.interp(a[i + 1] + wide, a, h), h[i + 1])
     points = [[a[i + 1] + wide, facing * (min(h[i + 1] + slope * wide, right_surface) - BELOW)]]
     if left:

@@ -1,0 +1,1 @@
+"""Grid clamp and its table."""

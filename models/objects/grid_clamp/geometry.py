@@ -1,15 +1,16 @@
-"""A grid clamp with five peg-like heads, and the part of a table's grid that it is clamped to.
+"""Geometry of a grid clamp with five pegs and of the part of a table with the holes.
 
-Frames. The table's frame G lies in its surface, in the middle hole's centre, z up. The clamp's frame C is the middle
-peg's tip, z up the peg. The clamp has snapped in at X_GC = (0, 0, −`peg_length`), its shoulder on the table.
+Frames. The table's frame G lies in its surface at the centre of the middle hole, z up. The clamp's frame C lies at the
+tip of the middle peg, z up along the peg. The clamp has snapped in at X_GC = (0, 0, −`peg_length`), with its shoulder
+on the table.
 
-Contact. Every hole is an open rigid surface that only its own peg may touch: the face around it, a chamfer and a short
-land. Pegs are compliant convex solids with as many sides as their holes, so that few triangles leave the full
-clearance; a wall as deep as the hole would take half of all simulation time. The middle hole also has a lip, and the
-middle peg a soft bead that must squeeze past it: a resistance that grows, falls away, and holds back. The body, a soft
-pad as thick as it can be so that no impact takes it through, may touch only the table's slab.
+Contact. Every hole is an open rigid surface that collides only with its own peg: the face around it, a chamfer and a
+short wall, because a wall of the hole's full depth would take half of the simulation time. Pegs are compliant convex
+solids with as many sides as their holes, so that few triangles leave the full clearance. The middle hole has a lip and
+the middle peg a soft bead, which must pass the lip: the resistance rises, falls, and then retains the clamp. The body
+is a soft pad, thick enough for impacts, that collides only with the table's slab.
 
-`python -m guiderail.models.objects.grid_clamp.sdf` writes the files beside this one that a simulator loads.
+`python -m guiderail.models.objects.grid_clamp.sdf` writes the SDF and OBJ files in this folder.
 """
 
 from __future__ import annotations
@@ -25,31 +26,31 @@ from guiderail.models.objects.triangle_mesh import TriangleMesh, cylindrical, la
 FOLDER = Path(__file__).parent
 CLAMP_SDF = FOLDER / "grid_clamp.sdf"
 TABLE_SDF = FOLDER / "grid_table.sdf"
-NUM_SIDES = 6  # of what touches
-NUM_VISUAL_SIDES = 12
+NUM_SIDES = 6  # sides of a polygon in collision geometry
+NUM_VISUAL_SIDES = 12  # sides of a polygon in visual geometry
 
 
 @dataclass(frozen=True)
 class GridClampDimensions:
-    """The drawing, in metres. A radius is that of the circle inside the polygon; depths are from the table's face."""
+    """Dimensions in metres; a radius is that of the circle inside the polygon, a depth is from the table's face."""
 
     peg_radius: float = 4.0 * MM
     peg_length: float = 12.0 * MM  # from the shoulder to the tip
     peg_chamfer: float = 0.6 * MM
-    spacing: float = 20.0 * MM  # of the four outer pegs from the middle one, along x and along y
+    spacing: float = 20.0 * MM  # distance of the outer pegs from the middle one along x and along y
 
     hole_radius: float = 4.15 * MM
     hole_chamfer: float = 0.5 * MM
-    hole_land: float = 3.0 * MM  # the wall's part that a peg touches: below, the hole is relieved
+    hole_land: float = 3.0 * MM  # height of the wall; the hole is wider below
     hole_depth: float = 13.0 * MM
-    face_radius: float = 14.0 * MM  # of the part of the table's face that a peg beside its hole stands on
+    face_radius: float = 14.0 * MM  # radius of the table's face for a misaligned peg
 
     lip_radius: float = 4.15 * MM
-    lip_depth: float = 0.6 * MM  # where its land begins
+    lip_depth: float = 0.6 * MM  # depth of the narrow part
     lip_land: float = 0.4 * MM
-    lip_flank: float = 0.4 * MM  # how far the flanks rise and fall, at 45 degrees
+    lip_flank: float = 0.4 * MM  # size of the flanks, at 45 degrees
     bead_radius: float = 4.35 * MM
-    bead_depth: float = 1.5 * MM  # of its crest when the shoulder is on the table
+    bead_depth: float = 1.5 * MM  # depth of its crest with the shoulder on the table
     bead_entry: float = 1.2 * MM  # length of the flank that meets the lip first
     bead_exit: float = 0.6 * MM
 
@@ -60,11 +61,11 @@ class GridClampDimensions:
 
     @property
     def clearance(self) -> float:
-        """Between a peg and its hole, on each side."""
+        """Clearance between a peg and its hole on each side."""
         return round(self.hole_radius - self.peg_radius, 9)
 
     def with_clearance(self, clearance: float) -> GridClampDimensions:
-        """The same clamp and a table with other holes."""
+        """Return the same clamp with holes of another clearance."""
         return self if clearance == self.clearance else replace(self, hole_radius=self.peg_radius + clearance)
 
     @property
@@ -75,12 +76,12 @@ class GridClampDimensions:
 
     @property
     def capture_radius(self) -> float:
-        """How far off a peg may be for the chamfers alone to lead it into its hole."""
+        """Largest misalignment of a peg that the chamfers alone correct."""
         return self.hole_radius - self.peg_radius + self.hole_chamfer + self.peg_chamfer
 
 
 def _around(radius: float) -> float:
-    """Radius of the corners of a polygon around a circle."""
+    """Return the radius of the corners of a polygon around a circle."""
     return radius / np.cos(np.pi / NUM_SIDES)
 
 
@@ -89,7 +90,7 @@ def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
 
 
 def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
-    """What a peg touches: the wall, the chamfer and the face around; its origin is the hole's centre in the face."""
+    """Return the collision mesh of a hole: wall, chamfer and face; the origin is the hole's centre in the face."""
     d = dimensions
     return _lathe(
         [
@@ -102,7 +103,7 @@ def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
 
 
 def lip_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
-    """What the bead touches: a ring that narrows and widens again; its origin is the middle hole's."""
+    """Return the collision mesh of the lip, a ring that narrows and widens; the origin is that of the middle hole."""
     d = dimensions
     top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
     return _lathe(
@@ -116,7 +117,7 @@ def lip_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
 
 
 def peg_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
-    """A peg, a convex solid; its origin is its tip."""
+    """Return a peg as a convex solid; the origin is its tip."""
     d = dimensions
     return _lathe(
         [
@@ -130,7 +131,7 @@ def peg_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
 
 
 def bead_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
-    """The bead, a convex solid about the middle peg; its origin is its crest."""
+    """Return the bead as a convex solid around the middle peg; the origin is its crest."""
     d = dimensions
     return _lathe(
         [
@@ -144,7 +145,7 @@ def bead_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
 
 
 def slab_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
-    """What one sees of the table: its face, the holes in it and its sides."""
+    """Return the visual mesh of the table: face, holes and sides."""
     d = dimensions
     angles = 2.0 * np.pi * (np.arange(NUM_VISUAL_SIDES + 1) + 0.5) / NUM_VISUAL_SIDES
     half_cell, half_table = d.spacing / 2, d.table_width / 2
@@ -159,7 +160,7 @@ def slab_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
     )
     hole = np.concatenate([strip(bottom, wall), strip(wall, mouth), strip(mouth, cylindrical(on_cell, angles, 0.0))])
     quads = [hole + np.array([x, y, 0.0]) for x, y in d.peg_positions]
-    # Cells without a hole, and the frame around the three by three of them.
+    # The cells without a hole, and the frame around the three by three cells.
     corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     sides = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     quads.append(half_cell * corners + d.spacing * sides[:, None])

@@ -1,4 +1,4 @@
-"""The SDF files of the grid clamp and its table, written from the drawing."""
+"""SDF and OBJ files of the grid clamp and its table."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from guiderail.models.objects.sdf import (
 )
 
 STEEL, ALUMINIUM, ANODIZED = "0.62 0.64 0.68 1", "0.80 0.81 0.82 1", "0.20 0.35 0.60 1"
-GLASS = "0.20 0.35 0.60 0.3"  # the body, through which pegs and holes are to be seen
+GLASS = "0.20 0.35 0.60 0.3"  # transparent body, so that pegs and holes are visible
 
-FRICTION = 0.2  # of pegs, holes and the table's face
+FRICTION = 0.2  # pegs, holes and the table's face
 PEG = ContactMaterial(friction=FRICTION, modulus=5e8)
 BEAD = ContactMaterial(friction=0.1, modulus=2e7)
 PAD = ContactMaterial(friction=FRICTION, modulus=1e6)
@@ -42,11 +42,11 @@ LIP = ContactMaterial(friction=0.1)
 SLAB = ContactMaterial(friction=FRICTION)
 
 CLAMP_MASS = 0.15  # [kg]
-STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # what it is held by
+STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # stem by which it is held
 
 
 def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
-    """The clamp: link `clamp` is frame C. Geometry `peg_0` (the middle one) to `peg_4`, `bead`, `pad`."""
+    """Return the clamp's model: link `clamp` is frame C, with geometry `peg_0` (middle) to `peg_4`, `bead`, `pad`."""
     d, peg_material, pad = dimensions, *(replace(surface, friction=friction) for surface in (PEG, PAD))
     contents = ""
     for number, (x, y) in enumerate(d.peg_positions):
@@ -65,7 +65,7 @@ def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> st
 
 
 def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
-    """The table: link `table` is frame G. Geometry `hole_0` (the middle one) to `hole_4`, `lip`, `slab`."""
+    """Return the table's model: link `table` is frame G, with geometry `hole_0` (middle) to `hole_4`, `lip`, `slab`."""
     d, hole, face = dimensions, *(replace(surface, friction=friction) for surface in (HOLE, SLAB))
     contents = ""
     for number, (x, y) in enumerate(d.peg_positions):
@@ -79,7 +79,7 @@ def table_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> st
 
 
 def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[str, str]:
-    """What each file holds, by name."""
+    """Return the content of each file by name."""
     return {
         "grid_clamp_peg.obj": peg_mesh(dimensions).to_obj(),
         "grid_clamp_bead.obj": bead_mesh(dimensions).to_obj(),
@@ -92,14 +92,14 @@ def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[s
 
 
 def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Path:
-    """Where the files of a clamp and its table lie: beside this one, or made to measure."""
+    """Return the folder with the files of a clamp and its table: this one, or a temporary one for other dimensions."""
     if (dimensions, friction) == (GridClampDimensions(), FRICTION):
         return FOLDER
     return generate_assets(files, dimensions, friction)
 
 
 def main(folder: Path = FOLDER) -> None:
-    """Writes every file."""
+    """Write all files of the standard clamp and table."""
     for name, content in files(GridClampDimensions()).items():
         (folder / name).write_text(content)
 

@@ -1,4 +1,4 @@
-"""The grid clamp and its table as convex solids, from their drawing: holes are rings of prisms, the bead is sprung."""
+"""Collision geometry of the grid clamp and its table as convex solids: rings of prisms, and a sprung bead."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDim
 from guiderail.models.objects.grid_clamp.sdf import BEAD, FRICTION
 from guiderail.models.objects.surfaces import Box, Hull, Spring, Surface, ring_hulls
 
-# Each side of the bead gives way by itself, as hard as a side of Drake's soft bead does in the lip.
+# Each side of the bead is sprung by itself, with the stiffness of a side of Drake's soft bead in the lip.
 BEAD_STIFFNESS = 7e3  # [N/m]
-BEAD_CORE = 2.0 * MM  # radius from which its sides go outwards
-BEAD_GAP = 0.4 * MM  # between two sides and their corner: each meets its own side of the lip, and none the next one's
-# How far a side's crest stands out in its middle: what meets along an edge, a collider gives any normal in between.
+BEAD_CORE = 2.0 * MM  # radius at which its sides begin
+BEAD_GAP = 0.4 * MM  # gap between a side and the corner, so that each side meets only its own side of the lip
+# Height of the crest in the middle of a side: for contact along an edge a collider would choose an arbitrary normal.
 BEAD_CROWN = 0.01 * MM
-LIP_BACK = 2.0 * MM  # how thick the lip is, into the table
+LIP_BACK = 2.0 * MM  # thickness of the lip into the table
 
 
 def clamp_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) -> list[Surface]:
-    """What of the clamp touches, in its frame C."""
+    """Return the collision geometry of the clamp in its frame C."""
     d, peg = dimensions, Hull(peg_mesh(dimensions).vertices)
     pegs = [
         Surface(f"peg_{number}", f"hole_{number}", peg, friction, (x, y, 0.0))
@@ -35,7 +35,7 @@ def clamp_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) 
 
 
 def table_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) -> list[Surface]:
-    """What of the table touches, in its frame G."""
+    """Return the collision geometry of the table in its frame G."""
     d = dimensions
     holes = [
         Surface(f"hole_{number}_{side}", f"hole_{number}", Hull(hull), friction, (x, y, 0.0))
@@ -48,7 +48,7 @@ def table_surfaces(dimensions: GridClampDimensions, friction: float = FRICTION) 
 
 
 def hole_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
-    """The wall, the chamfer and the face around a hole: the same polygon as `hole_mesh`."""
+    """Return the pieces of a hole's wall, chamfer and face, the same polygon as `hole_mesh`."""
     d = dimensions
     profile = [
         [d.hole_radius + d.hole_chamfer, 0.0],
@@ -61,7 +61,7 @@ def hole_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
 
 
 def lip_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
-    """A ring that narrows and widens again: the same polygon as `lip_mesh`."""
+    """Return the pieces of the lip, the same polygon as `lip_mesh`."""
     d = dimensions
     top, bottom = -d.lip_depth, -d.lip_depth - d.lip_land
     profile = [
@@ -76,7 +76,7 @@ def lip_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
 
 
 def bead_hulls(dimensions: GridClampDimensions) -> list[tuple[np.ndarray, tuple[float, float, float]]]:
-    """Each side of the bead, (V, 3) about its crest, and the way outwards: the same polygon as `bead_mesh`."""
+    """Return the sides of the bead (V, 3) about its crest and their outward directions; same polygon as `bead_mesh`."""
     d = dimensions
     radius, height = np.array(
         [

@@ -1,0 +1,1 @@
+"""Plane with a narrow passage."""

@@ -1,9 +1,8 @@
-"""Nine demonstrations through the narrow passage, and how they were made.
+"""Nine synthetic demonstrations through the narrow passage.
 
-They stand in for the hand-drawn ones of the thesis (figures 4.3 and 5.3), which are not published. What they share with
-those: from the same start to the same goal in the same time, wide where the plane is free, narrow where the passage is,
-each one smooth and its own. They were "drawn" before the obstacle and the restricted zone existed: their mean runs
-into the obstacle, and two of them enter the zone.
+They replace the hand-drawn demonstrations of the thesis (figures 4.3 and 5.3), which are not published. Like those they
+are smooth, have the same start, goal and duration, vary where the plane is free and agree in the passage. They ignore
+the obstacle and the restricted zone: their mean crosses the obstacle, and two of them enter the zone.
 """
 
 from pathlib import Path
@@ -15,14 +14,12 @@ from scipy.ndimage import gaussian_filter1d
 from guiderail.models.primitives import Demonstrations
 
 PATH = Path(__file__).with_name("narrow_passage.npz")
-"""The demonstrations as they are used."""
 
 NUM_DEMONSTRATIONS = 9
 NUM_STEPS = 400
-PERIOD = 0.02
-"""Seconds between two points."""
+PERIOD = 0.02  # time between points [s]
 
-# Along the path, from 0 at the start to 1 at the goal: the mean's x, and the standard deviations of x and y.
+# Mean of x, and standard deviations of x and y [m], over the progress along the path from 0 to 1.
 _MEAN_X = [(0, 0.30), (0.25, 0.55), (0.42, 0.35), (0.66, 0.35), (0.80, 0.47), (0.95, 0.40), (1, 0.40)]
 _DEVIATION_X = [
     (0, 0.012),
@@ -48,15 +45,15 @@ _DEVIATION_Y = [
     (0.95, 0.01),
     (1, 0.01),
 ]
-_Y = (0.05, 0.95)
-_ARRIVAL = 0.95  # of the time: then the hand rests on the goal
-_CORRELATION = 0.22  # of the time: how long a deviation from the mean lasts
-_CENTRING = 0.7  # nine random curves have a mean of their own; this much of it is taken out
-_SMOOTHING = 4.0  # steps: no corner where the profiles above have one
+_Y = (0.05, 0.95)  # of start and goal [m]
+_ARRIVAL = 0.95  # part of the duration after which the goal is reached
+_CORRELATION = 0.22  # correlation time of the deviations, as part of the duration
+_CENTRING = 0.7  # part of the mean of the nine random curves that is removed
+_SMOOTHING = 4.0  # standard deviation of the smoothing [steps]
 
 
 def generate(seed: int = 0) -> Demonstrations:
-    """Draws nine demonstrations: a mean path plus a smooth random curve each, scaled by how free the plane is there."""
+    """Return nine demonstrations: a mean path plus smooth random curves, scaled by the standard deviations."""
     rng = np.random.default_rng(seed)
     phase = np.linspace(0, 1, NUM_STEPS)
     progress = np.clip(phase / _ARRIVAL, 0, 1)
@@ -72,7 +69,7 @@ def generate(seed: int = 0) -> Demonstrations:
 
 
 def load() -> Demonstrations:
-    """The nine demonstrations, 400 points each, positions in metres."""
+    """Load the nine demonstrations of 400 positions [m] each."""
     return Demonstrations.load(PATH)
 
 

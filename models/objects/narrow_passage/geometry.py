@@ -1,4 +1,4 @@
-"""The planar world with a narrow passage (thesis, figures 4.3 and 5.3)."""
+"""Geometry of the plane with a narrow passage (thesis, figures 4.3 and 5.3)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,21 +11,21 @@ from guiderail.models.primitives import LinearConstraints
 
 @dataclass(frozen=True)
 class PassageGeometry:
-    """Where things are, in metres, for the centre of the robot: walls are where the centre can't go.
+    """Positions and sizes in metres; the walls bound the position of the robot's centre.
 
     Attributes:
-        start, goal: (x, y) of where the robot starts, and where it should arrive.
-        goal_radius: the goal is reached within this distance.
-        wall_y: the lower and the upper face of the two walls.
-        gap_x: the left and the right side of the gap between them.
-        wall_length: how far the walls extend to the left and to the right; nothing gets around them.
-        zone_x: the restricted zone is x ≥ zone_x.
-        obstacle, obstacle_radius: the disc that was put on the path after the demonstrations; it costs, but it does not
-            block.
-        second_obstacle: another such disc, where there is one.
-        obstacles_move: whether episodes differ in where the discs are.
-        obstacle_margin: the distance from a disc within which it costs.
-        robot_radius: of the robot itself; its walls are that much smaller than the centre's.
+        start, goal: Start and goal (x, y) of the robot.
+        goal_radius: Distance within which the goal is reached.
+        wall_y: Lower and upper face of the two walls.
+        gap_x: Left and right side of the gap between them.
+        wall_length: Length of each wall, beyond the reach of the robot.
+        zone_x: Lower bound of x in the restricted zone.
+        obstacle, obstacle_radius: Disc on the path of the demonstrations, which were recorded without it. It has a
+            cost and does not collide.
+        second_obstacle: Another such disc, or None.
+        obstacles_move: True if the positions of the discs are sampled in every episode.
+        obstacle_margin: Distance from a disc within which it has a cost.
+        robot_radius: Radius of the robot; its visible walls are smaller by it than those of the centre.
     """
 
     start: tuple[float, float] = (0.30, 0.05)
@@ -44,12 +44,12 @@ class PassageGeometry:
 
     @property
     def obstacles(self) -> np.ndarray:
-        """Where the discs are, (n, 2)."""
+        """Positions (n, 2) of the discs."""
         return np.array([self.obstacle] if self.second_obstacle is None else [self.obstacle, self.second_obstacle])
 
     @property
     def walls(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners (2, 2) of the boxes that the robot's centre can't enter."""
+        """Lower and upper corners (2, 2) of the walls, for the robot's centre."""
         (bottom, top), (left, right) = self.wall_y, self.gap_x
         lower = np.array([[left - self.wall_length, bottom], [right, bottom]])
         upper = np.array([[left, top], [right + self.wall_length, top]])
@@ -57,37 +57,37 @@ class PassageGeometry:
 
     @property
     def constraints(self) -> LinearConstraints:
-        """x ≤ zone_x, as g = [−1, 0], c = −zone_x."""
+        """Linear constraint x ≤ zone_x, as g = [−1, 0], c = −zone_x."""
         return LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-self.zone_x]))
 
     def keep_out(self, margin: float = 0.02) -> KeepOut:
-        """The active constraints of safe residual learning: stop `margin` before walls and zone (section 4.4.1)."""
+        """Return the keep-out region of safe residual learning, `margin` [m] before walls and zone (section 4.4.1)."""
         lower, upper = self.walls
         return KeepOut(lower, upper, self.constraints, margin)
 
     def at_goal(self, pose: np.ndarray) -> bool:
-        """True within `goal_radius` of the goal."""
+        """Return True within `goal_radius` of the goal."""
         return bool(np.hypot(pose[0] - self.goal[0], pose[1] - self.goal[1]) < self.goal_radius)
 
     def in_passage(self, pose: np.ndarray) -> bool:
-        """True in the gap and just before it, where a robot that doesn't advance is blocked by the walls."""
+        """Return True in the gap and just before it, where the walls may block the robot."""
         return bool(self.wall_y[0] - 0.05 < pose[1] < self.wall_y[1] + 0.02)
 
     def obstacle_distance(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
-        """d_t of equation 4.24: from the robot's centre to the edge of an obstacle, negative inside.
+        """Return the distance d_t [m] of the robot's centre from an obstacle's edge, negative inside (equation 4.24).
 
         Args:
-            pose: (2,) of the robot.
-            obstacle: (x, y) where that is, if not where the first one usually is.
+            pose: Pose of the robot (2,) [m].
+            obstacle: Position (x, y) of the obstacle; None: that of `obstacle`.
         """
         x, y = self.obstacle if obstacle is None else obstacle
         return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius
 
     def obstacle_cost(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
-        """r_o of equation 4.24, of one obstacle."""
+        """Return the cost r_o of one obstacle (equation 4.24)."""
         return -100.0 * max(self.obstacle_margin - self.obstacle_distance(pose, obstacle), 0.0)
 
 
 def action_cost(displacement: np.ndarray) -> float:
-    """r_a of equation 4.23, of the robot's displacement (2,) in a control step."""
+    """Return the cost r_a of the robot's displacement (2,) [m] in a control step (equation 4.23)."""
     return -10.0 * float(displacement @ displacement)

@@ -1,0 +1,1 @@
+"""Vessels and balls of the pouring task."""

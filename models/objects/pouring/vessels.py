@@ -1,7 +1,7 @@
-"""What is poured from, poured into, and poured: a thermos, a mug and table-tennis balls.
+"""Objects of the pouring task: a thermos, a mug and table-tennis balls.
 
-A vessel's frame is its tip: the centre of its opening, z out of the opening. Its wall is a ring of boxes, because point
-contact would fill a hollow mesh to its convex hull.
+A vessel's frame, the tip, is at the centre of its opening with z out of the opening. Its wall is a ring of boxes,
+because point contact replaces a hollow mesh by its convex hull.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from pydrake.multibody.tree import RigidBody, SpatialInertia, UnitInertia
 
 from guiderail.models.common.errors import InputError
 
-WALL_BOXES = 16
+WALL_BOXES = 16  # boxes of a vessel's wall
 FRICTION = 0.4
 
 
 @dataclass(frozen=True)
 class Vessel:
-    """A round vessel, open at the top."""
+    """Cylindrical vessel, open at the top."""
 
     inner_diameter: float  # [m]
-    depth: float  # [m] of the inside
+    depth: float  # inner depth [m]
     wall: float = 0.004  # [m]
     bottom: float = 0.006  # [m]
     mass: float = 0.3  # [kg]
@@ -35,23 +35,23 @@ class Vessel:
 
     @property
     def outer_radius(self) -> float:
-        """[m] out to the corners of the boxes."""
+        """Radius of the outer corners of the boxes [m]."""
         return (self.inner_diameter / 2 + self.wall) / np.cos(np.pi / WALL_BOXES)
 
     @property
     def height(self) -> float:
-        """[m] outside."""
+        """Outer height [m]."""
         return self.depth + self.bottom
 
     @property
     def inertia(self) -> SpatialInertia:
-        """About the tip, as if it were solid."""
+        """Spatial inertia about the tip, that of a solid cylinder."""
         centre = np.array([0.0, 0.0, -self.height / 2])
         solid = UnitInertia.SolidCylinder(self.outer_radius, self.height, np.array([0.0, 0.0, 1.0]))
         return SpatialInertia(self.mass, centre, solid.ShiftFromCenterOfMass(-centre))
 
     def boxes(self) -> list[tuple[RigidTransform, Box]]:
-        """The wall, in the tip frame; each box is an inner face wide enough to close the ring."""
+        """Return the boxes of the wall in the tip frame; their inner faces close the ring."""
         radius = self.inner_diameter / 2
         width = 2 * (radius + self.wall) * np.tan(np.pi / WALL_BOXES)
         boxes = []
@@ -62,7 +62,7 @@ class Vessel:
         return boxes
 
     def contains(self, p_TP: np.ndarray, margin: float = 0.0) -> bool:
-        """Whether a point is inside, given in the tip frame [m]; `margin` makes the inside larger."""
+        """Return True if a point (3,) [m] in the tip frame is inside the vessel enlarged by `margin` [m]."""
         radius = np.hypot(p_TP[0], p_TP[1])
         return bool(radius <= self.inner_diameter / 2 + margin and -self.depth - margin <= p_TP[2] <= margin)
 
@@ -73,17 +73,17 @@ MUG = Vessel(inner_diameter=0.080, depth=0.095)
 
 @dataclass(frozen=True)
 class Ball:
-    """A table-tennis ball."""
+    """Table-tennis ball."""
 
     diameter: float = 0.040  # [m]
     mass: float = 0.0027  # [kg]
-    # A stiff ball needs a short plant step; at this stiffness and 2 ms none of them left a vessel through its wall.
+    # A stiff ball needs a short plant step. With this stiffness and 2 ms no ball passed through a vessel's wall.
     stiffness: float = 1e3  # [N/m]
     dissipation: float = 0.5  # [s/m]
 
 
 def contact(stiffness: float | None = None, dissipation: float | None = None) -> ProximityProperties:
-    """What everything here feels like; without a stiffness, as hard as the plant takes for hard."""
+    """Return contact properties; without a stiffness, the plant's default."""
     properties = ProximityProperties()
     AddContactMaterial(
         properties=properties,
@@ -103,14 +103,14 @@ def add_shape(
     color: tuple[float, ...],
     properties: ProximityProperties | None = None,
 ) -> None:
-    """Makes a shape both felt and seen. A plant without a scene graph, a controller's own, has no use for either."""
+    """Add a shape as collision and visual geometry; without effect for a plant without a scene graph."""
     if plant.geometry_source_is_registered():
         plant.RegisterCollisionGeometry(body, X_BG, shape, name, properties or contact())
         plant.RegisterVisualGeometry(body, X_BG, shape, f"{name}_visual", np.array(color))
 
 
 def add_vessel(plant: MultibodyPlant, name: str, vessel: Vessel, color: tuple[float, ...]) -> RigidBody:
-    """Adds a vessel as a model of its own; its body's frame is the tip."""
+    """Add a vessel as a model instance; the frame of its body is the tip."""
     body = plant.AddRigidBody(name, plant.AddModelInstance(name), vessel.inertia)
     parts = [(f"wall_{i}", X, box) for i, (X, box) in enumerate(vessel.boxes())]
     bottom = Cylinder(vessel.inner_diameter / 2 + vessel.wall / 2, vessel.bottom)
@@ -121,7 +121,7 @@ def add_vessel(plant: MultibodyPlant, name: str, vessel: Vessel, color: tuple[fl
 
 
 def add_ball(plant: MultibodyPlant, name: str, ball: Ball, color: tuple[float, ...]) -> RigidBody:
-    """Adds a ball that floats freely, as a model of its own."""
+    """Add a free ball as a model instance."""
     inertia = SpatialInertia.HollowSphereWithMass(ball.mass, ball.diameter / 2)
     body = plant.AddRigidBody(name, plant.AddModelInstance(name), inertia)
     shape = Sphere(ball.diameter / 2)
