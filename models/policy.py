@@ -1,4 +1,4 @@
-"""A trained policy as it leaves a run: weights that hold no code, and the NumPy that evaluates them."""
+"""Trained policies: weights and a description in files without code, evaluated with NumPy."""
 
 import json
 import math
@@ -15,28 +15,29 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import digest, read_bytes
 
 FORMAT = "guiderail policy 2"
-MOST_WEIGHTS = 200_000_000  # [bytes] a policy of 256 × 256 units has 0.3 million
-MOST_DESCRIPTION = 1_000_000  # [bytes]
+MAX_WEIGHTS_SIZE = 200_000_000  # [bytes]; a policy of 256 × 256 units has 0.3 million
+MAX_DESCRIPTION_SIZE = 1_000_000  # [bytes]
 
 
 class Policy:
-    """The deterministic action of an actor: a feed-forward network of rectified layers, squashed by tanh.
+    """Deterministic policy: a feed-forward network with ReLU layers and a tanh output.
 
-    Evaluates what Stable-Baselines3's `predict(deterministic=True)` does, in single precision as there, with NumPy
-    alone: a robot that runs a skill needs neither PyTorch nor the learner.
+    It computes the same action as Stable-Baselines3's `predict(deterministic=True)`, in single precision, with NumPy
+    alone, so that a robot's computer needs neither PyTorch nor the learner.
     """
 
     def __init__(self, layers: list[tuple[np.ndarray, np.ndarray]], description: Mapping[str, Any]):
-        """
+        """Construct a policy.
+
         Args:
-            layers: weight (out, in) and bias (out,) of each layer, first to last.
-            description: what `policy.json` holds: the shapes and limits of observation and action, `activation`
-                ("relu" unless given, or "normalized_relu"), and `pool`, the side of the squares of pixels that an image
-                is averaged over.
+            layers: Weight (out, in) and bias (out,) of each layer, first to last.
+            description: Content of `policy.json`: the shape of observations, the limits of actions, `activation`
+                ("relu", the default, or "normalized_relu"), and for images `pool`, the side of the squares of pixels
+                that are averaged.
 
         Raises:
-            ValueError: for a description that lacks something, an activation that it does not know, layers that don't
-                follow each other from observation to action, or a number that is not finite.
+            ValueError: If the description is incomplete, the activation is unknown, the layers do not lead from
+                observation to action, or a number is not finite.
         """
         self._layers = layers
         self.description = dict(description)
@@ -52,13 +53,13 @@ class Policy:
         self._check()
 
     def _check(self) -> None:
-        """Raises a ValueError where what is known of the policy doesn't fit together."""
+        """Raise a ValueError if description and layers are inconsistent."""
         if any(type(n) is not int or n < 1 for n in (*self._shape, self.description.get("pool", 1))):
             raise ValueError("a shape, and the side of a square of pixels, are positive whole numbers")
         if self._low.ndim != 1 or self._low.shape != self._high.shape or not (self._low < self._high).all():
             raise ValueError("an action has a lower limit below an upper one for each of its numbers")
         if len(self._shape) == 3 and "pool" not in self.description:
-            raise ValueError("of an image the side of the squares of pixels is said, that it is averaged over")
+            raise ValueError("a policy of images needs `pool`, the side of the squares of pixels that are averaged")
         sizes = [self._num_features(), *(len(bias) for _, bias in self._layers)]
         expected = [(out, into) for into, out in pairwise(sizes)]
         if not self._layers or [weight.shape for weight, _ in self._layers] != expected or sizes[-1] != len(self._low):
@@ -68,7 +69,7 @@ class Policy:
             raise ValueError("weights and limits are finite and of single precision")
 
     def _num_features(self) -> int:
-        """How many numbers the first layer sees of an observation."""
+        """Return the number of inputs of the first layer."""
         if len(self._shape) != 3:
             return math.prod(self._shape)
         height, width, channels = self._shape
@@ -90,8 +91,8 @@ class Policy:
             if not path.is_file():
                 raise InputError(f"{folder} holds no {path.name}: train it first, or finish it with --resume")
         try:
-            values = json.loads(read_bytes(description, "description of a policy", MOST_DESCRIPTION))
-            arrays = load(read_bytes(weights, "policy's weights", MOST_WEIGHTS))
+            values = json.loads(read_bytes(description, "description of a policy", MAX_DESCRIPTION_SIZE))
+            arrays = load(read_bytes(weights, "policy's weights", MAX_WEIGHTS_SIZE))
             if values["format"] != FORMAT or values.pop("digest") != _digest(arrays, values):
                 raise ValueError("the format or the digest differs")
             if len(arrays) % 2:
@@ -100,11 +101,11 @@ class Policy:
             return cls(layers, values)
         except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(
-                f"the policy in {folder} is damaged or of another version: write it anew with guiderail train --resume"
+                f"the policy in {folder} is damaged or of another version: write it again with guiderail train --resume"
             ) from error
 
     def save(self, folder: Path | str, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
-        """Writes `policy.safetensors` and `policy.json`; `write` is how, such as a whole file or none."""
+        """Write `policy.safetensors` and `policy.json`; `write` writes one file, for example atomically."""
         folder = Path(folder)
         arrays: dict[str, np.ndarray] = {}
         for index, (weight, bias) in enumerate(self._layers):
@@ -115,10 +116,10 @@ class Policy:
         write(folder / "policy.json", json.dumps(values, indent=2).encode() + b"\n")
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """The action for one observation, in the units of the action space.
+        """Return the action for one observation, in the units of the action space.
 
         Raises:
-            ValueError: if the observation has another shape than those the policy was trained on.
+            ValueError: If the observation has another shape than those of the training.
         """
         observation = np.asarray(observation)
         if observation.shape != self._shape:
@@ -137,7 +138,7 @@ class Policy:
         return np.maximum(features, np.float32(0))
 
     def _features(self, observation: np.ndarray) -> np.ndarray:
-        """What the first layer sees: the numbers as they are, an image channel by channel in [0, 1], averaged."""
+        """Return the inputs of the first layer: the observation, or an averaged image in [0, 1], channel by channel."""
         if observation.ndim != 3:
             return observation.astype(np.float32).ravel()
         side = self.description["pool"]

@@ -1,4 +1,4 @@
-"""Joint positions for a tool pose."""
+"""Inverse kinematics: joint positions for a tool pose."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from pydrake.solvers import Solve
 
 from guiderail.models.common.errors import InputError
 
-STARTS = 10
-"""From how many postures a search starts before a pose counts as out of reach: the given one, and others around it."""
-AT_LIMIT = 1e-6  # [rad]: a joint this near to a limit is held there
+STARTS = 10  # start postures of a search: the given one and random ones around it
+AT_LIMIT = 1e-6  # distance from a limit within which a joint is fixed [rad]
 
 
 def solve_inverse_kinematics(
@@ -24,35 +23,35 @@ def solve_inverse_kinematics(
     posture: np.ndarray,
     tolerance: float = 1e-9,
 ) -> np.ndarray:
-    """The joint positions (n,) nearest to `posture` with the tool centre at X in the reference frame.
+    """Return the joint positions (n,) nearest to `posture` that put the tool centre at X in the reference frame.
 
-    Minimizes ‖q − posture‖² subject to the pose and to the joints' limits, starting at `posture`: the result is the
-    minimum that a descent from there leads to, and the same at every call. Only where that finds none, searches start
-    elsewhere, and the nearest of what they find is taken.
+    Minimizes ‖q − posture‖² subject to the pose and the joint limits, starting at `posture`, so that the result is
+    deterministic. If no solution is found from there, further searches start at random postures and the solution
+    nearest to `posture` is returned.
 
     Args:
-        plant: finalized; all its joints take part.
-        reference: in which X is given.
-        tool_centre: that shall be at X.
-        X: the pose.
-        posture: joint positions (n,).
-        tolerance: of the pose, translation [m] and rotation [rad] together.
+        plant: Finalized plant, all of whose joints are free.
+        reference: Frame in which X is expressed.
+        tool_centre: Frame to place at X.
+        X: Pose of the tool centre in the reference frame.
+        posture: Joint positions (n,) [rad].
+        tolerance: Tolerance of the pose, translation [m] and rotation [rad] together.
 
     Raises:
-        InputError: if the pose is out of reach, or reached only beyond a joint's limits.
+        InputError: If the pose is out of reach, or reached only beyond the joint limits.
     """
     problem = _Problem(plant, reference, tool_centre, X, np.asarray(posture, dtype=float), tolerance)
-    found = problem.search(within_limits=True)
-    if found is not None:
-        return found
-    where = X.translation().round(3)
+    solution = problem.search(within_limits=True)
+    if solution is not None:
+        return solution
+    position = X.translation().round(3)
     if problem.search(within_limits=False) is not None:
-        raise InputError(f"the arm reaches {where} m only beyond a joint's limit")
-    raise InputError(f"the arm can't reach {where} m: move the workcell nearer")
+        raise InputError(f"the arm reaches {position} m only beyond a joint's limit")
+    raise InputError(f"the arm can't reach {position} m: move the workcell nearer")
 
 
 class _Problem:
-    """One pose that is asked for."""
+    """Inverse kinematics of one pose."""
 
     def __init__(
         self,
@@ -68,18 +67,18 @@ class _Problem:
         self._context = plant.CreateDefaultContext()
 
     def search(self, within_limits: bool) -> np.ndarray | None:
-        """The solution that the given posture leads to, else the nearest one that other starts lead to."""
+        """Return the solution of a search from the posture, otherwise the nearest one of random starts, or None."""
         lower, upper = self._limits(within_limits)
         solution = self._solve(self._posture, lower, upper, within_limits)
         if solution is not None:
             return solution
-        # Within half a turn of the posture: a joint that turns several times isn't wound up.
+        # Within half a turn of the posture, so that a joint with several turns is not wound up.
         random = np.random.default_rng(0)
         low, high = np.maximum(lower, self._posture - np.pi), np.minimum(upper, self._posture + np.pi)
         starts = random.uniform(np.minimum(low, high), np.maximum(low, high), (STARTS - 1, len(lower)))
         solutions = [self._solve(start, lower, upper, within_limits) for start in starts]
-        found = [q for q in solutions if q is not None]
-        return min(found, key=lambda q: float(np.linalg.norm(q - self._posture)), default=None)
+        valid = [q for q in solutions if q is not None]
+        return min(valid, key=lambda q: float(np.linalg.norm(q - self._posture)), default=None)
 
     def _limits(self, within_limits: bool) -> tuple[np.ndarray, np.ndarray]:
         lower, upper = self._plant.GetPositionLowerLimits(), self._plant.GetPositionUpperLimits()
@@ -93,10 +92,10 @@ class _Problem:
         result = Solve(ik.prog(), np.clip(start, lower, upper))
         if not result.is_success():
             return None
-        return self._polished(np.clip(result.GetSolution(q), lower, upper), lower, upper)
+        return self._refine(np.clip(result.GetSolution(q), lower, upper), lower, upper)
 
     def _constrain_pose(self, ik: InverseKinematics) -> None:
-        """Six equations whose gradients are independent: the origin, a point of x in y and z, a point of y in z."""
+        """Add six independent equations: for the origin, for y and z of a point on x, and for z of a point on y."""
         free = np.inf
         for p_PQ, lower, upper in (
             ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]),
@@ -112,16 +111,16 @@ class _Problem:
                 p_AQ_upper=upper,
             )
 
-    def _polished(self, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
-        """The solver's answer, moved by the last bit to the pose itself; a joint at its limit stays there.
+    def _refine(self, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
+        """Refine the solver's solution to the exact pose, with joints at their limits fixed; None if it fails.
 
-        By Levenberg and Marquardt: a damping that goes to zero with the error takes quadratic steps to a pose that is
-        regular, and does not leap from one that is singular.
+        The method is Levenberg-Marquardt with a damping that vanishes with the error: it converges quadratically at a
+        regular pose and takes no large steps at a singular one.
         """
-        moves = (q > lower + AT_LIMIT) & (q < upper - AT_LIMIT)
+        is_free = (q > lower + AT_LIMIT) & (q < upper - AT_LIMIT)
         error, J = self._error_and_jacobian(q)
         for _ in range(20):
-            J = J * moves
+            J = J * is_free
             step = J.T @ np.linalg.solve(J @ J.T + (error @ error + 1e-16) * np.eye(6), error)
             moved = np.clip(q + step, lower, upper)
             moved_error, J = self._error_and_jacobian(moved)
@@ -131,7 +130,7 @@ class _Problem:
         return q if np.linalg.norm(error) < self._tolerance else None
 
     def _error_and_jacobian(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """From the pose at `q` to X, a rotation vector and a translation, (6,), and the Jacobian (6, n)."""
+        """Return the error from the pose at `q` to X, (6,) rotation first, and the Jacobian (6, n)."""
         plant, context = self._plant, self._context
         plant.SetPositions(context, q)
         X_now = self._tool_centre.CalcPose(context, self._reference)

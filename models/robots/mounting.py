@@ -1,4 +1,4 @@
-"""A robot and its end effector in a plant."""
+"""Mounting of a robot and its end effector in a plant."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from guiderail.models.robots.robot import EndEffector, JointDrives, Robot
 
 @dataclass(frozen=True)
 class MountedRobot:
-    """A robot in some plant.
+    """Robot in a plant.
 
     Attributes:
-        model: of its joints, whose positions, velocities and actuation are the plant's of this instance.
-        flange: where a tool is bolted on.
-        actuators: in the order of its joints.
+        model: Model instance of its joints.
+        flange: Frame to which a tool is mounted.
+        actuators: Actuators in the order of its joints.
     """
 
     model: ModelInstanceIndex
@@ -41,14 +41,14 @@ class MountedRobot:
 
 @dataclass(frozen=True)
 class MountedEndEffector:
-    """An end effector on some robot's flange.
+    """End effector on a robot's flange.
 
     Attributes:
-        wrist: by which it is bolted on; a wrist sensor measures there.
-        tool_centre: P.
-        bodies: all of it, the first is the child of `wrist`.
-        model: its model instance.
-        actuators: in the order of its joints; none of a rigid tool, or of a gripper that was added as one.
+        wrist: Joint to the flange, at which a wrist sensor measures.
+        tool_centre: Frame P.
+        bodies: All bodies; the first is the child of `wrist`.
+        model: Model instance.
+        actuators: Actuators in the order of its joints; empty for a rigid tool, or a gripper added as a rigid body.
     """
 
     wrist: WeldJoint
@@ -59,99 +59,99 @@ class MountedEndEffector:
 
 
 def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
-    """Adds a robot with its base at the world's origin.
+    """Add a robot with its base at the world's origin.
 
     Raises:
-        InputError: if its model file is missing, can't be read, or has not what the robot's data say.
+        InputError: If its model file is missing, can't be read, or does not match the robot's data.
     """
     models = _read(plant, robot.model, f"robot {robot.name!r}")
-    joints = [_joint(plant, models, name, robot) for name in robot.joints]
+    joints = [_find_joint(plant, models, name, robot) for name in robot.joints]
     model = joints[0].model_instance()
     if any(joint.model_instance() != model for joint in joints):
         raise InputError(f"robot {robot.name!r}: its joints must all be of one model instance")
-    base = _frame(plant, models, robot.base_frame, robot)
+    base = _find_frame(plant, models, robot.base_frame, robot)
     if not any(plant.get_joint(i).child_body().index() == base.body().index() for i in plant.GetJointIndices()):
         plant.WeldFrames(plant.world_frame(), base)
     return MountedRobot(
         model=model,
-        flange=_frame(plant, models, robot.flange_frame, robot),
-        actuators=_actuators(plant, joints, f"robot {robot.name!r}"),
+        flange=_find_frame(plant, models, robot.flange_frame, robot),
+        actuators=_list_actuators(plant, joints, f"robot {robot.name!r}"),
     )
 
 
 def add_end_effector(
     plant: MultibodyPlant, robot: Robot, mounted: MountedRobot, end_effector: EndEffector, *, as_rigid: bool = False
 ) -> MountedEndEffector:
-    """Bolts an end effector to a robot's flange.
+    """Mount an end effector to a robot's flange.
 
     Args:
-        plant: with the robot, not finalized.
-        robot: says how the flange is turned.
-        mounted: the robot in the plant.
-        end_effector: what is bolted on.
-        as_rigid: a gripper is added as one body, open: to a controller, what it carries is a mass.
+        plant: Plant with the robot, not finalized.
+        robot: Robot, whose `tool_turn` defines the orientation of the mount.
+        mounted: The robot in the plant.
+        end_effector: End effector to mount.
+        as_rigid: Add an open gripper as one rigid body, for a controller's plant.
 
     Raises:
-        InputError: if its model file is missing, can't be read, or has not what its data say.
+        InputError: If its model file is missing, can't be read, or does not match its data.
     """
     X_FlangeMount = RigidTransform(RotationMatrix.MakeZRotation(robot.tool_turn), [0.0, 0.0, 0.0])
     X_FlangeMount = X_FlangeMount @ end_effector.X_FlangeMount
-    who = f"end effector {end_effector.name!r}"
+    label = f"end effector {end_effector.name!r}"
     if as_rigid and end_effector.is_gripper:
         return _add_rigid_copy(plant, mounted, end_effector, X_FlangeMount)
-    (model,) = _read(plant, end_effector.model, who, only_one=True)
-    _expect(plant, model, end_effector)
+    (model,) = _read(plant, end_effector.model, label, only_one=True)
+    _check_names(plant, model, end_effector)
     wrist = plant.WeldFrames(mounted.flange, plant.GetFrameByName(end_effector.mount_frame, model), X_FlangeMount)
     joints = [plant.GetJointByName(name, model) for name in end_effector.joints]
-    _open(plant, model, end_effector)
+    _set_opening(plant, model, end_effector)
     return MountedEndEffector(
         wrist=wrist,
         tool_centre=plant.GetFrameByName(end_effector.tool_centre, model),
         bodies=[plant.GetBodyByName(name, model) for name in end_effector.bodies],
         model=model,
-        actuators=_actuators(plant, joints, who),
+        actuators=_list_actuators(plant, joints, label),
     )
 
 
 def lighten_rotors(robot: Robot, mounted: MountedRobot) -> None:
-    """Makes the rotors appear as light as control by torque makes them."""
+    """Set the rotor inertias to the smaller ones that a joint torque control makes apparent."""
     for actuator in mounted.actuators:
         actuator.set_default_rotor_inertia(robot.apparent_rotor_inertia * actuator.default_rotor_inertia())
 
 
 def add_drives(actuators: Sequence[JointActuator], drives: JointDrives) -> None:
-    """Gives each joint a spring to its desired position and a damper, which the plant solves implicitly."""
+    """Give each joint a spring to its desired position and a damper, which the plant integrates implicitly."""
     for actuator, stiffness, damping in zip(actuators, drives.stiffness, drives.damping, strict=True):
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
 
 
-def _read(plant: MultibodyPlant, file: Path, who: str, *, only_one: bool = False) -> list[ModelInstanceIndex]:
+def _read(plant: MultibodyPlant, file: Path, label: str, *, only_one: bool = False) -> list[ModelInstanceIndex]:
     if not Path(file).is_file():
-        raise InputError(f"{who}: there is no model file {file}")
+        raise InputError(f"{label}: there is no model file {file}")
     try:
         models = add_models(plant, file)
     except RuntimeError as error:
-        raise InputError(f"{who}: {file} can't be read as a model: {error}") from error
+        raise InputError(f"{label}: {file} can't be read as a model: {error}") from error
     if only_one and len(models) != 1:
-        raise InputError(f"{who}: {file} must hold one model, not {len(models)}")
+        raise InputError(f"{label}: {file} must hold one model, not {len(models)}")
     return models
 
 
-def _frame(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], name: str, robot: Robot) -> Frame:
+def _find_frame(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], name: str, robot: Robot) -> Frame:
     for model in models:
         if plant.HasFrameNamed(name, model):
             return plant.GetFrameByName(name, model)
     raise InputError(f"robot {robot.name!r}: {robot.model.name} has no frame {name!r}")
 
 
-def _joint(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], name: str, robot: Robot) -> Joint:
+def _find_joint(plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], name: str, robot: Robot) -> Joint:
     for model in models:
         if plant.HasJointNamed(name, model):
             return plant.GetJointByName(name, model)
     raise InputError(f"robot {robot.name!r}: {robot.model.name} has no joint {name!r}")
 
 
-def _actuators(plant: MultibodyPlant, joints: Sequence[Joint], who: str) -> list[JointActuator]:
+def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) -> list[JointActuator]:
     """Of the joints, which must be all that their model actuates, in the model's order."""
     if not joints:
         return []
@@ -161,26 +161,26 @@ def _actuators(plant: MultibodyPlant, joints: Sequence[Joint], who: str) -> list
     names = [joint.name() for joint in joints]
     for name in names:
         if name not in actuated:
-            raise InputError(f"{who}: joint {name!r} has no actuator: give its model file a transmission")
+            raise InputError(f"{label}: joint {name!r} has no actuator: give its model file a transmission")
     if names != actuated:
-        raise InputError(f"{who}: name all joints that its model file actuates, in its order: {', '.join(actuated)}")
+        raise InputError(f"{label}: name all joints that its model file actuates, in its order: {', '.join(actuated)}")
     return actuators
 
 
-def _expect(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
-    """Refuses data of names that the model file has not."""
-    for kind, names, is_there in (
+def _check_names(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
+    """Refuse an end effector whose data name elements that its model file does not have."""
+    for kind, names, has_name in (
         ("frame", (end_effector.mount_frame, end_effector.tool_centre), plant.HasFrameNamed),
         ("body", end_effector.bodies, plant.HasBodyNamed),
         ("joint", (*end_effector.joints, *end_effector.opening), plant.HasJointNamed),
     ):
         for name in names:
-            if not is_there(name, model):
+            if not has_name(name, model):
                 file = end_effector.model.name
                 raise InputError(f"end effector {end_effector.name!r}: {file} has no {kind} {name!r}")
 
 
-def _open(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
+def _set_opening(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEffector) -> None:
     for name, position in end_effector.opening.items():
         plant.GetJointByName(name, model).set_default_positions([position])
 
@@ -188,19 +188,19 @@ def _open(plant: MultibodyPlant, model: ModelInstanceIndex, end_effector: EndEff
 def _add_rigid_copy(
     plant: MultibodyPlant, mounted: MountedRobot, end_effector: EndEffector, X_FlangeMount: RigidTransform
 ) -> MountedEndEffector:
-    """One body with the inertia of the open gripper."""
-    alone = MultibodyPlant(time_step=1e-3)  # a joint that mimics another is known to discrete plants only
-    alone.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
-    model = add_model(alone, end_effector.model)
-    _expect(alone, model, end_effector)
-    mount = alone.GetFrameByName(end_effector.mount_frame, model)
-    alone.WeldFrames(alone.world_frame(), mount)
-    _open(alone, model, end_effector)
-    alone.Finalize()
-    context = alone.CreateDefaultContext()
-    bodies = [alone.GetBodyByName(name, model).index() for name in end_effector.bodies]
-    M = alone.CalcSpatialInertia(context, mount, bodies)
-    X_MountP = alone.GetFrameByName(end_effector.tool_centre, model).CalcPose(context, mount)
+    """Add one body with the inertia of the open gripper."""
+    gripper_plant = MultibodyPlant(time_step=1e-3)  # only discrete plants support mimic joints
+    gripper_plant.set_discrete_contact_approximation(DiscreteContactApproximation.kLagged)
+    model = add_model(gripper_plant, end_effector.model)
+    _check_names(gripper_plant, model, end_effector)
+    mount = gripper_plant.GetFrameByName(end_effector.mount_frame, model)
+    gripper_plant.WeldFrames(gripper_plant.world_frame(), mount)
+    _set_opening(gripper_plant, model, end_effector)
+    gripper_plant.Finalize()
+    context = gripper_plant.CreateDefaultContext()
+    bodies = [gripper_plant.GetBodyByName(name, model).index() for name in end_effector.bodies]
+    M = gripper_plant.CalcSpatialInertia(context, mount, bodies)
+    X_MountP = gripper_plant.GetFrameByName(end_effector.tool_centre, model).CalcPose(context, mount)
 
     instance = plant.AddModelInstance(end_effector.name)
     body = plant.AddRigidBody(end_effector.bodies[0], instance, M)

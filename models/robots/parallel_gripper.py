@@ -1,4 +1,4 @@
-"""A gripper with two parallel fingers."""
+"""Gripper with two parallel fingers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PARALLEL_GRIPPER = register_end_effector(
         bodies=("gripper_body", "left_finger", "right_finger", "tool_centre"),
         joints=("left_finger_joint",),
         opening={"left_finger_joint": 0.04, "right_finger_joint": 0.04},
-        # Both fingers hang on the one drive.
+        # One drive moves both fingers.
         drives=JointDrives(stiffness=(5000.0,), inertia=(0.12,)),
         source="this project's own design",
     )

@@ -1,8 +1,8 @@
-"""Robots and tools as data: what a station has to know of either beyond its model file.
+"""Robots and end effectors as data, and their registries.
 
-A robot is one file of this package and a model: the file makes a `Robot` and calls `register_robot`, and from then on
-`find_robot(name)` knows it. An installed package adds its own by an entry point of the group `guiderail.robots`
-(`guiderail.end_effectors` for tools), a script by calling `register_robot`.
+A robot is one file of this package and a model file. The Python file constructs a `Robot` and calls `register_robot`;
+`find_robot(name)` then returns it. An installed package adds robots by an entry point of the group `guiderail.robots`
+(end effectors: `guiderail.end_effectors`), a script by calling `register_robot`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ DEFAULT_END_EFFECTOR = "connector_tool"
 
 @dataclass(frozen=True)
 class JointDrives:
-    """Springs and dampers that hold joints at desired positions.
+    """Position control of joints by springs and dampers.
 
     Attributes:
-        stiffness: of each joint, (n,) [Nm/rad], or [N/m] where it slides.
-        inertia: that each drive typically moves, rotor included, (n,) [kg m²] or [kg]: damping is critical for it.
+        stiffness: Stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic one.
+        inertia: Typical inertia of each joint including its rotor, (n,) [kg m²] or [kg], for critical damping.
     """
 
     stiffness: tuple[float, ...]
@@ -42,33 +42,33 @@ class JointDrives:
 
     @property
     def damping(self) -> tuple[float, ...]:
-        """Of each joint, (n,) [Nms/rad] or [Ns/m]."""
+        """Critical damping of each joint, (n,) [Nms/rad] or [Ns/m]."""
         return tuple(2.0 * math.sqrt(k * m) for k, m in zip(self.stiffness, self.inertia, strict=True))
 
 
 @dataclass(frozen=True)
 class Robot:
-    """An arm of six or more joints.
+    """Robot arm with six or more joints.
 
     Attributes:
-        name: by which it is found.
-        title: what a person calls it.
-        model: its URDF or SDF file, or a file of Drake model directives (.yaml); directives find the packages that lie
-            in their own folder. Each joint needs an actuator with its limit of effort, the inertia of its rotor and
-            the ratio of its gear: without reflected inertia no impedance is stable at a step of milliseconds.
-        base_frame: that stands at the world's origin, unless the model itself welds it to the world.
-        flange_frame: where a tool is bolted on; its z points away from the arm.
-        joints: from the base to the flange.
-        home: joint positions with the flange pointing down in front of the robot, far from limits and singularities:
-            where inverse kinematics starts, (n,) [rad].
-        tool_turn: about the flange's z, by which tools are bolted on: at home, with the last joint in the middle of
-            its range, a tool turned by this has its own x along the base's [rad].
-        apparent_rotor_inertia: how much of the rotors' reflected inertia is left when the joints are controlled by
-            torque; feedback of the joint torque makes a rotor appear lighter (Albu-Schäffer, Ott, Hirzinger 2007).
-        drives: of the joints when they are controlled by position; None where nobody wrote them down.
-        level_posture: joint positions with the flange's z level, for a tool that is held like a cup, (n,) [rad]; None
-            where nobody wrote them down.
-        source: where the model's numbers come from, for whoever quotes them.
+        name: Name in the registry.
+        title: Name for users.
+        model: URDF or SDF file, or a file of Drake model directives (.yaml) with its packages in the same folder. Each
+            joint needs an actuator with effort limit, rotor inertia and gear ratio: without reflected inertia an
+            impedance controller is unstable at a step of milliseconds.
+        base_frame: Frame that is welded to the world's origin, unless the model file welds it to the world.
+        flange_frame: Frame to which tools are mounted; its z axis points away from the arm.
+        joints: Names of the joints from the base to the flange.
+        home: Joint positions (n,) [rad] with the flange pointing down in front of the robot, far from limits and
+            singularities; inverse kinematics starts there.
+        tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with that of
+            the base at home, with the last joint in the middle of its range.
+        apparent_rotor_inertia: Part of the rotors' reflected inertia that remains under torque control; joint torque
+            feedback reduces it (Albu-Schäffer, Ott, Hirzinger 2007).
+        drives: Drives of the joints under position control; None if unknown.
+        level_posture: Joint positions (n,) [rad] with a horizontal z axis of the flange, for a tool held like a cup;
+            None if unknown.
+        source: Source of the model's numbers.
     """
 
     name: str
@@ -97,27 +97,27 @@ class Robot:
 
     @property
     def num_joints(self) -> int:
-        """Of the arm."""
+        """Number of joints of the arm."""
         return len(self.joints)
 
 
 @dataclass(frozen=True)
 class EndEffector:
-    """What is bolted to a flange: a rigid tool, or a gripper.
+    """End effector: a rigid tool or a gripper.
 
     Attributes:
-        name: by which it is found.
-        title: what a person calls it.
-        model: its URDF or SDF file.
-        mount_frame: that is bolted to the flange.
-        tool_centre: the frame P that a station commands: the centre of compliance, z back towards the flange. It is
-            fixed to the mount.
-        bodies: all bodies, the mount's first.
-        X_FlangeMount: where the mount is on a flange that the robot's `tool_turn` has turned.
-        joints: that are actuated, a gripper's; none for a rigid tool. A gripper's joints that mimic another are not.
-        opening: of every joint by name, those that mimic others too: where an episode starts, [rad] or [m].
-        drives: of those joints.
-        source: where the model's numbers come from.
+        name: Name in the registry.
+        title: Name for users.
+        model: URDF or SDF file.
+        mount_frame: Frame that is mounted to the flange.
+        tool_centre: Name of the frame P that a station commands: the centre of compliance, z towards the flange, fixed
+            to the mount.
+        bodies: Names of all bodies, that of the mount first.
+        X_FlangeMount: Pose of the mount on the flange turned by the robot's `tool_turn`.
+        joints: Names of the actuated joints of a gripper, without mimic joints; empty for a rigid tool.
+        opening: Positions of all joints by name, including mimic joints, at the start of an episode [rad] or [m].
+        drives: Drives of the actuated joints.
+        source: Source of the model's numbers.
     """
 
     name: str
@@ -143,7 +143,7 @@ class EndEffector:
 
     @property
     def is_gripper(self) -> bool:
-        """Whether something of it moves."""
+        """True if it has actuated joints."""
         return bool(self.joints)
 
 
@@ -154,40 +154,40 @@ _END_EFFECTORS: Registry[EndEffector] = Registry(
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Makes a robot known by its name, which is given once."""
+    """Add a robot to the registry under its name, which must be new, and return it."""
     return _ROBOTS.register(robot.name, robot)
 
 
 def find_robot(name: str | Robot) -> Robot:
-    """The robot of that name; a robot is its own.
+    """Return the robot with a name; a `Robot` is returned unchanged.
 
     Raises:
-        InputError: if there is none; the sentence has the nearest name.
+        InputError: If there is none; the message suggests the nearest name.
     """
     return name if isinstance(name, Robot) else _ROBOTS.get(name)
 
 
 def robot_names() -> list[str]:
-    """Of all robots, sorted."""
+    """Return the names of all robots, sorted."""
     return _ROBOTS.names()
 
 
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
-    """Makes an end effector known by its name, which is given once."""
+    """Add an end effector to the registry under its name, which must be new, and return it."""
     return _END_EFFECTORS.register(end_effector.name, end_effector)
 
 
 def find_end_effector(name: str | EndEffector) -> EndEffector:
-    """The end effector of that name; an end effector is its own.
+    """Return the end effector with a name; an `EndEffector` is returned unchanged.
 
     Raises:
-        InputError: if there is none; the sentence has the nearest name.
+        InputError: If there is none; the message suggests the nearest name.
     """
     return name if isinstance(name, EndEffector) else _END_EFFECTORS.get(name)
 
 
 def end_effector_names() -> list[str]:
-    """Of all end effectors, sorted."""
+    """Return the names of all end effectors, sorted."""
     return _END_EFFECTORS.names()
 
 

@@ -19,7 +19,7 @@ UR5E = register_robot(
         ),
         home=(-0.25, -1.4, 1.85, -2.02, -1.57, 0.0),
         tool_turn=-math.pi / 2,
-        # It has no torque sensors in its joints: a torque that the motors make moves their rotors too.
+        # Without joint torque sensors, the motor torque accelerates the whole rotor inertia.
         apparent_rotor_inertia=1.0,
         drives=JointDrives(
             stiffness=(8000.0, 8000.0, 8000.0, 3000.0, 3000.0, 3000.0),
