@@ -37,7 +37,7 @@ def csv_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def template_numbers(text: str) -> dict[tuple[str, ...], float]:
-    """Every number of a template by its path, with PyYAML's own reader and Python's own arithmetic."""
+    """Return every number of a template by its path, read with PyYAML and evaluated with Python's `eval`."""
     data = yaml.safe_load(text)
     parameters = {name: float(_value(value, {})) for name, value in (data.get("parameters") or {}).items()}
     found: dict[tuple[str, ...], float] = {("parameters", name): value for name, value in parameters.items()}

@@ -36,7 +36,7 @@ START = np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0])
 
 
 class Rig:
-    """The projector with its inputs at hand."""
+    """Projector with settable inputs."""
 
     def __init__(self, start=START, max_tracking_error=np.inf, template=TEMPLATE):
         self.system = ActiveConstraintProjector(template, FRAMES, PERIOD, max_tracking_error)
@@ -49,7 +49,7 @@ class Rig:
         self.steps = 0
 
     def step(self, request, measured=None, state=None):
-        """One control step: what was commanded during it, and whether that was a repetition."""
+        """Run one control step; return its command and the fallback flag."""
         # The request comes from a hold: it changes with the events of an instant, not before them.
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
         self.request.GetMutableData().set_value(request)
@@ -68,14 +68,14 @@ class Rig:
         return self.system.GetOutputPort(name).Eval(self.context)[0]
 
 
-def test_ports():
+def test_projector_has_its_ports():
     system = ActiveConstraintProjector(TEMPLATE, FRAMES, PERIOD)
     names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
     assert names == ["desired_pose", "last_desired_pose", "fallback", "commanded_violation", "measured_violation"]
     assert [system.get_output_port(i).size() for i in range(5)] == [6, 6, 1, 1, 1]
 
 
-def test_the_last_command_never_feeds_through():
+def test_last_command_has_no_direct_feedthrough():
     system = ActiveConstraintProjector(TEMPLATE, FRAMES, PERIOD)
     last = system.get_last_desired_pose_output_port().get_index()
     assert not any(system.HasDirectFeedthrough(i, last) for i in range(system.num_input_ports()))
@@ -84,7 +84,7 @@ def test_the_last_command_never_feeds_through():
     assert not system.HasDirectFeedthrough(system.get_pose_input_port().get_index(), desired)
 
 
-def test_an_allowed_request_near_by_is_commanded():
+def test_projector_commands_an_allowed_request():
     rig = Rig()
     request = START + [0.001, -0.002, 0.001, 0.0, 0.0, 0.0]
     desired, fallback = rig.step(request)
@@ -92,7 +92,7 @@ def test_an_allowed_request_near_by_is_commanded():
     assert fallback == 0.0
 
 
-def test_a_forbidden_request_is_projected_whatever_it_is():
+def test_projector_projects_every_forbidden_request():
     rig = Rig()
     rng = np.random.default_rng(0)
     for _ in range(300):
@@ -102,7 +102,7 @@ def test_a_forbidden_request_is_projected_whatever_it_is():
         assert rig.value("commanded_violation") <= 1e-9
 
 
-def test_never_faster_than_the_template_allows():
+def test_projector_respects_the_speed_limits():
     rig = Rig()
     last = START
     for _ in range(150):
@@ -113,7 +113,7 @@ def test_never_faster_than_the_template_allows():
     assert last[0] > 0.1
 
 
-def test_a_command_is_taken_in_once_at_each_instant():
+def test_projector_updates_once_at_each_instant():
     rig = Rig()
     step = np.array([0.001, 0.0, 0.0, 0.0, 0.0, 0.0])
     rig.step(START + step)
@@ -123,7 +123,7 @@ def test_a_command_is_taken_in_once_at_each_instant():
     np.testing.assert_allclose(rig.system.get_last_desired_pose_output_port().Eval(rig.context), START + step)
 
 
-def test_a_request_that_is_not_finite_repeats_the_last_safe_command():
+def test_projector_repeats_the_last_command_for_a_nan_request():
     rig = Rig()
     before, _ = rig.step(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
     for request in (np.full(6, np.nan), START + [0.0, 0.0, np.inf, 0.0, 0.0, 0.0]):
@@ -132,7 +132,7 @@ def test_a_request_that_is_not_finite_repeats_the_last_safe_command():
         np.testing.assert_array_equal(desired, before)
 
 
-def test_the_command_waits_where_the_tracking_error_exceeds_its_bound():
+def test_command_waits_when_the_tracking_error_is_too_large():
     rig = Rig(max_tracking_error=0.02)
     for _ in range(100):
         desired, fallback = rig.step(np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0]), measured=START)
@@ -169,7 +169,7 @@ DOWN = START + [0.0, 0.0, -0.1, 0.0, 0.0, 0.0]
 @pytest.mark.parametrize(
     ("request_", "measured"), [(DOWN, START - [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]), (NOWHERE, START), (DOWN, NOWHERE)]
 )
-def test_constraints_hold_while_it_waits_across_a_transition(request_, measured):
+def test_waiting_command_is_inside_after_a_transition(request_, measured):
     rig = Rig(max_tracking_error=0.01, template=RAISED)
     assert RAISED.can_enter(1, pose_to_transform(rig.desired()), FRAMES, PERIOD)
     before, _ = rig.step(START, measured=measured)
@@ -182,7 +182,7 @@ def test_constraints_hold_while_it_waits_across_a_transition(request_, measured)
     np.testing.assert_allclose(desired, [0.0, 0.0, 0.302, 0.0, 0.0, 0.0], atol=1e-9)
 
 
-def test_an_object_that_is_moved_while_it_waits_leads_the_command_inside_no_faster_than_allowed():
+def test_waiting_command_is_led_inside_when_an_object_moves():
     rig = Rig(max_tracking_error=0.02)
     rig.step(START, measured=START + [0.0, 0.0, -0.05, 0.0, 0.0, 0.0])
     rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.3])})
@@ -199,7 +199,7 @@ def test_an_object_that_is_moved_while_it_waits_leads_the_command_inside_no_fast
 
 @pytest.mark.parametrize("nowhere", [NOWHERE, START + [0.0, 0.0, 0.0, 0.0, np.nan, 0.0]])
 @pytest.mark.parametrize("max_tracking_error", [0.02, np.inf])
-def test_waits_for_a_robot_whose_pose_is_no_number(max_tracking_error, nowhere):
+def test_command_waits_while_the_measured_pose_is_nan(max_tracking_error, nowhere):
     rig = Rig(max_tracking_error=max_tracking_error)
     away = START + [0.001, 0.0, 0.0, 0.0, 0.0, 0.0]
     before, _ = rig.step(START, measured=nowhere)
@@ -213,12 +213,12 @@ def test_waits_for_a_robot_whose_pose_is_no_number(max_tracking_error, nowhere):
     assert fallback == 0.0
 
 
-def test_refuses_to_begin_where_the_robot_is_nowhere():
+def test_projector_refuses_a_nan_initial_pose():
     with pytest.raises(InputError, match="measured pose must be finite"):
         Rig(start=START + [0.0, np.nan, 0.0, 0.0, 0.0, 0.0])
 
 
-def test_refuses_an_object_that_is_nowhere():
+def test_projector_refuses_a_frame_that_is_not_finite():
     nowhere = {"slab": RigidTransform([0.0, np.nan, 0.0])}
     with pytest.raises(InputError, match="frame slab must be at a finite pose"):
         ActiveConstraintProjector(TEMPLATE, nowhere, PERIOD)
@@ -229,8 +229,8 @@ def test_refuses_an_object_that_is_nowhere():
     assert rig.value("fallback") == 0.0
 
 
-def test_what_is_no_number_is_never_commanded_nor_remembered():
-    """Whoever writes an object's pose past `set`: the last command stays, and it goes on when there is one again."""
+def test_nan_is_never_commanded_or_stored():
+    """A NaN pose of an object that was written without `set` repeats the last command until the pose is finite."""
     rig = Rig()
     before, _ = rig.step(START)
     sound = rig.context.get_numeric_parameter(0).CopyToVector()
@@ -244,7 +244,7 @@ def test_what_is_no_number_is_never_commanded_nor_remembered():
     assert rig.desired()[2] < START[2]
 
 
-def test_a_robot_that_starts_outside_is_led_inside():
+def test_command_is_led_inside_when_the_robot_starts_outside():
     low = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.2])
     rig = Rig(start=low)
     violations = []
@@ -256,14 +256,14 @@ def test_a_robot_that_starts_outside_is_led_inside():
     assert violations[-1] <= 1e-9
 
 
-def test_says_how_far_the_robot_itself_is_outside():
+def test_measured_violation_is_that_of_the_measured_pose():
     rig = Rig()
     rig.step(START, measured=np.array([0.0, 0.0, 0.07, 0.0, 0.0, 0.0]))
     assert rig.value("measured_violation") == pytest.approx(0.03)
     assert rig.value("commanded_violation") == 0.0
 
 
-def test_a_reset_can_move_an_object():
+def test_projector_uses_a_frame_set_by_a_reset():
     rig = Rig()
     rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.15])})
     for _ in range(60):
@@ -272,6 +272,6 @@ def test_a_reset_can_move_an_object():
 
 
 @pytest.mark.parametrize(("period", "max_tracking_error"), [(0.0, 1.0), (-0.1, 1.0), (0.1, 0.0), (float("nan"), 1.0)])
-def test_refuses_what_makes_no_sense(period, max_tracking_error):
+def test_projector_refuses_invalid_arguments(period, max_tracking_error):
     with pytest.raises(InputError, match="positive"):
         ActiveConstraintProjector(TEMPLATE, FRAMES, period, max_tracking_error)

@@ -32,21 +32,21 @@ def requested(system, action, state, pose=POSE, frames=None):
     return system.get_requested_pose_output_port().Eval(context)
 
 
-def test_ports(system):
+def test_input_mapping_has_its_ports(system):
     assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == ["action", "pose", "state"]
     assert system.get_action_input_port().size() == 3
     assert system.get_output_port().get_name() == "requested_pose"
 
 
 @pytest.mark.parametrize("state", [0, 1, 2])
-def test_displaces_as_the_law_says(system, template, state):
+def test_input_mapping_displaces_by_the_law(system, template, state):
     action = np.array([0.3, 0.9, -0.4])
     X_WE = pose_to_transform(POSE)
     expected = template.displace(X_WE, template.map(state, action, X_WE, FRAMES, PERIOD))
     np.testing.assert_allclose(requested(system, action, state), transform_to_pose(expected), atol=1e-15)
 
 
-def test_the_state_decides_what_an_input_does(system):
+def test_input_mapping_depends_on_the_state(system):
     towards = np.array([0.0, 1.0, 0.0])
     moved = requested(system, towards, 1) - POSE
     tilted = requested(system, towards, 2) - POSE
@@ -54,24 +54,24 @@ def test_the_state_decides_what_an_input_does(system):
     np.testing.assert_allclose(tilted, [0.0, 0.0, 0.0, 0.0, 0.0, -0.8 * PERIOD], atol=1e-12)
 
 
-def test_a_reset_can_move_an_object(system):
-    # With the mug beside instead of ahead, the same input points across the bearing and tilts nothing.
+def test_input_mapping_uses_a_frame_set_by_a_reset(system):
+    # With the mug at the side instead of ahead, the same input is across the bearing and causes no tilt.
     aside = requested(system, np.array([0.0, 1.0, 0.0]), 2, frames={"mug_tip": RigidTransform([0.5, -0.06, 0.0])})
     np.testing.assert_allclose(aside, POSE, atol=1e-12)
 
 
-def test_an_object_that_the_template_does_not_have_is_refused(system):
+def test_input_mapping_refuses_an_unknown_frame(system):
     with pytest.raises(InputError, match="no frame cup, only mug_tip"):
         system.frames.set(system.CreateDefaultContext(), {"cup": RigidTransform()})
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_finite_stays_visible(system, bad):
+def test_input_mapping_returns_nan_for_a_nan_action(system, bad):
     assert np.isnan(requested(system, np.array([0.0, bad, 0.0]), 1)).all()
 
 
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan")])
-def test_refuses_what_makes_no_sense(template, period):
+def test_input_mapping_refuses_invalid_arguments(template, period):
     with pytest.raises(InputError, match="period"):
         SctInputMapping(template, FRAMES, period)
     with pytest.raises(InputError, match="mug_tip"):

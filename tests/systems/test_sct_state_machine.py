@@ -13,7 +13,7 @@ FRAMES = {"mug_tip": RigidTransform([0.0, 0.1, 0.0])}
 
 
 def at(distance):
-    """A pose `distance` in front of the mug."""
+    """Return a pose `distance` [m] in front of the mug."""
     return np.array([0.0, 0.1 - distance, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -33,7 +33,7 @@ class Rig:
         self.steps = 0
 
     def step(self, distance):
-        """The state after the events of the instant at which `distance` is seen."""
+        """Return the state after the events of the instant with this `distance`."""
         self.pose.GetMutableData().set_value(at(distance))
         self.steps += 1
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
@@ -43,13 +43,13 @@ class Rig:
         return int(self.system.get_state_output_port().Eval(self.context)[0])
 
 
-def test_ports(template):
+def test_state_machine_has_its_ports(template):
     system = SctStateMachine(template, FRAMES, PERIOD)
     names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
     assert names == ["state", "transition_distance", "progress"]
 
 
-def test_the_state_never_feeds_through(template):
+def test_state_has_no_direct_feedthrough(template):
     system = SctStateMachine(template, FRAMES, PERIOD)
     state = system.get_state_output_port().get_index()
     assert not any(system.HasDirectFeedthrough(i, state) for i in range(2))
@@ -58,22 +58,22 @@ def test_the_state_never_feeds_through(template):
 
 
 @pytest.mark.parametrize(("start", "state"), [(0.4, 0), (0.2, 1), (0.05, 2)])
-def test_begins_where_the_initial_pose_is(template, start, state):
+def test_state_machine_begins_in_the_state_of_the_initial_pose(template, start, state):
     assert Rig(template, start).state() == state
 
 
-def test_goes_there_and_back_with_hysteresis(template):
+def test_state_machine_returns_with_hysteresis(template):
     rig = Rig(template.without_active_constraints(), 0.4)
     assert [rig.step(d) for d in (0.26, 0.24, 0.26, 0.28, 0.24, 0.10, 0.07, 0.10, 0.40)] == [0, 1, 1, 0, 1, 1, 2, 2, 2]
 
 
-def test_one_transition_an_instant(template):
+def test_state_machine_makes_one_transition_an_instant(template):
     rig = Rig(template.without_active_constraints(), 0.4)
     assert [rig.step(0.05) for _ in range(3)] == [1, 2, 2]
 
 
-def test_waits_until_the_next_states_constraints_are_within_reach(template):
-    """An upright thermos near the mug: to pour it must have been tilted, which takes longer than a period."""
+def test_transition_waits_until_constraints_are_reachable(template):
+    """An upright thermos near the mug needs longer than a period to reach the tilt of pouring."""
     rig = Rig(template, 0.2)
     X_WE = RigidTransform(at(0.05)[:3])
     tilted = template.project(2, X_WE, FRAMES)
@@ -85,7 +85,7 @@ def test_waits_until_the_next_states_constraints_are_within_reach(template):
     assert rig.state() == 2
 
 
-def test_distance_and_progress_are_the_templates(template):
+def test_distance_and_progress_equal_those_of_the_template(template):
     rig = Rig(template, 0.4)
     rig.step(0.24)
     X_WE = RigidTransform(at(0.24)[:3])
@@ -96,7 +96,7 @@ def test_distance_and_progress_are_the_templates(template):
     assert progress == pytest.approx(5.0 * (0.40 - 0.24))
 
 
-def test_refuses_what_makes_no_sense(template):
+def test_state_machine_refuses_invalid_arguments(template):
     with pytest.raises(InputError, match="period"):
         SctStateMachine(template, FRAMES, 0.0)
     with pytest.raises(InputError, match="mug_tip"):

@@ -1,4 +1,4 @@
-"""Template files, mutated at random: a template that means exactly what the file says and works, or one sentence."""
+"""Randomly mutated template files: each is read exactly and works, or is refused in one sentence."""
 
 import copy
 import dataclasses
@@ -59,8 +59,8 @@ states:
 TREES = [yaml.safe_load(text) for text in TEXTS]
 
 
-def means_what_it_says(template, text):
-    """Every number of the template is the one that an independent reader finds at its place in the file."""
+def check_numbers(template, text):
+    """Check that every number equals that of an independent reader at the same place in the file."""
     found = template_numbers(text)
     data = parse_yaml(text)
     for name, value in template.parameters.items():
@@ -78,43 +78,43 @@ def means_what_it_says(template, text):
             assert state.ends_at == si * found[*place, f"ends_at_{unit}"]
         assert state.weight == found.get((*place, f"weight_per_{unit}"), 1.0 * si) / si
         for number, transition in enumerate(state.transitions):
-            there = (*place, "transitions", str(number))
-            assert transition.below == si * found[*there, f"below_{unit}"]
-            assert transition.hysteresis == _scaled(si, found.get((*there, f"hysteresis_{unit}")))
+            transition_place = (*place, "transitions", str(number))
+            assert transition.below == si * found[*transition_place, f"below_{unit}"]
+            assert transition.hysteresis == _scaled(si, found.get((*transition_place, f"hysteresis_{unit}")))
         for field in ("input_mapping", "active_constraints"):
             parts = getattr(state, field)
             assert len(parts) == len(entry[field])
             for number, part in enumerate(parts):
-                same_fields(part, entry[field][number], (*place, field, str(number)), found)
-        same_fields(state.transition_distance, entry["transition_distance"], (*place, "transition_distance"), found)
+                check_fields(part, entry[field][number], (*place, field, str(number)), found)
+        check_fields(state.transition_distance, entry["transition_distance"], (*place, "transition_distance"), found)
 
 
 def _scaled(si, value):
     return None if value is None else si * value
 
 
-def same_fields(part, entry, place, found):
+def check_fields(part, entry, place, found):
     assert set(entry) - {"kind"} <= {field.name for field in dataclasses.fields(part)}
-    for key, said in entry.items():
+    for key, value in entry.items():
         if key == "of":
-            same_fields(part.of, said, (*place, "of"), found)
+            check_fields(part.of, value, (*place, "of"), found)
         elif key != "kind":
-            same_value(getattr(part, key), said, (*place, key), found)
+            check_value(getattr(part, key), value, (*place, key), found)
 
 
-def same_value(value, said, place, found):
+def check_value(value, entry, place, found):
     if isinstance(value, tuple):
-        assert len(value) == len(said)
-        for number, (inner, inner_said) in enumerate(zip(value, said, strict=True)):
-            same_value(inner, inner_said, (*place, str(number)), found)
+        assert len(value) == len(entry)
+        for number, (inner, inner_entry) in enumerate(zip(value, entry, strict=True)):
+            check_value(inner, inner_entry, (*place, str(number)), found)
     elif isinstance(value, str | bool):
-        assert value is said or value == said
+        assert value is entry or value == entry
     else:
         assert value == found[place]
 
 
-def works(template):
-    """Every law of every state gives a pose or a number, near the object and far from it."""
+def check_laws(template):
+    """Check that every law of every state returns finite values, near the object and far from it."""
     X_WF = {
         name: RigidTransform(RotationMatrix.MakeZRotation(0.3 + i), [0.5, 0.1 * i, 0.1])
         for i, name in enumerate(template.frames)
@@ -137,18 +137,18 @@ def works(template):
 def try_template(target, text):
     template = attempt(target, InputError, lambda: parse_template(text))
     if template is not None:
-        means_what_it_says(template, text)
-        works(template)
+        check_numbers(template, text)
+        check_laws(template)
 
 
 @given(changed_trees(TREES))
 @example(TREES[-1])
-def test_templates_with_entries_changed(tree):
+def test_template_with_changed_entries_is_exact_or_refused(tree):
     try_template("template, entries changed", yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
 
 
 @given(changed_texts(TEXTS))
-def test_templates_with_characters_changed(text):
+def test_template_with_changed_characters_is_exact_or_refused(text):
     try_template("template, characters changed", text)
 
 
@@ -158,7 +158,7 @@ TOKENS = st.sampled_from(
 
 
 @given(st.lists(TOKENS, max_size=12).map("".join))
-def test_arithmetic(expression):
+def test_arithmetic_is_exact_or_refused(expression):
     tree = copy.deepcopy(TREES[-1])
     tree["max_speed_m_per_s"] = expression
     try_template("template, arithmetic", yaml.safe_dump(tree, sort_keys=False))
@@ -174,7 +174,7 @@ VALUES = st.recursive(
 
 
 @given(VALUES)
-def test_yaml_gives_back_what_was_written(value):
+def test_yaml_round_trip_is_exact(value):
     text = yaml.safe_dump(value)
     read = attempt("yaml, round trip", InputError, lambda: (parse_yaml(text),))
     if read is not None:

@@ -1,4 +1,4 @@
-"""Objects of other dimensions than those whose files come along."""
+"""Generated files of objects with other dimensions than the shipped ones."""
 
 import dataclasses
 import re
@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.units import MM
-from guiderail.models.objects.bnc_connector import sdf as write_bnc
+from guiderail.models.objects.bnc_connector import sdf as bnc_sdf
 from guiderail.models.objects.bnc_connector.geometry import FOLDER, BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION
-from guiderail.models.objects.grid_clamp import sdf as write_grid_clamp
+from guiderail.models.objects.grid_clamp import sdf as grid_clamp_sdf
+from guiderail.models.objects.grid_clamp.geometry import FOLDER as GRID_CLAMP_FOLDER
 from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions
 
 
@@ -19,18 +20,21 @@ def vertices(path):
 
 
 @pytest.mark.parametrize(
-    ("folder_of", "dimensions"),
-    [(write_bnc.folder_of, BncDimensions()), (write_grid_clamp.folder_of, GridClampDimensions())],
+    ("folder_of", "dimensions", "folder"),
+    [
+        (bnc_sdf.folder_of, BncDimensions(), FOLDER),
+        (grid_clamp_sdf.folder_of, GridClampDimensions(), GRID_CLAMP_FOLDER),
+    ],
 )
-def test_what_is_as_drawn_is_read_from_where_it_lies(folder_of, dimensions):
-    assert folder_of(dimensions) == FOLDER
-    assert folder_of(dataclasses.replace(dimensions)) == FOLDER
+def test_folder_of_returns_the_shipped_folder_when_unchanged(folder_of, dimensions, folder):
+    assert folder_of(dimensions) == folder
+    assert folder_of(dataclasses.replace(dimensions)) == folder
 
 
-def test_a_plug_made_to_measure_has_those_measures():
+def test_generated_connector_has_the_given_dimensions():
     dimensions = dataclasses.replace(BncDimensions().with_bore_clearance(0.07 * MM), mouth_chamfer=0.25 * MM)
-    folder = write_bnc.folder_of(dimensions, 0.35)
-    assert write_bnc.folder_of(dimensions, 0.35) == folder != FOLDER
+    folder = bnc_sdf.folder_of(dimensions, 0.35)
+    assert bnc_sdf.folder_of(dimensions, 0.35) == folder != FOLDER
     bore = vertices(folder / "bnc_bore.obj")
     inner = np.hypot(*bore[bore[:, 2] > 1.0 * MM, :2].T) * np.cos(np.pi / 24)
     np.testing.assert_allclose(inner, 4.825 * MM + 0.07 * MM, atol=1e-8)
@@ -42,17 +46,17 @@ def test_a_plug_made_to_measure_has_those_measures():
         assert set(re.findall(r"<drake:mu_static>([\d.]+)<", (folder / name).read_text())) == numbers
 
 
-def test_a_wider_slot_is_wider():
+def test_generated_slot_has_the_given_width():
     wider = dataclasses.replace(BncDimensions(), slot_clearance=0.2 * MM)
-    generate_assets, drawn = (vertices(write_bnc.folder_of(d) / "bnc_slots.obj") for d in (wider, BncDimensions()))
-    assert generate_assets[:, 2].max() - drawn[:, 2].max() == pytest.approx(0.075 * MM, abs=1e-6)
+    wide, standard = (vertices(bnc_sdf.folder_of(d) / "bnc_slots.obj") for d in (wider, BncDimensions()))
+    assert wide[:, 2].max() - standard[:, 2].max() == pytest.approx(0.075 * MM, abs=1e-6)
 
 
-def test_a_table_and_a_clamp_made_to_measure_have_those_measures():
+def test_generated_clamp_and_table_have_the_given_dimensions():
     dimensions = dataclasses.replace(
         GridClampDimensions().with_clearance(0.1 * MM), hole_chamfer=0.3 * MM, peg_chamfer=0.2 * MM
     )
-    folder = write_grid_clamp.folder_of(dimensions, 0.3)
+    folder = grid_clamp_sdf.folder_of(dimensions, 0.3)
     inside = np.cos(np.pi / NUM_SIDES)
     hole, peg = vertices(folder / "grid_clamp_hole.obj"), vertices(folder / "grid_clamp_peg.obj")
     assert np.hypot(*hole[:, :2].T).min() * inside == pytest.approx(4.1 * MM, abs=1e-8)

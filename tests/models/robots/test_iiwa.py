@@ -17,8 +17,8 @@ def arm():
     return plant
 
 
-def test_reflected_rotor_inertia_dominates(arm):
-    """n² of a gear of 160 turns a gram square metre into kilograms; without it no explicit impedance is stable."""
+def test_iiwa_reflected_rotor_inertia_dominates(arm):
+    """The squared gear ratio of 160 makes the rotor inertia dominant, without which no explicit impedance is stable."""
     context = arm.CreateDefaultContext()
     arm.SetPositions(context, IIWA14.home)
     reflected = [arm.get_joint_actuator(index).default_reflected_inertia() for index in arm.GetJointActuatorIndices()]
@@ -26,7 +26,7 @@ def test_reflected_rotor_inertia_dominates(arm):
     assert reflected[0] == pytest.approx(1.321e-4 * 160**2)
 
 
-def test_a_tool_at_rest_feels_what_the_wrist_does_not_carry():
+def test_wrist_wrench_at_rest_is_the_external_wrench():
     mass, gravity = 2.0, np.array([0.0, 0.0, -9.81])
     M = np.diag([0.01, 0.02, 0.03, mass, mass, mass])
     pushed_up = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5.0])
@@ -34,8 +34,8 @@ def test_a_tool_at_rest_feels_what_the_wrist_does_not_carry():
     np.testing.assert_allclose(external_wrench(F_reaction, M, np.zeros(6), np.zeros(6), gravity), pushed_up, atol=1e-12)
 
 
-def test_a_tool_that_spins_and_falls_freely_is_touched_by_nothing(arm):
-    """A free body with an offset centre of mass, checked against Drake's own dynamics."""
+def test_wrist_wrench_is_zero_in_free_fall_with_spin(arm):
+    """A free body with an offset centre of mass, compared with Drake's dynamics."""
     plant = MultibodyPlant(0.0)
     model = add_model(plant, CONNECTOR_TOOL.model)
     plant.Finalize()

@@ -1,4 +1,4 @@
-"""Inverse kinematics by what it promises: exact, nearest, within limits, the same every time, or a sentence."""
+"""Inverse kinematics: exact, nearest to a posture, within limits, deterministic, and refusals."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def arm(request):
     return Arm(request.param)
 
 
-def test_is_exact_within_limits_and_the_same_every_time(arm):
+def test_solution_is_exact_within_limits_and_deterministic(arm):
     rng = np.random.default_rng(0)
     for _ in range(20):
         X = arm.around_home(rng)
@@ -64,8 +64,8 @@ def test_is_exact_within_limits_and_the_same_every_time(arm):
         np.testing.assert_array_equal(arm.solve(X), q)
 
 
-def test_is_the_nearest_to_the_posture(arm):
-    """No motion that leaves the tool where it is leads nearer: what separates it from the posture moves the tool."""
+def test_solution_is_nearest_to_the_posture(arm):
+    """No null-space motion reduces the distance from the posture."""
     rng = np.random.default_rng(1)
     for _ in range(10):
         q = arm.solve(arm.around_home(rng))
@@ -76,13 +76,13 @@ def test_is_the_nearest_to_the_posture(arm):
         assert np.linalg.norm(away) < 2.0
 
 
-def test_from_a_posture_that_is_there_already_it_stays():
+def test_solution_is_the_posture_when_it_meets_the_pose():
     arm = Arm("panda")
     np.testing.assert_allclose(arm.solve(arm.pose(arm.home)), arm.home, atol=1e-7)
 
 
-def test_a_joint_at_its_limit_stays_within_it():
-    """Nearest to a posture beyond a limit is that joint at its limit; the pose is met exactly all the same."""
+def test_solution_keeps_a_joint_at_its_limit_within_it():
+    """For a posture beyond a limit the nearest solution has that joint at its limit, at the exact pose."""
     arm = Arm("panda")
     X = arm.pose(arm.home)
     posture = arm.home.copy()
@@ -92,8 +92,8 @@ def test_a_joint_at_its_limit_stays_within_it():
     assert arm.error(q, X) < 1e-9
 
 
-def test_a_posture_on_the_wrong_side_is_no_obstacle():
-    """Half a turn away: where the search from the posture fails, others start around it."""
+def test_solution_exists_when_the_posture_is_on_the_wrong_side():
+    """If the search from a posture half a turn away fails, further searches start around it."""
     arm = Arm("ur5e")
     X = arm.pose(arm.home)
     for seed in range(10):
@@ -103,7 +103,7 @@ def test_a_posture_on_the_wrong_side_is_no_obstacle():
 
 
 @pytest.mark.parametrize(("name", "joint"), [("ur5e", 4), ("ur5e", 2), ("iiwa14", 5)])
-def test_a_singular_pose_is_met_too(name, joint):
+def test_solution_exists_for_a_singular_pose(name, joint):
     arm = Arm(name)
     singular = arm.home.copy()
     singular[joint] = 0.0
@@ -114,13 +114,13 @@ def test_a_singular_pose_is_met_too(name, joint):
     assert np.abs(q - near).max() < 0.5
 
 
-def test_says_what_is_out_of_reach(arm):
+def test_refuses_a_pose_out_of_reach(arm):
     with pytest.raises(InputError, match=r"can't reach \[2\. *0\. *0\. *\] m: move the workcell nearer"):
         arm.solve(RigidTransform([2.0, 0.0, 0.0]))
 
 
-def test_says_what_only_a_joints_limit_keeps_from():
-    """Beside its own foot, flange down: an elbow that could fold further would do it."""
+def test_refuses_a_pose_beyond_a_joint_limit():
+    """A pose near the base with the flange down needs an elbow that folds further."""
     arm = Arm("panda")
     X = RigidTransform(arm.pose(arm.home).rotation(), [0.05, 0.0, 0.1])
     with pytest.raises(InputError, match="only beyond a joint's limit"):

@@ -1,4 +1,4 @@
-"""A robot and a tool in a plant: what is refused, which files may be read, what a controller sees of a tool."""
+"""Mounting of robots and end effectors in a plant: refusals, model files, and rigid copies for a controller."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ def mounted(end_effector, robot=UR5E, **options):
     return plant, arm, tool
 
 
-def test_joints_are_in_the_robots_order():
+def test_add_robot_orders_actuators_like_the_joints():
     plant, arm, _ = mounted(find_end_effector("connector_tool"))
     assert [actuator.joint().name() for actuator in arm.actuators] == list(UR5E.joints)
     q = np.arange(6) / 10
@@ -31,7 +31,7 @@ def test_joints_are_in_the_robots_order():
     assert [plant.GetJointByName(name).GetOnePosition(context) for name in UR5E.joints] == list(q)
 
 
-def test_torque_control_makes_rotors_lighter():
+def test_lighten_rotors_scales_the_rotor_inertia():
     plant = MultibodyPlant(0.0)
     robot = find_robot("panda")
     arm = add_robot(plant, robot)
@@ -42,7 +42,7 @@ def test_torque_control_makes_rotors_lighter():
     assert after == pytest.approx([0.25 * inertia for inertia in before])
 
 
-def test_a_controller_sees_a_gripper_as_one_open_body():
+def test_add_end_effector_as_rigid_adds_one_open_body():
     plant, _, tool = mounted(GRIPPER)
     rigid_plant, _, rigid = mounted(GRIPPER, as_rigid=True)
     assert rigid_plant.num_positions() == 6
@@ -85,8 +85,8 @@ STAND = """
 """
 
 
-def test_a_robot_may_be_a_file_of_model_directives(tmp_path):
-    """An arm on a stand of the laboratory's own: its base is welded by the file, not at the world's origin."""
+def test_add_robot_accepts_model_directives(tmp_path):
+    """The model file welds the base of an arm to a stand, not at the world's origin."""
     (tmp_path / "package.xml").write_text("<package><name>laboratory</name></package>")
     (tmp_path / "stand.urdf").write_text(STAND)
     (tmp_path / "ur5e.urdf").write_text(UR5E.model.read_text())
@@ -111,12 +111,12 @@ def test_a_robot_may_be_a_file_of_model_directives(tmp_path):
         ({"joints": (*UR5E.joints[:4], UR5E.joints[5], UR5E.joints[4])}, "in its order"),
     ],
 )
-def test_refuses_data_that_the_model_has_not(wrong, sentence):
+def test_add_robot_refuses_data_that_the_model_lacks(wrong, sentence):
     with pytest.raises(InputError, match=sentence):
         add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, **wrong))
 
 
-def test_refuses_a_model_that_is_missing_broken_or_without_motors(tmp_path):
+def test_add_robot_refuses_a_missing_or_broken_model(tmp_path):
     for text, sentence in (
         (None, "no model file"),
         ("<robot", "can't be read"),
@@ -139,6 +139,6 @@ def test_refuses_a_model_that_is_missing_broken_or_without_motors(tmp_path):
     ],
 )
 @pytest.mark.parametrize("as_rigid", [False, True])
-def test_refuses_a_tool_that_the_model_has_not(wrong, sentence, as_rigid):
+def test_add_end_effector_refuses_data_that_the_model_lacks(wrong, sentence, as_rigid):
     with pytest.raises(InputError, match=sentence):
         mounted(dataclasses.replace(GRIPPER, **wrong), as_rigid=as_rigid)

@@ -1,4 +1,4 @@
-"""Robots and tools as data: found by name, refused in a sentence, and the same as what was published of them."""
+"""Data of robots and end effectors: registry, refusals, and agreement with published values."""
 
 import dataclasses
 import re
@@ -24,7 +24,7 @@ ROBOTS = ("iiwa14", "panda", "ur5e")
 
 
 class Alone:
-    """A robot without a tool."""
+    """Return a plant with a robot without a tool."""
 
     def __init__(self, name):
         self.robot = find_robot(name)
@@ -43,30 +43,30 @@ def alone(request):
     return Alone(request.param)
 
 
-def test_every_file_of_the_package_is_found():
+def test_registry_finds_every_robot_of_the_package():
     assert tuple(robot_names()) == ROBOTS
     assert end_effector_names() == ["connector_tool", "parallel_gripper"]
     assert find_robot("panda") is find_robot(find_robot("panda"))
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("iiwa", "iiwa14"), ("Panda", "panda"), ("ur5", "ur5e")])
-def test_an_unknown_robot_is_answered_with_the_nearest(typed, meant):
+def test_find_robot_suggests_the_nearest_name(typed, meant):
     with pytest.raises(InputError, match=f"no robot '{typed}': did you mean {meant}"):
         find_robot(typed)
 
 
-def test_an_unknown_tool_is_answered_with_the_nearest():
+def test_find_end_effector_suggests_the_nearest_name():
     with pytest.raises(InputError, match="no end effector 'gripper': did you mean parallel_gripper"):
         find_end_effector("gripper")
 
 
-def test_a_name_is_given_once():
+def test_register_refuses_a_second_robot_of_a_name():
     with pytest.raises(InputError, match="panda"):
         register_robot(dataclasses.replace(find_robot("panda"), title="another"))
 
 
-def test_an_installed_package_adds_robots_by_an_entry_point(tmp_path, monkeypatch):
-    """A distribution as an installer leaves it: one entry point registers while it loads, the other is the robot."""
+def test_entry_point_of_an_installed_package_adds_robots(tmp_path, monkeypatch):
+    """Install a distribution with two entry points: one registers a robot on import, the other is a robot."""
     (tmp_path / "laboratory.py").write_text(
         "import dataclasses\n"
         "from guiderail.models.robots.robot import find_robot\n"
@@ -95,7 +95,7 @@ def test_an_installed_package_adds_robots_by_an_entry_point(tmp_path, monkeypatc
         ({"drives": JointDrives((1.0,), (1.0,))}, "as many drives"),
     ],
 )
-def test_refuses_a_robot_that_makes_no_sense(wrong, sentence):
+def test_robot_refuses_invalid_data(wrong, sentence):
     with pytest.raises(InputError, match=sentence):
         dataclasses.replace(find_robot("ur5e"), **wrong)
 
@@ -109,18 +109,18 @@ def test_refuses_a_robot_that_makes_no_sense(wrong, sentence):
         ({"drives": None}, "drive"),
     ],
 )
-def test_refuses_an_end_effector_that_makes_no_sense(wrong, sentence):
+def test_end_effector_refuses_invalid_data(wrong, sentence):
     with pytest.raises(InputError, match=sentence):
         dataclasses.replace(find_end_effector("parallel_gripper"), **wrong)
 
 
 @pytest.mark.parametrize("wrong", [((1.0, 2.0), (1.0,)), ((0.0,), (1.0,)), ((1.0,), (np.nan,))])
-def test_refuses_drives_that_make_no_sense(wrong):
+def test_drives_refuse_invalid_data(wrong):
     with pytest.raises(InputError):
         JointDrives(*wrong)
 
 
-def test_drives_are_critically_damped_for_their_inertia():
+def test_drives_are_critically_damped():
     (damping,) = JointDrives((400.0,), (0.25,)).damping
     assert np.roots([0.25, damping, 400.0]) == pytest.approx([-40.0, -40.0])
 
@@ -155,7 +155,7 @@ def _step(a, d, alpha, theta, craig):
     return twist @ turn if craig else turn @ twist
 
 
-def test_the_flange_is_where_published_kinematics_put_it(alone):
+def test_flange_pose_equals_published_kinematics(alone):
     name = alone.robot.name
     if name == "iiwa14":  # the data sheet has the height of the stretched arm
         np.testing.assert_allclose(alone.flange(np.zeros(7)).translation(), [0.0, 0.0, 1.306], atol=1e-9)
@@ -183,7 +183,7 @@ PUBLISHED_LIMITS = {
 }
 
 
-def test_limits_are_the_published_ones(alone):
+def test_limits_equal_published_ones(alone):
     upper, speed, effort = PUBLISHED_LIMITS[alone.robot.name]
     np.testing.assert_allclose(alone.plant.GetPositionUpperLimits(), upper, atol=1e-5)
     np.testing.assert_allclose(alone.plant.GetVelocityUpperLimits(), speed, atol=1e-5)
@@ -193,8 +193,8 @@ def test_limits_are_the_published_ones(alone):
         np.testing.assert_allclose(alone.plant.GetPositionLowerLimits(), lower, atol=1e-9)
 
 
-def test_the_pandas_weight_is_that_of_the_identified_model():
-    """Gravity torques at Franka's ready posture by the coefficients that Gaz et al. published with their paper.
+def test_panda_gravity_equals_the_identified_model():
+    """Compare gravity torques at Franka's ready posture with the coefficients published by Gaz et al.
 
     The feasible masses and centres of mass reproduce what they were retrieved from to 0.15 Nm.
     """
@@ -204,8 +204,8 @@ def test_the_pandas_weight_is_that_of_the_identified_model():
     np.testing.assert_allclose(torque, [0.0, -1.7388, -0.6683, 18.5240, 0.7158, 1.6714, 0.0], atol=0.15)
 
 
-def test_the_ur5es_weight_is_that_of_published_masses():
-    """At zero the arm is stretched out: what the shoulder carries is each mass times its distance."""
+def test_ur5e_gravity_equals_that_of_published_masses():
+    """At zero the arm is stretched out, and the shoulder torque is the sum of the masses times their distances."""
     alone = Alone("ur5e")
     alone.plant.SetPositions(alone.context, np.zeros(6))
     masses = np.array([8.058, 2.846, 1.37, 1.3, 0.365])
@@ -225,8 +225,8 @@ def test_home_is_regular_within_limits_and_points_down(alone):
     assert X.translation()[0] > 0.3
 
 
-def test_a_turned_tool_is_aligned_with_the_base_at_home(alone):
-    """With the last joint in the middle of its range: that is what `tool_turn` is for."""
+def test_tool_turn_aligns_the_tool_with_the_base_at_home(alone):
+    """The last joint is in the middle of its range."""
     robot, plant = alone.robot, alone.plant
     q = np.array(robot.home)
     q[-1] = 0.5 * (plant.GetPositionLowerLimits()[-1] + plant.GetPositionUpperLimits()[-1])
@@ -234,10 +234,10 @@ def test_a_turned_tool_is_aligned_with_the_base_at_home(alone):
     assert abs(np.rad2deg(RollPitchYaw(R @ RotationMatrix.MakeXRotation(np.pi)).yaw_angle())) < 16.0
 
 
-def test_a_robot_says_where_its_numbers_are_from(alone):
+def test_robot_names_the_source_of_its_numbers(alone):
     assert len(alone.robot.source) > 40
 
 
-def test_models_name_nothing_that_has_to_be_fetched(alone):
+def test_models_reference_no_remote_files(alone):
     text = alone.robot.model.read_text()
     assert not re.search(r"package:|https?:(?!//drake\.mit\.edu)|mesh ", text)

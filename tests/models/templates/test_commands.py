@@ -1,4 +1,4 @@
-"""A command under any request: inside, no faster than allowed, and as much of the request as that permits."""
+"""Commands for arbitrary requests: inside the constraints, within the speeds, and near to the request."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def load(s, A, B):
 
 
 @given(SEEDS, st.sampled_from([1e-4, 1e-3, 1e-2, 1.0]))
-def test_without_constraints_it_goes_as_far_as_the_speeds_allow(seed, spread):
+def test_command_reaches_the_speed_limit_without_constraints(seed, spread):
     rng = np.random.default_rng(seed)
     s = template(speed=rng.uniform(0.01, 1), turn=rng.uniform(0.1, 3))
     last, request = pose(rng, 0.3), pose(rng, spread)
@@ -60,7 +60,7 @@ UNDONE = [ac.Cylinder("f", max_radius_m=0.002), ac.KeepAbove(0.0, "f"), ac.Funne
 
 
 def wander(s, seed, height=0.02, climb=(-1e-3, 4e-4), steps=300):
-    """Commands, each with the state that it was made in, of requests that go anywhere from above the object."""
+    """Return commands and their states for random requests that start above the object."""
     rng = np.random.default_rng(seed)
     number, last = 0, RigidTransform([0.0, 0.0, height])
     for _ in range(steps):
@@ -71,7 +71,7 @@ def wander(s, seed, height=0.02, climb=(-1e-3, 4e-4), steps=300):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_command_is_inside_where_one_constraint_undoes_another(seed):
+def test_command_is_inside_when_one_constraint_undoes_another(seed):
     s = template(state(constraints=UNDONE[::-1]), speed=0.05)
     assert s.violation(0, s.project(0, RigidTransform([0.003, 0.0, 0.009]), F), F) > 5e-4
     pairs = list(wander(s, seed, height=0.006, climb=(-4e-4, 1e-3)))
@@ -80,7 +80,7 @@ def test_a_command_is_inside_where_one_constraint_undoes_another(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_no_command_leaves_the_constraints_of_a_next_state_that_are_tighter(seed):
+def test_command_satisfies_tighter_constraints_of_the_next_state(seed):
     wide, narrow = (
         state(name, [ac.Cylinder("f", max_radius_m=radius), ac.KeepAbove(-0.006, "f")], to)
         for name, radius, to in (("search", 0.004, (Transition("insert", 0.006, 0.002),)), ("insert", 0.002, ()))
@@ -92,8 +92,8 @@ def test_no_command_leaves_the_constraints_of_a_next_state_that_are_tighter(seed
 
 
 @given(SEEDS)
-def test_inside_constraints_it_stays_inside_and_within_the_speeds(seed):
-    """Also where the orientation that goes with a position turns quickly."""
+def test_command_stays_inside_and_within_the_speed_limits(seed):
+    """The orientation that belongs to a position may turn quickly."""
     rng = np.random.default_rng(seed)
     constraints = [
         ac.Box((-0.2, -0.2, -0.2), (0.2, 0.2, 0.2), "f"),
@@ -108,7 +108,7 @@ def test_inside_constraints_it_stays_inside_and_within_the_speeds(seed):
 
 
 @given(SEEDS)
-def test_from_outside_it_is_led_in_at_no_more_than_the_speeds(seed):
+def test_command_from_outside_is_led_inside_within_the_speeds(seed):
     rng = np.random.default_rng(seed)
     s = template(state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3, "f"), ac.FixedOrientation(frame="f")]))
     last = pose(rng, 0.5)
@@ -121,7 +121,7 @@ def test_from_outside_it_is_led_in_at_no_more_than_the_speeds(seed):
         assert load(s, last, command.X_WE) == pytest.approx(1.0, rel=1e-6)
 
 
-def test_what_can_be_done_at_once_is_done_whole():
+def test_command_executes_a_feasible_request_completely():
     s = template()
     last, request = RigidTransform(), RigidTransform([0.2 * PERIOD * 0.999, 0, 0])
     command = s.command(0, last, request, F, PERIOD)
@@ -129,7 +129,7 @@ def test_what_can_be_done_at_once_is_done_whole():
     np.testing.assert_array_equal(command.X_WE.translation(), request.translation())
 
 
-def test_a_displacement_turns_about_the_origin_of_the_end_effector_and_adds_up():
+def test_displace_rotates_about_the_end_effector_and_adds_up():
     s = template()
     X = RigidTransform(RotationMatrix.MakeXRotation(0.4), [1.0, 2.0, 3.0])
     d = RigidTransform(RotationMatrix.MakeZRotation(0.3), [0.1, 0.2, 0.3])
@@ -145,7 +145,7 @@ def test_a_displacement_turns_about_the_origin_of_the_end_effector_and_adds_up()
     np.testing.assert_allclose(total.rotation().matrix(), RotationMatrix.MakeZRotation(0.1).matrix(), atol=1e-12)
 
 
-def test_constraints_apply_in_their_order():
+def test_project_applies_constraints_in_order():
     up, down = ac.HalfSpace((0.0, 0.0, 1.0), 0.5), ac.HalfSpace((0.0, 0.0, -1.0), -0.2)
     for order, height in (((up, down), 0.2), ((down, up), 0.5)):
         s = template(state(constraints=order))
@@ -160,7 +160,7 @@ def at(height):
     return RigidTransform([0.0, 0.0, height])
 
 
-def test_the_first_way_that_is_open_is_taken_and_the_way_back_has_hysteresis():
+def test_next_state_takes_the_first_transition_with_hysteresis():
     s = template(
         state("a", to=(Transition("b", 0.5, 0.1), Transition("c", 0.7)), starts_at=1.0, ends_at=0.5),
         state("b", to=(Transition("c", 0.2, 0.05),), starts_at=0.5, ends_at=0.2),
@@ -185,7 +185,7 @@ def test_the_first_way_that_is_open_is_taken_and_the_way_back_has_hysteresis():
     assert s.distance(1, at(0.3), F) == pytest.approx(0.3)
 
 
-def test_progress_goes_on_where_the_state_before_ended():
+def test_progress_continues_from_the_end_of_the_previous_state():
     s = template(
         state("b", to=(Transition("c", 0.2),), starts_at=0.5, ends_at=0.2, weight=2.0),
         state("a", to=(Transition("b", 0.5), Transition("c", 0.1)), starts_at=1.0, ends_at=0.5, weight=3.0),
@@ -203,7 +203,7 @@ def test_progress_goes_on_where_the_state_before_ended():
     assert round_.progress(1, at(0.2), F) == pytest.approx(0.8)
 
 
-def test_a_state_needs_the_frames_of_all_its_parts():
+def test_state_needs_the_frames_of_all_its_parts():
     s = TemplateState(
         "x", (im.TiltTowards((0, 1), 1.0, "a"),), (ac.Cylinder("b"),), td.Distance("c"), starts_at=1.0, ends_at=0.0
     )

@@ -1,4 +1,4 @@
-"""Active constraints with any sizes: what each allows, by geometry written down a second time."""
+"""Active constraints with random sizes, compared with an independent formulation of their geometry."""
 
 import math
 
@@ -19,7 +19,7 @@ EXACT = 1e-11
 
 
 def scene(seed, spread=0.3):
-    """A generator, an end effector and an object anywhere, and the object's name or the world's."""
+    """Yield random generators, poses of the end effector and an object, and the name of the object or the world."""
     rng = np.random.default_rng(seed)
 
     def pose():
@@ -31,7 +31,7 @@ def scene(seed, spread=0.3):
 
 
 def projected(constraint, X_WE, frames, frame):
-    """p_FE and p_FP, with everything that every constraint on the position promises."""
+    """Return p_FE and its projection p_FP after checks of the properties of every position constraint."""
     X_WP = constraint.project(X_WE, frames)
     assert angle_between(X_WP.rotation(), X_WE.rotation()) == 0.0
     p, q = position_in(frame, X_WE, frames), position_in(frame, X_WP, frames)
@@ -81,7 +81,7 @@ def test_cylinder(seed):
         assert p[:2] @ q[:2] >= -EXACT
 
 
-def test_out_of_the_middle_of_a_cylinder_it_goes_along_minus_x():
+def test_cylinder_projects_its_axis_along_minus_x():
     X_WP = ac.Cylinder(F, 0.1, 0.2).project(RigidTransform([0.0, 0.0, 0.5]), {F: RigidTransform()})
     np.testing.assert_allclose(X_WP.translation(), [-0.1, 0.0, 0.5], atol=1e-11)
 
@@ -148,7 +148,7 @@ def test_fixed_orientation(seed):
 
 
 def leaning(R_FE, p_FE, rest, turns_along):
-    """The tilt of an orientation that is a lean towards F's axis and nothing else, and how far it is from one."""
+    """Return the tilt of an orientation that only leans towards F's axis, and its distance from such an orientation."""
     towards = -p_FE[:2] / np.linalg.norm(p_FE[:2])
     if turns_along:
         rest = Rotation.from_euler("z", math.atan2(towards[1], towards[0])) * rest
@@ -226,7 +226,7 @@ def test_arc(seed):
 
 
 class Tilted(ac.ActiveConstraint):
-    """Moves by 0.3 m and turns by a given angle."""
+    """Translates by 0.3 m and rotates by a given angle."""
 
     def __init__(self, angle):
         self.angle = angle
@@ -237,7 +237,7 @@ class Tilted(ac.ActiveConstraint):
         )
 
 
-def test_a_violation_is_the_larger_of_metres_and_radians():
+def test_violation_is_the_larger_of_metres_and_radians():
     X_WE = RigidTransform(RotationMatrix.MakeYRotation(0.7), [0.1, -0.2, 0.5])
     assert Tilted(0.1).violation(X_WE, {}) == pytest.approx(0.3)
     assert Tilted(0.5).violation(X_WE, {}) == pytest.approx(0.5)
@@ -253,7 +253,7 @@ def test_nearest_turn_is_within_half_a_turn(centre):
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: ac.HalfSpace((0.0, 0.0, 1e-7), 0.0), "zero"),
         (lambda: ac.Box((0.0, 0.0, 0.0), (1.0, 1.0, -1e-9)), "exceed"),
@@ -278,12 +278,12 @@ def test_nearest_turn_is_within_half_a_turn(centre):
         (lambda: ac.Arc(F, 1.0, max_deg=181.0), "angles"),
     ],
 )
-def test_refuses_what_allows_nothing(make, said):
-    with pytest.raises(InputError, match=said):
+def test_constraint_refuses_an_empty_set(make, message):
+    with pytest.raises(InputError, match=message):
         make()
 
 
-def test_what_is_just_allowed_is_not_refused():
+def test_constraint_accepts_limits_at_their_bounds():
     ac.Box((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     ac.Cylinder(F, 0.1, 0.1)
     ac.Cylinder(F)
@@ -299,7 +299,7 @@ def test_what_is_just_allowed_is_not_refused():
 
 
 @given(SEEDS)
-def test_constraints_that_share_a_frame_do_together_what_they_do_one_by_one(seed):
+def test_constraint_group_equals_its_constraints_one_by_one(seed):
     rng, X_WE, frames, frame = scene(seed)
     box = ac.Box((-0.1, -0.2, -0.3), (0.3, 0.2, 0.1), frame)
     constraints = [

@@ -1,4 +1,4 @@
-"""Every active constraint is a projection, and each one keeps what it says it keeps."""
+"""Every active constraint is a projection and leaves other coordinates unchanged."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def scenes(seed=0, count=100):
 
 
 @pytest.mark.parametrize("constraint", CONSTRAINTS, ids=IDS)
-def test_projects_onto_what_it_allows(constraint):
+def test_constraint_projects_into_its_set(constraint):
     moved = 0
     for X_WE, frames in scenes():
         X_WP = constraint.project(X_WE, frames)
@@ -51,7 +51,7 @@ def test_projects_onto_what_it_allows(constraint):
 
 
 @pytest.mark.parametrize("constraint", CONSTRAINTS, ids=IDS)
-def test_does_not_care_where_the_world_is(constraint):
+def test_constraint_is_independent_of_the_world_frame(constraint):
     X_VW = random_pose(np.random.default_rng(1))
     for X_WE, frames in scenes(2, 20):
         X_VP = constraint.project(X_VW @ X_WE, {F: X_VW @ frames[F]})
@@ -60,13 +60,13 @@ def test_does_not_care_where_the_world_is(constraint):
 
 
 @pytest.mark.parametrize("constraint", [c for c in CONSTRAINTS if isinstance(c, ac.PositionConstraint | ac.KeepAbove)])
-def test_constraints_on_the_position_keep_the_orientation(constraint):
+def test_position_constraint_keeps_the_orientation(constraint):
     for X_WE, frames in scenes(3, 20):
         R = constraint.project(X_WE, frames).rotation()
         assert angle_between(R, X_WE.rotation()) == 0.0
 
 
-def test_half_space_goes_to_the_nearest_point():
+def test_half_space_projects_to_the_nearest_point():
     constraint = CONSTRAINTS[0]
     for X_WE, frames in scenes(4, 20):
         p, q = (position_in(F, X, frames) for X in (X_WE, constraint.project(X_WE, frames)))
@@ -75,7 +75,7 @@ def test_half_space_goes_to_the_nearest_point():
         np.testing.assert_allclose(q, p + short * normal, atol=1e-12)
 
 
-def test_tilt_is_what_the_distance_says_towards_the_object():
+def test_tilt_by_distance_tilts_towards_the_object():
     constraint = ac.TiltByDistance(frame=F, distance_m=(0.0, 1.0), tilt_deg=(90.0, 0.0))
     frames = {F: RigidTransform([0.2, 0.0, 0.0])}
     R = constraint.project(RigidTransform([-0.3, 0.0, 0.0]), frames).rotation().matrix()
@@ -84,7 +84,7 @@ def test_tilt_is_what_the_distance_says_towards_the_object():
     np.testing.assert_allclose(R[:, 1], [0.0, 1.0, 0.0], atol=1e-12)
 
 
-def test_tilt_limits_leave_an_allowed_tilt_where_it_is():
+def test_tilt_limits_keep_an_allowed_tilt():
     constraint = ac.TiltLimits(frame=F, min_deg=20.0, max_deg=50.0)
     frames = {F: RigidTransform([0.0, 1.0, 0.0])}
     X_WE = RigidTransform(RotationMatrix.MakeXRotation(-np.deg2rad(35.0)), np.zeros(3))
@@ -93,7 +93,7 @@ def test_tilt_limits_leave_an_allowed_tilt_where_it_is():
     assert angle_between(X_WP.rotation(), RotationMatrix.MakeXRotation(-np.deg2rad(20.0))) < 1e-12
 
 
-def test_turning_along_always_tilts_about_the_same_axis_of_its_own():
+def test_turns_along_tilts_about_a_constant_axis_of_the_tool():
     constraint = ac.TiltByDistance(
         frame=F, distance_m=(1.0,), tilt_deg=(40.0,), rpy_deg=(0.0, 0.0, -90.0), turns_along=True
     )
@@ -106,7 +106,7 @@ def test_turning_along_always_tilts_about_the_same_axis_of_its_own():
         assert R[:, 2] @ (-p_FE / 0.2) == pytest.approx(np.sin(np.deg2rad(40.0)))
 
 
-def test_an_arc_turns_the_end_effector_along():
+def test_arc_turns_the_end_effector():
     constraint = ac.Arc(frame=F, radius_m=0.3)
     frames = {F: RigidTransform()}
     X_WP = constraint.project(RigidTransform([0.0, 0.5, 0.2]), frames)
@@ -132,13 +132,13 @@ def test_keep_above_lifts_the_lowest_point():
         lambda: ac.Arc(frame=F, radius_m=0.0),
     ],
 )
-def test_refuses_what_allows_nothing(make):
+def test_constraint_refuses_an_empty_set(make):
     with pytest.raises(InputError):
         make()
 
 
 @pytest.mark.parametrize("constraint", CONSTRAINTS, ids=IDS)
-def test_what_is_no_number_is_never_inside(constraint):
+def test_nan_pose_is_never_inside(constraint):
     for lost in (np.s_[:], np.s_[:3]):
         pose = np.array([0.1, 0.0, 0.1, 0.3, 0.2, 0.1])
         pose[lost] = np.nan
@@ -150,7 +150,7 @@ def test_what_is_no_number_is_never_inside(constraint):
             assert not constraint.violation(X_WE, frames) <= 1e-9
 
 
-def test_the_largest_of_what_is_no_number_is_none():
+def test_largest_is_nan_when_a_violation_is_nan():
     assert np.isnan(largest([0.1, np.nan, 0.2]))
     assert np.isnan(largest([np.nan, 0.2]))
     assert largest([]) == 0.0
@@ -158,7 +158,7 @@ def test_the_largest_of_what_is_no_number_is_none():
 
 
 @pytest.mark.parametrize("constraint", CONSTRAINTS, ids=IDS)
-def test_others_can_follow_in_a_group(constraint):
+def test_group_may_follow_other_constraints(constraint):
     box = ac.Box((-0.02,) * 3, (0.02,) * 3, F)
     for X_WE, frames in scenes(3, 5):
         together = ac.ConstraintGroup((constraint, box, constraint)).project(X_WE, frames)

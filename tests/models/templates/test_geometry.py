@@ -1,4 +1,4 @@
-"""Rotations, tilts and ways between poses, against SciPy's rotations and plain trigonometry."""
+"""Rotations, tilts and interpolation of poses, compared with SciPy's rotations and trigonometry."""
 
 import math
 
@@ -20,13 +20,13 @@ def random_pose(rng, spread=0.5):
 
 
 @given(st.tuples(*[st.floats(-180, 180)] * 3))
-def test_rotation_deg_is_roll_then_pitch_then_yaw_about_fixed_axes(rpy):
+def test_rotation_deg_is_roll_pitch_yaw_about_fixed_axes(rpy):
     expected = Rotation.from_euler("xyz", rpy, degrees=True).as_matrix()
     np.testing.assert_allclose(g.rotation_deg(rpy).matrix(), expected, atol=1e-12)
 
 
 @given(SEEDS)
-def test_positions_in_a_frame_and_back(seed):
+def test_position_in_a_frame_and_back_is_the_same(seed):
     rng = np.random.default_rng(seed)
     X_WE, X_WF = random_pose(rng), random_pose(rng)
     p_FE = g.position_in("f", X_WE, {"f": X_WF})
@@ -40,7 +40,7 @@ def test_positions_in_a_frame_and_back(seed):
 
 
 @given(ANGLES, st.floats(1e-6, 2), st.floats(-1, 1))
-def test_the_bearing_points_at_the_axis_and_a_tilt_about_its_normal_tips_towards_it(azimuth, radius, z):
+def test_tilt_about_the_tilt_axis_leans_along_the_bearing(azimuth, radius, z):
     p_FE = np.array([radius * math.cos(azimuth), radius * math.sin(azimuth), z])
     towards = g.bearing(p_FE)
     np.testing.assert_allclose(towards, [-math.cos(azimuth), -math.sin(azimuth), 0], atol=1e-9)
@@ -50,7 +50,7 @@ def test_the_bearing_points_at_the_axis_and_a_tilt_about_its_normal_tips_towards
     np.testing.assert_allclose(tipped, math.cos(0.3) * np.eye(3)[2] + math.sin(0.3) * towards, atol=1e-12)
 
 
-def test_on_the_axis_the_bearing_is_x():
+def test_bearing_is_x_on_the_axis():
     for p in ([0, 0, 0.3], [9e-10, 0, 0], [0, -9e-10, 1]):
         np.testing.assert_array_equal(g.bearing(np.array(p)), [1, 0, 0])
     np.testing.assert_allclose(g.bearing(np.array([0, 2e-9, 0])), [0, -1, 0], atol=1e-12)
@@ -71,7 +71,7 @@ def test_angle_between_is_accurate_from_tiny_to_half_a_turn(seed, angle):
 
 
 @given(SEEDS, st.floats(0, 1))
-def test_between_goes_straight_and_about_one_axis(seed, fraction):
+def test_between_interpolates_on_a_line_and_about_one_axis(seed, fraction):
     rng = np.random.default_rng(seed)
     A, B = random_pose(rng), random_pose(rng)
     X = g.between(A, B, fraction)
@@ -82,7 +82,7 @@ def test_between_goes_straight_and_about_one_axis(seed, fraction):
     np.testing.assert_allclose(X.rotation().matrix(), expected.as_matrix(), atol=1e-9)
 
 
-def test_the_ends_of_a_way_are_its_poses_to_the_last_digit():
+def test_between_returns_its_end_poses_exactly():
     rng = np.random.default_rng(0)
     A, B = random_pose(rng), random_pose(rng)
     np.testing.assert_array_equal(g.between(A, B, 0.0).rotation().matrix(), A.rotation().matrix())

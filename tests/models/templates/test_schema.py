@@ -1,4 +1,4 @@
-"""What a template file may say, and what a person is told when it says something else."""
+"""Template files: what is read, and the sentence in which a faulty file is refused."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ def changed(change):
     return yaml.safe_dump(data, sort_keys=False)
 
 
-def test_reads_states_in_order_with_units_turned_into_si():
+def test_parse_returns_states_in_order_in_si_units():
     template = parse_template(TEMPLATE)
     assert [state.name for state in template.states] == ["far", "near"]
     assert template.initial_state == 0
@@ -30,7 +30,7 @@ def test_reads_states_in_order_with_units_turned_into_si():
     assert template.states[0].ends_at == 0.1
 
 
-def test_numbers_may_be_arithmetic_on_the_objects_sizes():
+def test_parse_evaluates_expressions_of_parameters():
     cylinder = parse_template(TEMPLATE).states[0].active_constraints[0]
     assert isinstance(cylinder, Cylinder)
     assert (cylinder.min_radius_m, cylinder.max_radius_m) == pytest.approx((0.06, 0.3))
@@ -39,7 +39,7 @@ def test_numbers_may_be_arithmetic_on_the_objects_sizes():
     assert (larger.min_radius_m, larger.max_radius_m) == pytest.approx((0.07, 0.36))
 
 
-def test_a_new_kind_is_one_class_and_one_registration():
+def test_register_adds_a_kind_with_one_decorator():
     @register(ACTIVE_CONSTRAINTS, "at_origin")
     @dataclass(frozen=True)
     class AtOrigin(ActiveConstraint):
@@ -103,7 +103,7 @@ TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (set_in("inptus", value=3), "did you mean inputs"),
         (remove("max_speed_m_per_s"), "max_speed_m_per_s is missing"),
@@ -172,22 +172,22 @@ TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
         (set_in("parameters", "ﬁ", value=1), "should match pattern"),
     ],
 )
-def test_says_what_is_wrong_and_what_to_do(change, said):
+def test_parse_names_fault_and_place_in_one_sentence(change, message):
     with pytest.raises(InputError) as refused:
         parse_template(changed(change))
-    assert said in str(refused.value)
+    assert message in str(refused.value)
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 500
 
 
-def test_refuses_parameters_that_are_no_numbers():
+def test_parse_refuses_parameters_that_are_not_numbers():
     for value in (None, [0.04], True, float("nan"), 1e300, 10**400):
         with pytest.raises(InputError, match="rim_m"):
             parse_template(TEMPLATE, rim_m=value)
     assert parse_template(TEMPLATE, rim_m=np.float32(0.25)).parameters["rim_m"] == 0.25
 
 
-def test_refuses_what_other_readers_would_stumble_over():
+def test_parse_refuses_ambiguous_or_exploding_yaml():
     for text in ("inputs: 010", "inputs: 2001-99-99", "inputs: 2\ninputs: 3", "inputs: !!int 2", "inputs: 1:30"):
         with pytest.raises(InputError):
             parse_template(TEMPLATE.replace("inputs: 2", text, 1))
@@ -198,7 +198,7 @@ def test_refuses_what_other_readers_would_stumble_over():
         parse_template(TEMPLATE + bomb)
 
 
-def test_refuses_what_is_not_there(tmp_path):
+def test_load_refuses_unknown_names_and_missing_files(tmp_path):
     with pytest.raises(InputError, match="did you mean pouring"):
         load_template("puoring")
     with pytest.raises(InputError, match="there is no template"):
@@ -211,7 +211,7 @@ def test_refuses_what_is_not_there(tmp_path):
         load_template(broken)
 
 
-def test_a_parameter_is_made_of_no_other_and_the_sentence_names_them():
+def test_parse_refuses_a_parameter_that_depends_on_another():
     with pytest.raises(InputError, match=r"parameters.near: 'far' is not a number, and a parameter can't be computed"):
         parse_template(
             "{name: x, inputs: 1, parameters: {near: far, far: 1}, max_speed_m_per_s: 1, "

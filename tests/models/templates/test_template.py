@@ -27,7 +27,7 @@ def in_mug(p):
 
 
 def run(template, X_WE, inputs, steps, state=None, observe=None):
-    """The template under `inputs(k, X)`, as the systems run it; returns the last state and command."""
+    """Run the template with `inputs(k, X)` like the systems; return the last state and command."""
     state = template.state_at(X_WE, MUG) if state is None else state
     for k in range(steps):
         request = template.displace(X_WE, template.map(state, inputs(k, X_WE), X_WE, MUG, PERIOD))
@@ -45,7 +45,7 @@ def test_translation_moves_at_its_speed_along_its_frame():
     np.testing.assert_allclose(moved.translation(), [0.01, 0.0, 0.0], atol=1e-15)
 
 
-def test_rotation_turns_about_the_end_effectors_own_origin(pouring):
+def test_rotation_turns_about_the_end_effectors_origin(pouring):
     mapping = im.Rotation(inputs=(0, 1, 2), speed_rad_per_s=2.0)
     X_WE = RigidTransform([1.0, 2.0, 3.0])
     turned = pouring.displace(X_WE, mapping.displacement(np.array([0.0, 0.0, 1.0]), X_WE, {}, 0.1))
@@ -53,7 +53,7 @@ def test_rotation_turns_about_the_end_effectors_own_origin(pouring):
     assert angle_between(turned.rotation(), RotationMatrix.MakeZRotation(0.2)) < 1e-12
 
 
-def test_only_the_input_towards_the_object_tilts():
+def test_tilt_towards_uses_only_the_input_along_the_bearing():
     mapping = im.TiltTowards(inputs=(0, 1), speed_rad_per_s=1.0, frame="mug_tip")
     X_WE = in_mug([0.0, -0.05, 0.05])
     across = mapping.displacement(np.array([1.0, 0.0]), X_WE, MUG, 0.1)
@@ -74,33 +74,33 @@ def test_scaled_slows_down_near_the_object():
     np.testing.assert_allclose(speeds, [0.2, 0.6, 1.0])
 
 
-def test_uneven_leads_one_way_on_average():
+def test_uneven_scales_positive_and_negative_inputs_differently():
     mapping = im.Uneven(above=0.4, below=1.0, of=im.Translation((0,), 1.0, axes=((0.0, 0.0, 1.0),)))
     speeds = [mapping.displacement(np.array([u]), RigidTransform(), {}, 1.0).translation()[2] for u in (-1, 0, 0.5, 1)]
     np.testing.assert_allclose(speeds, [-1.0, 0.0, 0.2, 0.4])
 
 
-def test_inputs_beyond_one_are_one(pouring):
+def test_map_clips_inputs_to_one(pouring):
     X_WE = in_mug([0.0, -0.3, 0.1])
     one = pouring.map(0, np.array([1.0, -1.0, 0.0]), X_WE, MUG, PERIOD)
     much = pouring.map(0, np.array([50.0, -7.0, 0.0]), X_WE, MUG, PERIOD)
     assert one.IsExactlyEqualTo(much)
 
 
-def test_a_state_that_maps_no_input_stands_still(pouring):
-    deaf = replace(pouring, states=tuple(replace(state, input_mapping=()) for state in pouring.states))
-    moved = deaf.map(0, np.ones(3), in_mug([0.2, 0.0, 0.2]), {"mug_tip": RigidTransform()}, 0.01)
+def test_map_returns_no_displacement_without_a_mapping(pouring):
+    unmapped = replace(pouring, states=tuple(replace(state, input_mapping=()) for state in pouring.states))
+    moved = unmapped.map(0, np.ones(3), in_mug([0.2, 0.0, 0.2]), {"mug_tip": RigidTransform()}, 0.01)
     np.testing.assert_array_equal(moved.GetAsMatrix34(), RigidTransform().GetAsMatrix34())
 
 
-def test_adversarial_inputs_never_leave_the_constraints_or_exceed_the_speeds(pouring):
+def test_command_is_safe_under_adversarial_inputs(pouring):
     rng = np.random.default_rng(0)
     worst = speed = turn = 0.0
-    seen = set()
+    visited = set()
 
     def observe(state, X_last, X_WE):
         nonlocal worst, speed, turn
-        seen.add(state)
+        visited.add(state)
         worst = max(worst, pouring.violation(state, X_WE, MUG))
         speed = max(speed, np.linalg.norm(X_WE.translation() - X_last.translation()) / PERIOD)
         turn = max(turn, angle_between(X_WE.rotation(), X_last.rotation()) / PERIOD)
@@ -118,13 +118,13 @@ def test_adversarial_inputs_never_leave_the_constraints_or_exceed_the_speeds(pou
         start = in_mug(rng.normal([-0.1, -0.25, 0.15], 0.05))
         start = pouring.project(pouring.state_at(start, MUG), start, MUG)
         run(pouring, start, inputs, 1000, observe=observe)
-    assert seen == {0, 1, 2}
+    assert visited == {0, 1, 2}
     assert worst <= 1e-9
     assert speed <= pouring.max_speed_m_per_s * (1 + 1e-9)
     assert turn <= pouring.max_speed_rad_per_s * (1 + 1e-9)
 
 
-def test_translation_slows_down_where_the_tilt_could_not_keep_up(pouring):
+def test_command_slows_translation_when_the_tilt_would_lag(pouring):
     full = np.array([0.0, 1.0, 0.0])
     X_WE = pouring.project(1, in_mug([0.0, -0.15, 0.06]), MUG)
     request = pouring.displace(X_WE, pouring.map(1, full, X_WE, MUG, 0.1))
@@ -133,7 +133,7 @@ def test_translation_slows_down_where_the_tilt_could_not_keep_up(pouring):
     assert pouring.violation(1, slow.X_WE, MUG) <= 1e-9
 
 
-def test_a_command_outside_is_led_inside_at_the_greatest_speed(pouring):
+def test_command_outside_is_led_inside_at_the_largest_speed(pouring):
     outside = in_mug([0.0, -0.3, 0.02])  # 3 cm too low
     steps = 0
     X_WE = outside
@@ -144,17 +144,17 @@ def test_a_command_outside_is_led_inside_at_the_greatest_speed(pouring):
     assert steps == pytest.approx(0.03 / (pouring.max_speed_m_per_s * PERIOD), abs=2)
 
 
-def test_states_change_with_hysteresis(pouring):
+def test_next_state_has_hysteresis(pouring):
     def after(state, distance):
         return pouring.next_state(state, in_mug([0.0, -distance, 0.0]), MUG)
 
     assert [after(0, d) for d in (0.251, 0.249)] == [0, 1]
     assert [after(1, d) for d in (0.269, 0.271)] == [1, 0]
     assert [after(1, d) for d in (0.076, 0.074)] == [1, 2]
-    assert after(2, 0.5) == 2  # there is no way back from pouring
+    assert after(2, 0.5) == 2  # no return from pouring
 
 
-def test_transition_finds_the_command_inside_the_next_states_constraints(pouring):
+def test_command_is_inside_the_next_states_constraints(pouring):
     jumps = []
 
     def observe(state, X_last, X_WE):
@@ -167,7 +167,7 @@ def test_transition_finds_the_command_inside_the_next_states_constraints(pouring
     assert max(jumps) <= 1e-9
 
 
-def test_progress_adds_up_to_what_the_distances_lost(pouring):
+def test_progress_sums_the_decrease_of_the_distances(pouring):
     rises = []
     first = in_mug([-0.05, -0.31, 0.12])
     last = [pouring.progress(0, first, MUG)]
@@ -178,12 +178,12 @@ def test_progress_adds_up_to_what_the_distances_lost(pouring):
 
     state, X_WE = run(pouring, first, lambda k, X: np.array([0.1, 0.8, -0.5]), 900, observe=observe)
     assert state == 2
-    assert min(rises) > -0.02  # going straight at the mug, it falls nowhere by more than a transition's own overshoot
+    assert min(rises) > -0.02  # on a straight approach, progress falls by no more than the overshoot of a transition
     total = sum(s.weight * (s.starts_at - s.ends_at) for s in pouring.states)
     assert pouring.progress(state, X_WE, MUG) == pytest.approx(total, abs=0.01)
 
 
-def test_without_active_constraints_what_is_asked_is_done(pouring):
+def test_without_active_constraints_keeps_states(pouring):
     free = pouring.without_active_constraints()
     X_WE = in_mug([0.0, -0.06, 0.01])
     assert pouring.violation(1, X_WE, MUG) > 0.01
@@ -191,13 +191,13 @@ def test_without_active_constraints_what_is_asked_is_done(pouring):
     assert [s.name for s in free.states] == [s.name for s in pouring.states]
 
 
-def test_the_template_follows_the_object():
+def test_load_adapts_the_template_to_the_object():
     wide = load_template("pouring", mug_radius_m=0.06)
     narrow = load_template("pouring", mug_radius_m=0.04)
     assert wide.states[1].ends_at - narrow.states[1].ends_at == pytest.approx(0.02)
 
 
-def test_the_length_of_an_axis_multiplies_the_speed():
+def test_translation_scales_with_the_length_of_an_axis():
     moved = [
         im.Translation((0,), 0.1, axes=((0.0, 0.0, length),)).displacement(np.ones(1), RigidTransform(), {}, 0.5)
         for length in (1.0, 2.0)
@@ -205,11 +205,11 @@ def test_the_length_of_an_axis_multiplies_the_speed():
     np.testing.assert_allclose(moved[1].translation(), 2 * moved[0].translation())
 
 
-REACH = 0.125  # [m] of one step of the templates below, and a number that arithmetic keeps to the last bit
+REACH = 0.125  # [m] largest step of the templates below, an exact binary number
 
 
 class UpTo(ac.ActiveConstraint):
-    """Says how far x is beyond a limit, and projects nothing: only a shorter displacement gets inside."""
+    """Bound on x with an identity projection, so that only a shorter displacement is inside."""
 
     frame_names = ()
 
@@ -240,8 +240,8 @@ def floor_and_ceiling(floor, ceiling):
     return one(ac.HalfSpace((0.0, 0.0, 1.0), floor), ac.HalfSpace((0.0, 0.0, -1.0), -ceiling))
 
 
-def test_a_nanometre_outside_is_inside_and_more_is_not():
-    """A floor above a ceiling: what the ceiling leaves is outside of the floor by their distance."""
+def test_violation_of_a_nanometre_counts_as_inside():
+    """With a floor above a ceiling, a pose at the ceiling violates the floor by their distance."""
     X = RigidTransform()
     for floor, fraction in ((1e-9, 1.0), (1.5e-9, 0.0)):
         assert floor_and_ceiling(floor, 0.0).command(0, X, X, {}, 1.0).fraction == fraction
@@ -249,7 +249,7 @@ def test_a_nanometre_outside_is_inside_and_more_is_not():
 
 
 @pytest.mark.parametrize("halvings", range(9))
-def test_a_displacement_is_halved_until_it_is_inside_seven_times_at_most(halvings):
+def test_command_halves_a_displacement_at_most_seven_times(halvings):
     template = one(UpTo(0.75 * 0.5 ** (halvings - 1) * 0.0625))
     command = template.command(0, RigidTransform(), shifted(0.0625), {}, 1.0)
     fraction = 0.5**halvings if halvings < 8 else 0.0
@@ -257,38 +257,38 @@ def test_a_displacement_is_halved_until_it_is_inside_seven_times_at_most(halving
     assert command.X_WE.translation()[0] == pytest.approx(0.0625 * fraction, abs=1e-15)
 
 
-def test_the_whole_reach_is_within_reach():
-    there = shifted(REACH)
-    assert one().command(0, RigidTransform(), there, {}, 1.0) == Command(there, 1.0)
-    assert one(UpTo(0.75 * REACH)).command(0, RigidTransform(), there, {}, 1.0).fraction == 0.5
+def test_command_reaches_exactly_the_speed_limit():
+    target = shifted(REACH)
+    assert one().command(0, RigidTransform(), target, {}, 1.0) == Command(target, 1.0)
+    assert one(UpTo(0.75 * REACH)).command(0, RigidTransform(), target, {}, 1.0).fraction == 0.5
     beyond = one(ac.HalfSpace((1.0, 0.0, 0.0), REACH))
     assert beyond.can_enter(0, RigidTransform(), {}, 1.0)
     assert beyond.can_enter(0, shifted(0.5 * REACH), {}, 1.0)
     assert not beyond.can_enter(0, shifted(-1e-6), {}, 1.0)
 
 
-def test_who_may_not_move_keeps_the_last_command_itself():
+def test_command_is_the_last_command_when_no_motion_is_allowed():
     X_WLast = shifted(0.0)
     command = one(UpTo(0.0)).command(0, X_WLast, shifted(0.1), {}, 1.0)
     assert command.X_WE is X_WLast
     assert command.fraction == 0.0
 
 
-def test_who_is_led_inside_goes_no_further_than_the_constraints_say():
-    led = floor_and_ceiling(0.0, -0.02).command(0, RigidTransform([0.0, 0.0, 0.04]), RigidTransform(), {}, 1.0)
-    assert led == Command(led.X_WE, 0.0)
-    np.testing.assert_allclose(led.X_WE.translation(), [0.0, 0.0, -0.02], atol=1e-15)
+def test_command_led_inside_stops_at_the_projection():
+    command = floor_and_ceiling(0.0, -0.02).command(0, RigidTransform([0.0, 0.0, 0.04]), RigidTransform(), {}, 1.0)
+    assert command == Command(command.X_WE, 0.0)
+    np.testing.assert_allclose(command.X_WE.translation(), [0.0, 0.0, -0.02], atol=1e-15)
 
 
-def test_a_request_out_of_all_proportion_still_slides_along_a_wall():
-    """Brought within reach before it is projected, however far away it is: as far along the wall as one step goes."""
+def test_command_slides_along_a_wall_for_a_distant_request():
+    """A request is brought within reach before it is projected, so that the command slides by a whole step."""
     template = one(ac.Box((-1.0, -1.0, -1.0), (0.0, 1e9, 1.0), "world"))
     for far in (1.0, 1e4, 1e8):
         command = template.command(0, RigidTransform(), RigidTransform([far, far, 0.0]), {}, 1.0)
         np.testing.assert_allclose(command.X_WE.translation(), [0.0, REACH / np.sqrt(2), 0.0], rtol=1e-7, atol=1e-9)
 
 
-def test_what_is_not_said_of_a_template():
+def test_template_has_defaults_and_refuses_unknown_states():
     template = one()
     assert template.parameters == {}
     assert template.states[0].weight == 1.0
@@ -296,7 +296,7 @@ def test_what_is_not_said_of_a_template():
         template.index("onyl")
 
 
-def test_the_progress_of_states_that_go_round_ends():
+def test_progress_is_finite_for_cyclic_states():
     a, b, c = (
         one_state(name=name, transitions=(Transition(to, 0.5),)) for name, to in (("a", "b"), ("b", "c"), ("c", "b"))
     )

@@ -1,4 +1,4 @@
-"""`guiderail check` finds the mistakes that a template can make without being unreadable."""
+"""Checks of templates find faults that reading a file does not."""
 
 from pathlib import Path
 
@@ -24,15 +24,15 @@ def errors(change):
 
 
 @pytest.mark.parametrize("name", ["pouring", "pouring_aimed", "grid_clamp", "end_effector_velocity"])
-def test_our_own_templates_have_no_errors(name):
+def test_validate_finds_no_errors_in_shipped_templates(name):
     assert [f.message for f in validate(load_template(name)) if f.is_error] == []
 
 
-def test_a_sound_template_is_left_alone():
+def test_validate_returns_nothing_for_a_valid_template():
     assert findings() == []
 
 
-def test_finds_a_state_that_nothing_leads_to():
+def test_validate_finds_an_unreachable_state():
     def change(data):
         data["states"]["lost"] = dict(data["states"]["near"])
 
@@ -40,14 +40,14 @@ def test_finds_a_state_that_nothing_leads_to():
     assert "lost" in message
 
 
-def test_finds_a_transition_that_the_constraints_never_allow():
+def test_validate_finds_a_transition_blocked_by_constraints():
     def change(data):
         data["states"]["far"]["transitions"][0]["below_m"] = 0.05  # the cylinder keeps it at 0.06
 
     assert any("never fires" in message and "constraints" in message for message in errors(change))
 
 
-def test_finds_a_transition_that_no_input_leads_to():
+def test_validate_finds_a_transition_that_no_input_reaches():
     def change(data):
         data["states"]["near"]["input_mapping"] = [{"kind": "translation", "inputs": [0, 1, 2], "speed_m_per_s": 0.1}]
         data["inputs"] = 3
@@ -58,7 +58,7 @@ def test_finds_a_transition_that_no_input_leads_to():
     assert any("near: the end never fires" in message for message in errors(change))
 
 
-def test_finds_constraints_that_contradict_each_other():
+def test_validate_finds_contradictory_constraints():
     def change(data):
         data["states"]["far"]["active_constraints"] += [
             {"kind": "keep_above", "frame": "cup", "height_m": 0.2},
@@ -68,7 +68,7 @@ def test_finds_constraints_that_contradict_each_other():
     assert any("contradicts" in message and "KeepAbove" in message for message in errors(change))
 
 
-def test_finds_a_wrong_order():
+def test_validate_finds_constraints_in_the_wrong_order():
     def change(data):
         # An orientation that depends on the position, before the position is final.
         data["states"]["far"]["active_constraints"].insert(
@@ -78,7 +78,7 @@ def test_finds_a_wrong_order():
     assert any("undone by a constraint after it" in message for message in errors(change))
 
 
-def test_warns_of_inputs_that_move_nothing_and_frames_that_are_never_used():
+def test_validate_warns_of_unused_inputs_and_frames():
     def change(data):
         data["inputs"] = 4
         data["frames"].append("saucer")
@@ -89,7 +89,7 @@ def test_warns_of_inputs_that_move_nothing_and_frames_that_are_never_used():
 
 
 @pytest.mark.parametrize("name", ['a "b" \\', "$x", "$\\frac{1", "ψ"])
-def test_draws_whatever_a_state_is_called(tmp_path, name):
+def test_draw_quotes_names_of_states(tmp_path, name):
     def change(data):
         data["states"][name] = data["states"].pop("near")
         data["states"]["far"]["transitions"][0]["to"] = name
@@ -103,7 +103,7 @@ def test_draws_whatever_a_state_is_called(tmp_path, name):
         assert line.replace("\\\\", "").replace('\\"', "").count('"') % 2 == 0
 
 
-def test_draws_every_state_and_every_way(tmp_path):
+def test_draw_shows_every_state_and_transition(tmp_path):
     template = load_template("pouring")
     dot = to_dot(template)
     assert all(f'"{state.name}"' in dot for state in template.states)
@@ -113,7 +113,7 @@ def test_draws_every_state_and_every_way(tmp_path):
         assert (tmp_path / f"pouring{suffix}").stat().st_size > 100
 
 
-def test_warns_of_a_transition_into_tighter_constraints():
+def test_validate_warns_of_a_transition_that_waits():
     def change(data):
         data["states"]["near"]["active_constraints"].insert(
             0, {"kind": "cylinder", "frame": "cup", "max_radius_m": 0.01}

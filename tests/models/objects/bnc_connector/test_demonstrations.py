@@ -9,7 +9,7 @@ from research.generate.bnc_connector import record_one
 TIMES = 0.02 * np.arange(NUM_STEPS)
 
 
-def test_five_times_four_hundred_poses():
+def test_load_returns_five_times_400_poses():
     loaded = demonstrations.load()
     assert loaded.num_demonstrations == NUM_DEMONSTRATIONS
     assert all(output.shape == (NUM_STEPS, 6) for output in loaded.outputs)
@@ -17,7 +17,7 @@ def test_five_times_four_hundred_poses():
     np.testing.assert_allclose(loaded.times[0], TIMES, atol=1e-9)
 
 
-def test_the_file_holds_what_was_measured_too():
+def test_file_holds_measured_poses_and_wrenches():
     everything = demonstrations.load_all()
     shape = (NUM_DEMONSTRATIONS, NUM_STEPS)
     assert everything["measured"].shape == everything["wrench"].shape == (*shape, 6)
@@ -25,14 +25,14 @@ def test_the_file_holds_what_was_measured_too():
     assert "locked plug" in str(everything["frame"])
 
 
-def test_every_demonstration_ends_locked():
+def test_demonstrations_end_locked():
     """The measured poses end at the locked frame's origin."""
     final = demonstrations.load_all()["measured"][:, -1]
     assert np.abs(final[:, 2]).max() < 0.6 * MM
     assert np.abs(np.rad2deg(final[:, 3])).max() < 4.0
 
 
-def test_the_push_lives_in_the_difference():
+def test_push_is_the_difference_of_command_and_measurement():
     """While the plug is turned, the stiffness times commanded minus measured is the force along z."""
     everything = demonstrations.load_all()
     turning = slice(260, 320)
@@ -42,27 +42,27 @@ def test_the_push_lives_in_the_difference():
     np.testing.assert_allclose(push.mean(), everything["wrench"][:, turning, 2].mean(), rtol=0.1)
 
 
-def test_the_hand_searches_at_the_rim_and_is_precise_when_seated():
+def test_deviations_are_wide_at_the_rim_and_small_when_seated():
     outputs = np.stack(demonstrations.load().outputs)
     spread = outputs.std(axis=0)[:, :2].mean(axis=1)
     assert spread[80:170].mean() > 4.0 * spread[240:].mean()
 
 
-def test_no_two_demonstrations_are_alike_and_a_seed_repeats_itself():
+def test_motions_differ_and_repeat_with_a_seed():
     session, again, other = (demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
     np.testing.assert_array_equal(session, again)
     assert np.abs(session[0] - session[1])[:, :2].max() > 0.5 * MM
     assert np.abs(session[0] - other[0])[:, :2].max() > 0.5 * MM
 
 
-def test_their_mean_searches_nowhere_in_particular():
-    """What the demonstrations have in common finds the jack where it is known, and does not search by itself."""
+def test_mean_of_the_motions_has_no_search_offset():
+    """The mean of the demonstrations leads to the expected position of the jack without a search."""
     mean = np.mean(demonstrations.load().outputs, axis=0)
     assert np.abs(mean[:, :2]).max() < 0.3 * MM
 
 
-def test_recorded_again_it_is_the_same():
-    """Another machine's arithmetic may differ in the last digits, and contact passes that on."""
+def test_recording_again_reproduces_the_file():
+    """Rounding may differ between machines, and contact amplifies it."""
     everything = demonstrations.load_all()
     recording, is_locked = record_one(demonstrator_motions(int(everything["seed"]), TIMES_RECORDED)[0])
     assert is_locked

@@ -32,24 +32,24 @@ def centres(mesh):
 
 
 @pytest.mark.parametrize("name", files(DIMENSIONS))
-def test_committed_files_are_what_the_drawing_says(name):
+def test_shipped_files_equal_the_generated_ones(name):
     assert (FOLDER / name).read_text() == files(DIMENSIONS)[name]
 
 
-def test_writing_again_writes_the_same(tmp_path):
+def test_main_writes_the_shipped_files(tmp_path):
     main(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(files(DIMENSIONS))
     assert (tmp_path / "bnc_slots.obj").read_bytes() == (FOLDER / "bnc_slots.obj").read_bytes()
 
 
-def test_a_change_of_the_drawing_changes_the_files():
+def test_files_change_with_the_dimensions():
     wider = dataclasses.replace(DIMENSIONS, slot_clearance=0.2 * MM)
     assert files(wider)["bnc_slots.obj"] != files(DIMENSIONS)["bnc_slots.obj"]
     assert files(wider)["bnc_bore.obj"] == files(DIMENSIONS)["bnc_bore.obj"]
 
 
-def test_the_bore_lets_the_true_barrel_through():
-    """The polygon lies around the circle, and its faces look at the barrel."""
+def test_bore_encloses_the_true_barrel():
+    """The polygon encloses the circle and its faces point at the barrel."""
     mesh = bore_mesh(DIMENSIONS)
     wall = centres(mesh)[:, 2] > DIMENSIONS.mouth_chamfer
     outward = centres(mesh)[wall] * [1, 1, 0]
@@ -58,8 +58,8 @@ def test_the_bore_lets_the_true_barrel_through():
     assert (np.einsum("ij,ij->i", mesh.normals()[wall], outward) < 0).all()
 
 
-def test_polygons_of_equal_area_have_their_circles_area():
-    """The barrel's as Drake makes it: what it touches is drawn that much wider."""
+def test_equal_area_polygons_have_the_area_of_their_circles():
+    """The barrel is the polygon that Drake makes of the cylinder."""
     bore = bore_mesh(DIMENSIONS, equal_area=True)
     corners = bore.vertices[bore.vertices[:, 2] > DIMENSIONS.mouth_chamfer + 1e-9, :2]
     area = 0.5 * len(corners) * np.hypot(*corners.T).max() ** 2 * np.sin(2 * np.pi / len(corners))
@@ -74,7 +74,7 @@ def test_polygons_of_equal_area_have_their_circles_area():
 
 
 def barrel_circle(radius: float) -> np.ndarray:
-    """The corners of the polygon that Drake makes of a barrel."""
+    """Return the corners of the polygon that Drake makes of a barrel."""
     scene_graph = SceneGraph()
     source, properties = scene_graph.RegisterSource(), ProximityProperties()
     AddCompliantHydroelasticProperties(BARREL.resolution, BARREL.modulus, properties)
@@ -86,15 +86,15 @@ def barrel_circle(radius: float) -> np.ndarray:
     return corners[(corners[:, 2] > 0) & np.isclose(np.hypot(*corners[:, :2].T), radius)]
 
 
-def test_a_lug_fits_everywhere_along_its_path():
-    """At every point of the path, the slot is wider than the lug, along z."""
+def test_slot_has_clearance_along_the_lugs_path():
+    """The slot is wider than the lug along z at every point of the path."""
     columns = slot_columns(DIMENSIONS)
     width = columns.upper - columns.lower
     ramp = (columns.angles > 0.2) & (columns.angles < DIMENSIONS.detent_angle)
     assert width[ramp].min() > 2 * (DIMENSIONS.lug_radius + 0.9 * DIMENSIONS.slot_clearance)
 
 
-def test_slot_walls_look_into_the_slot():
+def test_slot_walls_face_the_slot():
     mesh = slot_mesh(DIMENSIONS)
     middle = centres(mesh)
     angle = np.arctan2(middle[:, 1], middle[:, 0])
@@ -112,7 +112,7 @@ def test_meshes_repeat_after_half_a_turn():
         assert points == turned
 
 
-def test_quads_share_corners_and_lose_slivers():
+def test_from_quads_merges_corners_and_drops_slivers():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     sliver = np.array([[1, 0, 0], [2, 0, 0], [1, 1, 0], [1, 1, 0]], dtype=float)
     mesh = TriangleMesh.from_quads(np.stack([square, sliver]))

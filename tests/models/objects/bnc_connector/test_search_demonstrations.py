@@ -1,4 +1,4 @@
-"""The demonstrations that really search."""
+"""Demonstrations with a search."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from research.generate.bnc_connector import TIMES, record_one
 SEARCHING = slice(0, round(bnc_search.SEARCH[1] / 0.02))
 
 
-def test_five_times_four_hundred_poses_that_end_locked():
+def test_load_returns_five_times_400_poses_that_end_locked():
     with np.load(bnc_search.PATH, allow_pickle=False) as file:
         measured = file["measured"]
     assert measured.shape == (NUM_DEMONSTRATIONS, NUM_STEPS, 6)
@@ -20,7 +20,7 @@ def test_five_times_four_hundred_poses_that_end_locked():
     assert np.abs(np.rad2deg(measured[:, -1, 3])).max() < 4.0
 
 
-def test_an_action_is_worth_the_same_in_every_direction_until_the_plug_drops_in():
+def test_covariance_is_isotropic_until_the_plug_drops_in():
     reference = reference_trajectory("search")
     deviations = reference.standard_deviations[SEARCHING, :2]
     assert deviations.max() < 1.15 * deviations.min()
@@ -29,13 +29,13 @@ def test_an_action_is_worth_the_same_in_every_direction_until_the_plug_drops_in(
     assert np.abs(reference.means[SEARCHING, :2]).max() < 0.4 * MM
 
 
-def test_the_hand_is_precise_once_the_plug_is_in():
+def test_deviations_are_small_after_the_insertion():
     reference = reference_trajectory("search")
     seated = slice(round((bnc_search.IN_BY + 0.4) / 0.02), NUM_STEPS)
     assert reference.standard_deviations[seated, :2].max() < 0.3 * MM
 
 
-def test_recorded_again_it_is_the_same():
+def test_recording_again_reproduces_the_file():
     with np.load(bnc_search.PATH, allow_pickle=False) as file:
         everything = dict(file)
     motion = bnc_search.demonstrator_motions(int(everything["seed"]), TIMES)[0]

@@ -19,31 +19,31 @@ DIMENSIONS = GridClampDimensions()
 
 
 def plane_distances(mesh, select):
-    """Distance from the z axis of the planes of the triangles whose centre's height `select` accepts."""
+    """Return the distances from the z axis of the planes of triangles whose centre's height `select` accepts."""
     corners = mesh.vertices[mesh.triangles]
     chosen = select(corners[:, :, 2].mean(axis=1))
     return np.abs(np.einsum("ij,ij->i", mesh.normals()[chosen], corners[chosen, 0]))
 
 
 @pytest.mark.parametrize("name", files(DIMENSIONS))
-def test_committed_files_are_what_the_drawing_says(name):
+def test_shipped_files_equal_the_generated_ones(name):
     assert (FOLDER / name).read_text() == files(DIMENSIONS)[name]
 
 
-def test_writing_again_writes_the_same(tmp_path):
+def test_main_writes_the_shipped_files(tmp_path):
     main(tmp_path)
     for path in tmp_path.iterdir():
         assert path.read_bytes() == (FOLDER / path.name).read_bytes()
 
 
-def test_a_change_of_the_drawing_changes_the_files():
+def test_files_change_with_the_dimensions():
     wider = files(dataclasses.replace(DIMENSIONS, hole_radius=4.3 * MM))
     assert wider["grid_clamp_hole.obj"] != files(DIMENSIONS)["grid_clamp_hole.obj"]
     assert wider["grid_clamp_peg.obj"] == files(DIMENSIONS)["grid_clamp_peg.obj"]
 
 
-def test_the_polygons_leave_the_full_clearance():
-    """Flat to flat, a peg in its hole has the play that the circles have."""
+def test_polygons_have_the_full_clearance():
+    """The clearance between flat sides equals that of the circles."""
     d = DIMENSIONS
     wall = plane_distances(hole_mesh(d), lambda z: z < -d.hole_chamfer)
     shaft = plane_distances(peg_mesh(d), lambda z: (z > d.peg_chamfer) & (z < d.peg_length - 1e-6))
@@ -52,7 +52,7 @@ def test_the_polygons_leave_the_full_clearance():
 
 
 @pytest.mark.parametrize("mesh", [peg_mesh(DIMENSIONS), bead_mesh(DIMENSIONS)])
-def test_what_is_compliant_is_a_closed_convex_solid(mesh):
+def test_compliant_meshes_are_closed_convex_solids(mesh):
     edges = np.sort(np.concatenate([mesh.triangles[:, [0, 1]], mesh.triangles[:, [1, 2]], mesh.triangles[:, [2, 0]]]))
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     heights = np.einsum("tk,vk->tv", mesh.normals(), mesh.vertices)
@@ -60,8 +60,8 @@ def test_what_is_compliant_is_a_closed_convex_solid(mesh):
     assert (heights <= planes[:, None] + 1e-8).all()
 
 
-def test_only_the_bead_has_to_squeeze():
-    """Every peg passes its hole and the lip; the bead's crest doesn't pass the lip without giving way."""
+def test_only_the_bead_has_interference():
+    """Every peg passes its hole and the lip; the bead passes the lip only by compression."""
     d = DIMENSIONS
     assert d.peg_radius < min(d.hole_radius, d.lip_radius)
     assert d.bead_radius > d.lip_radius
@@ -69,7 +69,7 @@ def test_only_the_bead_has_to_squeeze():
     assert np.hypot(*lip_mesh(d).vertices[:, :2].T).min() >= d.lip_radius
 
 
-def test_holes_open_upwards_everywhere_that_pegs_come_down():
+def test_holes_face_upwards_below_the_pegs():
     d = DIMENSIONS
     mesh = hole_mesh(d)
     face = np.isclose(mesh.vertices[mesh.triangles][:, :, 2], 0.0).all(axis=1)

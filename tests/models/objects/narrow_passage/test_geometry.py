@@ -19,7 +19,7 @@ def test_action_cost_is_equation_4_23():
     assert action_cost(np.array([0.3, -0.4])) == pytest.approx(-2.5)
 
 
-def test_the_zone_is_the_thesis_constraint():
+def test_zone_is_the_constraint_of_the_thesis():
     np.testing.assert_array_equal(WORLD.constraints.G, [[-1.0, 0.0]])
     np.testing.assert_array_equal(WORLD.constraints.c, [-0.6])
     assert WORLD.constraints.violation(np.array([0.7, 0.0])) == pytest.approx(0.1)
@@ -33,7 +33,7 @@ def test_walls_leave_only_the_gap():
     assert upper[1, 0] - lower[1, 0] >= 5
 
 
-def test_start_and_goal_are_on_different_sides():
+def test_start_and_goal_are_on_different_sides_of_the_walls():
     assert not WORLD.at_goal(np.array(WORLD.start))
     assert WORLD.at_goal(np.array(WORLD.goal))
     assert not WORLD.in_passage(np.array(WORLD.start))

@@ -1,4 +1,4 @@
-"""The thermos holds balls, and its wall has no gaps."""
+"""Vessels contain balls without gaps in the wall."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel,
 
 
 def shaken(vessel, acceleration, duration=0.4):
-    """Where a ball in an open vessel on its side is, in the tip frame, after gravity pulled at it that way."""
+    """Return the position in the tip frame of a ball in an open vessel after gravity acted in one direction."""
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlant(
         MultibodyPlantConfig(time_step=0.005, contact_model="point", discrete_contact_approximation="lagged"), builder
@@ -32,23 +32,23 @@ def shaken(vessel, acceleration, duration=0.4):
 
 @pytest.mark.parametrize("vessel", [THERMOS, MUG])
 @pytest.mark.parametrize("angle", np.deg2rad([0.0, 11.25, 90.0, 200.0]))
-def test_no_ball_leaves_through_the_wall(vessel, angle):
+def test_wall_contains_balls(vessel, angle):
     # Straight at a box, at an edge between two, and elsewhere; three times as hard as gravity.
     p = shaken(vessel, 30.0 * np.array([np.cos(angle), np.sin(angle), -0.1]))
     assert np.hypot(p[0], p[1]) < vessel.inner_diameter / 2
     assert vessel.contains(p)
 
 
-def test_no_ball_leaves_through_the_bottom():
+def test_bottom_contains_balls():
     p = shaken(THERMOS, np.array([0.0, 0.0, -30.0]))
     assert p[2] == pytest.approx(-THERMOS.depth + 0.02, abs=2e-3)
 
 
-def test_a_ball_leaves_through_the_opening():
+def test_opening_releases_balls():
     assert shaken(THERMOS, np.array([0.0, 0.0, 9.81]))[2] > 0.02
 
 
-def test_the_wall_surrounds_the_inside():
+def test_wall_surrounds_the_inside():
     radius = THERMOS.inner_diameter / 2
     for X_TG, box in THERMOS.boxes():
         corners = [X_TG @ (np.array(s) * box.size() / 2) for s in np.ndindex(2, 2, 2) for s in [2 * np.array(s) - 1]]
@@ -57,20 +57,20 @@ def test_the_wall_surrounds_the_inside():
         assert max(radii) <= THERMOS.outer_radius + 1e-12
 
 
-def test_contains_is_the_inside():
+def test_contains_is_true_inside():
     assert MUG.contains(np.array([0.0, 0.0, -0.01]))
     assert not MUG.contains(np.array([0.0, 0.0, 0.01]))
     assert not MUG.contains(np.array([0.041, 0.0, -0.05]))
     assert MUG.contains(np.array([0.041, 0.0, -0.05]), margin=0.002)
 
 
-def test_two_balls_fit_into_the_mug():
+def test_mug_holds_two_balls():
     volume = MUG.depth * np.pi * (MUG.inner_diameter / 2) ** 2
     ball = Sphere(Ball().diameter / 2)
     assert volume > 4 * 2 * np.pi * ball.radius() ** 3
 
 
 @pytest.mark.parametrize("wrong", [{"inner_diameter": 0.0}, {"depth": -1.0}, {"wall": float("nan")}, {"mass": np.inf}])
-def test_refuses_impossible_vessels(wrong):
+def test_vessel_refuses_invalid_dimensions(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
         Vessel(**({"inner_diameter": 0.05, "depth": 0.1} | wrong))
