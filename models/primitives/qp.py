@@ -5,8 +5,8 @@ In the dual of equation 4.20, min ½αᵀHα − dᵀα with α ≥ 0 and H = �
 same problem is min ½‖v‖² subject to Ḡᵀ(y + L v) ≥ C̄. Its Hessian is the identity, and its rows can be scaled to unit
 length, so that a solver's tolerance is a tolerance on the output itself.
 
-`qpsolvers` does not replace the adaptors: its rows are one-sided, which doubles them (DAQP takes 1.8 times as long), and
-it has no second tolerance, no margin and no check of an inaccurate result.
+`qpsolvers` does not replace the adaptors: its rows are one-sided, which doubles them (DAQP takes 1.8 times as long),
+and it has no second tolerance, no margin and no check of an inaccurate result.
 """
 
 from collections.abc import Callable
