@@ -1,34 +1,55 @@
-"""YAML that a person wrote: templates, run configurations and studies.
+"""Reader of YAML files: templates, tasks, run configurations and studies.
 
-It is read as YAML 1.2's core schema has it, of numbers, texts, lists and mappings alone: `yes` is a text, `1e-3` a
-number, and `010` is a text rather than eight. Whatever a text holds, reading it takes a bounded time and memory.
+Files hold numbers, texts, lists and mappings of YAML 1.2's core schema: `yes` is a text, `1e-3` a number, and `010` a
+text instead of eight. Reading takes bounded time and memory for any content.
 """
 
 import re
 from pathlib import Path
+from textwrap import shorten
 from typing import Any, NoReturn
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, MappingStartEvent, ScalarEvent
+from ruamel.yaml.nodes import ScalarNode
+from ruamel.yaml.parser import Parser
+from ruamel.yaml.reader import ReaderError
+from ruamel.yaml.resolver import VersionedResolver
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import read_bytes
 
-LARGEST_TEXT = 100_000  # [bytes] a template has five thousand
-MOST_NODES = 10_000  # with every alias counted as what it stands for
-DEEPEST = 30  # lists and mappings inside each other
+MAX_SIZE = 100_000  # [bytes]; a template has five thousand
+MAX_ENTRIES = 10_000  # aliases are counted as their content
+MAX_DEPTH = 30  # nested lists and mappings
 
-_TOO_DEEP = f"more than {DEEPEST} lists or mappings are inside each other: flatten them"
-_CORE = "tag:yaml.org,2002:"
+_TAG = "tag:yaml.org,2002:"
+_PATTERNS = {
+    "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    "bool": (r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    "int": (r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
+    "float": (
+        r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+    "timestamp": (r"[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}([Tt ].*)?", list("0123456789")),  # to be refused
+    "merge": (r"<<", ["<"]),
+}
 
 
 def load_yaml(path: str | Path, what: str = "file") -> Any:
-    """Reads a YAML file; `what` names its kind in messages.
+    """Read a YAML file.
+
+    Args:
+        path: Path of the file.
+        what: Kind of the file for messages, such as "template".
 
     Raises:
-        InputError: as `parse_yaml`, or if the file can't be read.
+        InputError: As `parse_yaml`, or if the file cannot be read.
     """
     path = Path(path)
-    data = read_bytes(path, what, LARGEST_TEXT)
+    data = read_bytes(path, what, MAX_SIZE)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -37,104 +58,116 @@ def load_yaml(path: str | Path, what: str = "file") -> Any:
 
 
 def parse_yaml(text: str, where: str = "text") -> Any:
-    """What one YAML document says, in Python's own types; `where` names it in messages.
+    """Read one YAML document as Python's own types.
+
+    Args:
+        text: The document.
+        where: Name of the document for messages.
 
     Raises:
-        InputError: if it is no YAML, has a tag, a key twice, a key that is no text, or is too large or too deep.
+        InputError: If it is not YAML, it has a tag, a date, a duplicate key or a key that is no text, or it is too
+            large or too deep.
     """
-    if len(text) > LARGEST_TEXT:
-        raise InputError(f"{where} is longer than {LARGEST_TEXT} characters: leave out what is not needed")
+    if len(text) > MAX_SIZE:
+        raise InputError(f"{where} is longer than {MAX_SIZE} characters: leave out what is not needed")
     try:
-        return yaml.load(text, Loader=_Loader)
+        return _make_yaml().load(text)
     except _RefusedError as error:
         raise InputError(f"{where}, {error}") from error
-    except yaml.reader.ReaderError as error:
+    except ReaderError as error:
         raise InputError(f"{where} is not YAML: it holds a character that can't be printed") from error
-    except yaml.MarkedYAMLError as error:
-        said = ", ".join(part for part in (error.context, error.problem) if part)
-        raise InputError(f"{where} is not YAML: {said}{_at(error.problem_mark or error.context_mark)}") from error
+    except MarkedYAMLError as error:
+        problem = str(error.problem).partition(" with value ")[0]  # of a duplicate key
+        mark = error.problem_mark or error.context_mark
+        line = f" in line {mark.line + 1}" if mark is not None else ""
+        words = shorten(", ".join(part for part in (error.context, problem) if part), 200)
+        raise InputError(f"{where} is not YAML: {words}{line}") from error
     except ValueError as error:  # an integer of more digits than Python reads
         raise InputError(f"{where} holds a number of thousands of digits: shorten it") from error
 
 
+class _Resolver(VersionedResolver):
+    """Resolver of plain scalars by `_PATTERNS`, whatever version of YAML a document claims."""
+
+    processing_version = (1, 2)
+    versioned_resolver: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 (ruamel.yaml's interface)
+
+
+for _name, (_pattern, _first) in _PATTERNS.items():
+    for _character in _first:
+        _entry = f"{_TAG}{_name}", re.compile(rf"(?:{_pattern})\Z")
+        _Resolver.versioned_resolver.setdefault(_character, []).append(_entry)
+
+
+def _make_yaml() -> YAML:
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Resolver, yaml.Parser = _Resolver, _Parser
+    return yaml
+
+
 class _RefusedError(Exception):
-    """YAML that is sound, and not what anyone writes."""
+    """Valid YAML that exceeds the reader's limits or uses a feature that it refuses."""
 
 
-def _at(mark: Any) -> str:
-    return f" in line {mark.line + 1}" if mark is not None else ""
+class _Collection:
+    """List or mapping that is being read: number of children, of entries below, and of levels below."""
+
+    def __init__(self, event: Any):
+        self.anchor, self.is_mapping = event.anchor, isinstance(event, MappingStartEvent)
+        self.children, self.entries, self.levels = 0, 1, 1
 
 
-class _Loader(yaml.SafeLoader):
-    """PyYAML's safe loader, with YAML 1.2's numbers, and with limits that hold before anything is built."""
+class _Parser(Parser):
+    """Parser that checks each event before anything is built from it."""
 
-    yaml_implicit_resolvers = {}  # noqa: RUF012  (PyYAML's own way: filled below, and not its base's)
+    def __init__(self, loader: Any):
+        super().__init__(loader)
+        self._num_entries = 0
+        self._parents: list[_Collection] = []
+        self._sizes: dict[str, tuple[int, int]] = {}  # entries and levels of anchored nodes
 
-    def __init__(self, stream: str):
-        super().__init__(stream)
-        self._nodes, self._depth = 0, 0
-        self._sizes: dict[yaml.Node, tuple[int, int]] = {}  # nodes and levels below, of what is complete
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        event = self.peek_event()
-        if getattr(event, "tag", None) is not None:
-            _refuse(f"the tag {brief(event.tag)} says nothing here: leave it out", event)
-        self._depth += 1
-        if self._depth > DEEPEST:
-            _refuse(_TOO_DEEP, event)
-        node: Any = super().compose_node(parent, index)
-        self._depth -= 1
-        if node.tag == f"{_CORE}timestamp":
-            _refuse(f"{brief(node.value)} is a date, or a subtraction: put it in quotes", event)
-        if isinstance(event, yaml.AliasEvent):
-            if node not in self._sizes:
+    def get_event(self) -> Any:
+        event = super().get_event()
+        entries, levels = 0, 0
+        if isinstance(event, CollectionEndEvent):
+            collection = self._parents.pop()
+            entries, levels = self._sizes[collection.anchor] = collection.entries, collection.levels
+        elif isinstance(event, AliasEvent):
+            if any(parent.anchor == event.anchor for parent in self._parents):
                 _refuse(f"{brief(event.anchor)} contains itself: write out what it stands for", event)
-            size, levels = self._sizes[node]
-            if self._depth + levels > DEEPEST:
-                _refuse(_TOO_DEEP, event)
-            self._nodes += size
-        else:
-            inside = [self._sizes[child] for child in _children(node)]
-            self._sizes[node] = 1 + sum(size for size, _ in inside), 1 + max((n for _, n in inside), default=0)
-            self._nodes += 1
-        if self._nodes > MOST_NODES:
-            _refuse(f"there are more than {MOST_NODES} entries, aliases counted: leave out what is not needed", event)
-        return node
-
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        node = super().compose_mapping_node(anchor)
-        seen = set()
-        for key, _ in node.value:
-            if key.tag not in (f"{_CORE}str", f"{_CORE}merge"):
-                said = brief(key.value) if isinstance(key, yaml.ScalarNode) else "a list or a mapping"
-                _refuse(f"{said} as a key is no text: put it in quotes", key)
-            if key.value in seen:
-                _refuse(f"the key {brief(key.value)} is there twice: keep one", key)
-            seen.add(key.value)
-        return node
+            entries, levels = self._sizes.get(event.anchor, (1, 1))
+            self._num_entries += entries
+        elif isinstance(event, ScalarEvent | CollectionStartEvent):
+            is_key = bool(self._parents) and self._parents[-1].is_mapping and self._parents[-1].children % 2 == 0
+            _check_node(event, self.resolver, is_key=is_key)
+            self._num_entries += 1
+            if isinstance(event, CollectionStartEvent):
+                self._parents.append(_Collection(event))
+            else:
+                entries, levels = self._sizes[event.anchor] = 1, 1
+        if len(self._parents) + levels > MAX_DEPTH:
+            _refuse(f"more than {MAX_DEPTH} lists or mappings are inside each other: flatten them", event)
+        if self._num_entries > MAX_ENTRIES:
+            _refuse(f"there are more than {MAX_ENTRIES} entries, aliases counted: leave out what is not needed", event)
+        if entries and self._parents:
+            parent = self._parents[-1]
+            parent.children, parent.entries = parent.children + 1, parent.entries + entries
+            parent.levels = max(parent.levels, levels + 1)
+        return event
 
 
-def _refuse(problem: str, at: Any) -> NoReturn:
-    """`at` is the event or the node that is refused."""
-    raise _RefusedError(f"line {at.start_mark.line + 1}: {problem}")
+def _check_node(event: Any, resolver: Any, *, is_key: bool) -> None:
+    if event.tag is not None:
+        _refuse(f"the tag {brief(event.tag)} has no meaning here: leave it out", event)
+    kind = "collection"
+    if isinstance(event, ScalarEvent):
+        kind = str(resolver.resolve(ScalarNode, event.value, event.implicit)).removeprefix(_TAG)
+    if kind == "timestamp":
+        _refuse(f"{brief(event.value)} is a date, or a subtraction: put it in quotes", event)
+    if is_key and kind not in ("str", "merge"):
+        key = "a list or a mapping" if kind == "collection" else brief(event.value)
+        _refuse(f"{key} as a key is no text: put it in quotes", event)
 
 
-def _children(node: yaml.Node) -> list[yaml.Node]:
-    if isinstance(node, yaml.MappingNode):
-        return [child for pair in node.value for child in pair]
-    return node.value if isinstance(node, yaml.SequenceNode) else []
-
-
-for _name, _pattern, _first in (
-    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
-    ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
-    (
-        "float",
-        r"[-+]?([0-9]+\.[0-9]*|\.[0-9]+|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        list("-+.0123456789"),
-    ),
-    ("timestamp", r"[0-9]{4}-[0-9]{1,2}-[0-9]{1,2}([Tt ].*)?", list("0123456789")),  # to be refused
-    ("merge", r"<<", ["<"]),
-):
-    _Loader.add_implicit_resolver(f"{_CORE}{_name}", re.compile(rf"(?:{_pattern})\Z"), _first)
+def _refuse(problem: str, event: Any) -> NoReturn:
+    raise _RefusedError(f"line {event.start_mark.line + 1}: {problem}")

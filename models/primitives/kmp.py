@@ -109,7 +109,13 @@ class Kmp:
         return identifier
 
     def move_via_point(self, identifier: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-        """Replace the input, mean and covariance of a via-point, with the arguments of `add_via_point`.
+        """Replace a via-point.
+
+        Args:
+            identifier: Return value of `add_via_point`.
+            input_: New input (I,).
+            mean: New output (O,).
+            covariance: New covariance (O, O).
 
         Raises:
             InputError: As `add_via_point`, or if there is no such via-point.
