@@ -1,0 +1,1 @@
+"""Hardware stations: driver interface, drivers, clocks and safety monitor."""

@@ -80,7 +80,7 @@ class Driver(ABC):
                 return
             time.sleep(POLL_PERIOD)
 
-    def check_usable(self) -> None:
+    def check_usable(self) -> None:  # noqa: B027 (optional hook)
         """Raise `InputError` if the connection cannot receive in this environment."""
 
     def add_listener(self, on_status: StatusCallback, on_command: CommandCallback) -> None:

@@ -51,8 +51,8 @@ class HardwareStation(Station):
 
     A `StatusWatchdog` checks the statuses, a `HeartbeatMonitor` the safety monitor's heartbeat, and a
     `TorqueSafetyLimiter` measurements and torques. They stop the arm, the output ``fault`` has the reason, and `resume`
-    ends the stop. A `Clock` calls `receive` before each step. Besides every station's ports there are these outputs; the
-    joints' have the names of Drake's own stations, with the driver's name and a dot before them:
+    ends the stop. A `Clock` calls `receive` before each step. Besides every station's ports there are these outputs;
+    those of the joints have the names of Drake's own stations, after the driver's name and a dot:
 
     =====================  =====  =====================================================================================
     output                 size   meaning

@@ -1,4 +1,4 @@
-"""An arm under a Cartesian impedance, with a tool: which arm and which tool are data."""
+"""Arm station: any arm and tool under a Cartesian impedance controller."""
 
 from __future__ import annotations
 
@@ -40,22 +40,22 @@ from guiderail.models.robots.robot import (
 )
 from guiderail.systems.gripper_command import GripperCommand
 
-# Half way through a quarter turn of what is held, from 90 degrees to 0.
+# Pose half way through a quarter turn of the workpiece, from 90 degrees to 0.
 MID_TURN_POSE = np.array([0.0, 0.0, 0.0, np.pi / 4, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
 class ArmModel:
-    """The arm, its tool and what it holds, in some plant.
+    """Arm, tool and workpiece in a plant.
 
     Attributes:
-        model: of the arm's joints.
-        target: T.
-        tool_centre: P.
-        wrist: by which the tool is bolted to the flange.
-        tool: the bodies behind the wrist, the first at the wrist.
-        tool_model: of the tool's joints, if it has any.
-        gripper: the actuators of the tool's joints.
+        model: Model instance of the arm's joints.
+        target: Target frame T.
+        tool_centre: Frame of the tool center P.
+        wrist: Joint between flange and tool.
+        tool: Bodies of tool and workpiece, the first at the wrist.
+        tool_model: Model instance of the tool's joints.
+        gripper: Actuators of the tool's joints.
     """
 
     model: ModelInstanceIndex
@@ -75,14 +75,14 @@ def add_arm(
     *,
     as_rigid: bool = False,
 ) -> ArmModel:
-    """Adds the arm at the world's origin, the tool, and the workpiece in it.
+    """Add the arm at the world's origin, the tool, and the workpiece.
 
     Args:
-        plant: not finalized.
-        workcell: what is held, and where the target is.
-        robot: which arm, or its name.
-        end_effector: which tool, or its name.
-        as_rigid: a gripper is one body, open, as a controller knows it.
+        plant: Plant, not finalized.
+        workcell: Workpiece and target frame.
+        robot: The arm, or its name.
+        end_effector: The tool, or its name.
+        as_rigid: Model a gripper as one body, open.
     """
     robot, end_effector = find_robot(robot), find_end_effector(end_effector)
     arm = add_robot(plant, robot)
@@ -102,10 +102,10 @@ def controller_model(
     robot: Robot | str = DEFAULT_ROBOT,
     end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
 ) -> tuple[MultibodyPlant, ArmModel]:
-    """The arm alone, as its controller knows it: without the fixture, without offsets, without joints of the tool.
+    """Return a plant with the arm only, for its controller: without fixture, offsets and joints of the tool.
 
     Raises:
-        InputError: if the robot's model moves by other joints than the arm's.
+        InputError: If the robot's model has other joints than the arm's.
     """
     robot = find_robot(robot)
     plant = MultibodyPlant(0.0)
@@ -121,13 +121,13 @@ def controller_model(
 
 
 class ArmControllerPlant:
-    """The arm as its controller knows it, and what follows from that alone.
+    """Model of an arm for its controller; see `ControllerPlant`.
 
     Attributes:
-        plant: the arm, its tool and the workpiece; no fixture, no offsets.
-        arm: in that plant.
-        posture: halfway through the workpiece's quarter turn, so that a null space that returns to it pulls either way
-            alike, (n,).
+        plant: Plant with arm, tool and workpiece.
+        arm: The arm in this plant.
+        posture: Joint positions to which the null space returns, (n,): half way through the workpiece's quarter turn,
+            so that both ends are equally far.
     """
 
     def __init__(
@@ -136,32 +136,33 @@ class ArmControllerPlant:
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
     ):
-        """
+        """Construct the model.
+
         Args:
-            workcell: what is held, and where the target is.
-            robot: which arm, or its name.
-            end_effector: which tool, or its name.
+            workcell: Workpiece and target frame.
+            robot: The arm, or its name.
+            end_effector: The tool, or its name.
         """
         self.plant, self.arm = controller_model(workcell, robot, end_effector)
         self.posture = self.solve(MID_TURN_POSE, np.array(find_robot(robot).home))
 
     @property
     def target(self) -> Frame:
-        """T."""
+        """Target frame T."""
         return self.arm.target
 
     @property
     def tool_centre(self) -> Frame:
-        """P."""
+        """Frame of the tool center P."""
         return self.arm.tool_centre
 
     def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
-        """The joint positions (n,) nearest to `posture`, (n,), with the tool centre at `pose`, (6,)."""
+        """Return the joint positions (n,) closest to `posture`, (n,), with the tool center at `pose`, (6,)."""
         arm = self.arm
         return solve_inverse_kinematics(self.plant, arm.target, arm.tool_centre, pose_to_transform(pose), posture)
 
     def place(self, plant: MultibodyPlant, model: ModelInstanceIndex, context: Context, pose: np.ndarray) -> None:
-        """Puts an arm of a station's plant at rest with its tool centre at `pose`, (6,); `context` is the root's."""
+        """Put the arm of a station's plant at rest with its tool center at `pose`, (6,), in the root context."""
         plant_context = plant.GetMyMutableContextFromRoot(context)
         plant.SetPositions(plant_context, model, self.solve(check_pose(pose, POSE_SIZE), self.posture))
         plant.SetVelocities(plant_context, model, np.zeros(plant.num_velocities(model)))
@@ -170,7 +171,7 @@ class ArmControllerPlant:
 def add_gripper_control(
     builder: DiagramBuilder, plant: MultibodyPlant, arm: ArmModel, end_effector: EndEffector, period: float
 ) -> tuple[InputPort, OutputPort]:
-    """Adds what drives the joints of a gripper; returns their desired positions and their measured state."""
+    """Add the drives of a gripper; return the ports of their desired positions and of their measured state."""
     joints = [actuator.joint() for actuator in arm.gripper]
     command = builder.AddNamedSystem(
         "gripper_command",
@@ -181,7 +182,7 @@ def add_gripper_control(
             period=period,
         ),
     )
-    # Joints that mimic others are in the model's state too.
+    # The model's state includes joints that mimic others.
     num_positions, first = plant.num_positions(arm.tool_model), _first_position(plant, arm.tool_model)
     actuated = np.zeros((2 * len(joints), plant.num_multibody_states(arm.tool_model)))
     for row, joint in enumerate(joints):
@@ -194,7 +195,7 @@ def add_gripper_control(
 
 
 class ArmOptions(ContactOptions):
-    """Of an arm's station."""
+    """Options of the arm station."""
 
     robot: str = Field(DEFAULT_ROBOT, description="which arm")
     end_effector: str = Field(DEFAULT_END_EFFECTOR, description="which tool")
@@ -202,19 +203,19 @@ class ArmOptions(ContactOptions):
 
 @register_station("arm", world="workcell", options=ArmOptions)
 class ArmStation(Station):
-    """The arm, its controller and the workcell.
+    """Arm under a Cartesian impedance controller, and a workcell.
 
-    Its rotors' reflected inertia makes the arm slower than the rails to follow, and stable under a controller that is
-    as slow as the plant's step. A station whose end effector is a gripper has two ports more:
+    The rotors' reflected inertia makes the arm slower than the gantry, and stable with a controller that is as slow as
+    the plant's step. With a gripper as the end effector, the station has two more ports:
 
     ==================  =========  ====================================================================================
     port                size       meaning
     ==================  =========  ====================================================================================
-    `gripper_position`  n          input, optional: where the gripper's actuated joints shall be; it stays open without
+    `gripper_position`  n          input, optional: desired positions of the gripper's actuated joints; open by default
     `gripper_state`     2n         output: their positions and velocities
     ==================  =========  ====================================================================================
 
-    A gripper's limit of force is its actuators'. To the controller and to the wrench sensor it is a rigid tool, open.
+    A gripper's force is limited by its actuators. For controller and wrench sensor it is a rigid, open tool.
     """
 
     wraps_angles = True
@@ -229,15 +230,16 @@ class ArmStation(Station):
         robot: Robot | str = DEFAULT_ROBOT,
         end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
     ):
-        """
+        """Construct the station.
+
         Args:
-            workcell: what stands in the world and what is held.
-            impedance: at the tool centre.
-            time_step: of the plant and of the controller [s]; half a rails' plant's for a gripper, whose fingers would
-                sink into what they hold, and the rails' plant's for other tools, unless given.
-            wrench_time_constant: of the wrench sensor's low-pass filter [s].
-            robot: which arm, or its name: see `robot_names()`.
-            end_effector: which tool, or its name: see `end_effector_names()`.
+            workcell: Fixture in the world and held workpiece.
+            impedance: Impedance at the tool center.
+            time_step: Time step of plant and controller [s]; `PLANT_PERIOD` by default, half of it with a gripper,
+                whose fingers would penetrate the workpiece.
+            wrench_time_constant: Time constant of the wrench sensor's low-pass filter [s].
+            robot: The arm, or its name: see `robot_names()`.
+            end_effector: The tool, or its name: see `end_effector_names()`.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -267,24 +269,24 @@ class ArmStation(Station):
         builder.BuildInto(self)
 
     def get_gripper_position_input_port(self) -> InputPort:
-        """Where the gripper's actuated joints shall be, (n,); only of a station with a gripper."""
+        """Return the port of the desired positions of the gripper's actuated joints, (n,), if there is a gripper."""
         return self.GetInputPort("gripper_position")
 
     def get_gripper_state_output_port(self) -> OutputPort:
-        """Positions and velocities of the gripper's actuated joints, (2n,); only of a station with a gripper."""
+        """Return the port of the state of the gripper's actuated joints, (2n,), if there is a gripper."""
         return self.GetOutputPort("gripper_state")
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the arm at rest with its tool centre at `pose`, (6,); `context` is the root context."""
+        """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""
         self._controller_plant.place(self.plant, self.arm.model, context, pose)
 
     def set_payload(self, context: Context, mass: float) -> None:
-        """Adds a mass [kg] to the tool that neither controller nor sensor knows of; `context` is the root context."""
+        """Add a mass [kg] to the tool that controller and sensor do not model; `context` is the root context."""
         own, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
         tool.SetMass(own, tool.default_mass() + mass)
 
 
 def _first_position(plant: MultibodyPlant, model: ModelInstanceIndex) -> int:
-    """Where a model's positions begin in the plant's."""
+    """Return the index of a model's first position among the plant's."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices(model)]
     return min(joint.position_start() for joint in joints if joint.num_positions() > 0)

@@ -1,4 +1,4 @@
-"""What a robot in a laboratory is like that nobody modelled: options of an environment, all off unless given."""
+"""Disturbances of a simulated station that resemble unmodelled effects of a real robot; all off by default."""
 
 from __future__ import annotations
 
@@ -25,44 +25,50 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.command_disturbance import CommandDisturbance
 from guiderail.systems.sensor_disturbance import SensorDisturbance
 
-MANY_TIMES = 100.0
-"""The largest factor that anything may be off by, either way."""
+MAX_FACTOR = 100.0
+"""Largest factor of a disturbance; its inverse is the smallest."""
 
 
-def _factors(words: str) -> Any:
-    return Field((1.0, 1.0), min_length=2, max_length=2, description=f"least and greatest factor of {words}")
+def _factors(quantity: str) -> Any:
+    return Field((1.0, 1.0), min_length=2, max_length=2, description=f"smallest and largest factor of {quantity}")
 
 
-def _largest(words: str) -> Any:
-    return Field((0.0, 0.0), min_length=2, max_length=2, description=words)
+def _magnitudes(description: str) -> Any:
+    return Field((0.0, 0.0), min_length=2, max_length=2, description=description)
 
 
 class Disturbances(Options):
-    """Of every environment with a workpiece and a fixture: what is drawn anew in every episode, and what never changes.
+    """Options of environments with a workcell: constant disturbances, and ranges that every episode samples from.
 
-    A range is a task's uncertainty: a policy may be trained with it, and is judged with any other.
+    A policy can be trained with one range and evaluated with another.
     """
 
-    friction_factor: Numbers = _factors("all friction, drawn every episode")
-    modulus_factor: Numbers = _factors("the contact's stiffness, drawn every episode")
-    wrench_scale: Numbers = _factors("what the wrench sensor says, drawn every episode")
-    wrench_bias: Numbers = _largest("largest offset of the wrench sensor, drawn every episode: force [N], torque [Nm]")
-    wrench_noise: Numbers = _largest("standard deviation of a sample of the wrench: force [N], torque [Nm]")
-    wrench_delay: Integer = Field(0, ge=0, le=50, description="control steps by which the wrench is late")
-    pose_bias: Number = Field(0.0, ge=0, le=0.01, description="largest error of measured x, y, z, every episode [m]")
-    lost_commands: Number = Field(0.0, ge=0, lt=1, description="how likely a command doesn't arrive")
-    late_commands: Integer = Field(0, ge=0, le=50, description="control steps by which a command is late")
-    control_period: Number | None = Field(
-        None, gt=0, le=1, description="of the controller's clock [s], the station's own"
+    friction_factor: Numbers = _factors("all friction, sampled every episode")
+    modulus_factor: Numbers = _factors("the contact's stiffness, sampled every episode")
+    wrench_scale: Numbers = _factors("the measured wrench, sampled every episode")
+    wrench_bias: Numbers = _magnitudes(
+        "largest offset of the measured wrench, sampled every episode: force [N], torque [Nm]"
     )
-    stiffness_factor: Number = Field(1.0, gt=0, le=MANY_TIMES, description="of the impedance's stiffness")
-    payload: Number = Field(0.0, ge=0, le=5, description="mass at an arm's tool that its controller ignores [kg]")
+    wrench_noise: Numbers = _magnitudes("standard deviation of the measured wrench: force [N], torque [Nm]")
+    wrench_delay: Integer = Field(0, ge=0, le=50, description="delay of the measured wrench in control steps")
+    pose_bias: Number = Field(
+        0.0, ge=0, le=0.01, description="largest offset of measured x, y, z, sampled every episode [m]"
+    )
+    lost_commands: Number = Field(0.0, ge=0, lt=1, description="probability that a command is lost")
+    late_commands: Integer = Field(0, ge=0, le=50, description="delay of a command in control steps")
+    control_period: Number | None = Field(
+        None, gt=0, le=1, description="period of the controller [s]; the station's by default"
+    )
+    stiffness_factor: Number = Field(1.0, gt=0, le=MAX_FACTOR, description="factor of the impedance's stiffness")
+    payload: Number = Field(
+        0.0, ge=0, le=5, description="mass at an arm's tool that its controller does not model [kg]"
+    )
 
     @field_validator("friction_factor", "modulus_factor", "wrench_scale")
     @classmethod
     def _check_range(cls, value: tuple[float, ...]) -> tuple[float, ...]:
-        if not 1.0 / MANY_TIMES <= value[0] <= value[1] <= MANY_TIMES:
-            raise ValueError(f"give two factors from {1.0 / MANY_TIMES} to {MANY_TIMES}, the smaller one first")
+        if not 1.0 / MAX_FACTOR <= value[0] <= value[1] <= MAX_FACTOR:
+            raise ValueError(f"give two factors from {1.0 / MAX_FACTOR} to {MAX_FACTOR}, the smaller one first")
         return value
 
     @field_validator("wrench_bias", "wrench_noise")
@@ -74,7 +80,7 @@ class Disturbances(Options):
 
     @property
     def any(self) -> bool:
-        """Whether anything is other than it should be."""
+        """True if any disturbance is on."""
         return self != type(self).model_validate({})
 
 
@@ -82,19 +88,20 @@ SIMULATION_PORTS = ("query", "body_poses")
 
 
 class DisturbedStation(Station):
-    """Another station with disturbances between its ports and whoever uses them.
+    """A station with disturbances between its ports and those of the inner station.
 
-    Its outputs are what a robot would believe; success, and the force that a collision is judged by, stay the truth.
+    Measured pose and wrench are disturbed; success and the contact force, by which collisions are detected, are not.
     """
 
     def __init__(self, station: Station, disturbances: Disturbances):
-        """
+        """Construct the station.
+
         Args:
-            station: what is disturbed; it becomes part of this one.
-            disturbances: in what way.
+            station: Inner station, which becomes part of this one.
+            disturbances: The disturbances.
 
         Raises:
-            InputError: if the station cannot be disturbed like that.
+            InputError: If the station does not have such a disturbance.
         """
         super().__init__()
         d = self._disturbances = disturbances
@@ -130,28 +137,28 @@ class DisturbedStation(Station):
 
     @property
     def nominal_period(self) -> float:
-        """Of the station that is disturbed [s]."""
+        """Time between commands of the inner station [s]."""
         return self._inner.nominal_period
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the robot at rest with its tool centre at `pose`, (6,), really; `context` is the root context."""
+        """Put the robot at rest with its true tool center at `pose`, (6,); `context` is the root context."""
         self._inner.set_pose(context, pose)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
-        """Draws what an episode's contact and sensors are like."""
+        """Sample the disturbances of an episode, and return them by name."""
         d = self._disturbances
         friction, modulus = (_sample_factor(rng, factors) for factors in (d.friction_factor, d.modulus_factor))
         scale, seed = _sample_factor(rng, d.wrench_scale), int(rng.integers(2**31))
         bias = rng.uniform(-1.0, 1.0, 6) * np.repeat(d.wrench_bias, 3)
-        beside = np.append(rng.uniform(-1.0, 1.0, 3) * d.pose_bias, np.zeros(3))
+        pose_offset = np.append(rng.uniform(-1.0, 1.0, 3) * d.pose_bias, np.zeros(3))
         if (friction, modulus) != (1.0, 1.0):
             self._inner.set_contact(context, friction, modulus)
         if d.payload:
             self._inner.set_payload(context, d.payload)
         own = {name: system.GetMyMutableContextFromRoot(context) for name, system in self._systems().items()}
         self._wrench.set_error(own["wrench"], np.full(6, scale), bias, seed)
-        self._pose.set_error(own["pose"], np.ones(POSE_SIZE), beside, 0)
-        # Of its own: both count their steps, and two that share seed and count draw from one stream.
+        self._pose.set_error(own["pose"], np.ones(POSE_SIZE), pose_offset, 0)
+        # A seed of its own: with the same seed both systems would use the same random numbers.
         self._commands.set_seed(own["commands"], int(np.random.SeedSequence(seed).generate_state(1)[0]))
         return {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
 
@@ -160,33 +167,33 @@ class DisturbedStation(Station):
 
 
 def disturbed(build: Callable[..., Station], disturbances: Disturbances, is_simulated: bool, name: str) -> Station:
-    """The station that `build` makes, disturbed where anything is; otherwise it is that station itself.
+    """Build a station, with disturbances if any is on.
 
     Args:
-        build: makes it; takes an `impedance` where its stiffness can be disturbed.
-        disturbances: in what way.
-        simulated: whether it is a simulation.
-        name: of the station.
+        build: Function that builds the station; has a parameter `impedance` if its stiffness can be disturbed.
+        disturbances: The disturbances.
+        is_simulated: True if it is a simulation.
+        name: Name of the station.
 
     Raises:
-        InputError: if it cannot be disturbed like that.
+        InputError: If the station does not have such a disturbance.
     """
     if not disturbances.any:
         return build()
     if not is_simulated:
         raise InputError(f"station={name!r} is a real robot, which has disturbances of its own: leave them out")
-    how: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
     if disturbances.stiffness_factor != 1.0:
         if "impedance" not in inspect.signature(build).parameters:
             raise InputError(f"station={name!r} has no impedance whose stiffness could be another: leave it out")
         nominal = Impedance()
         stiffness = tuple(disturbances.stiffness_factor * value for value in nominal.stiffness)
-        how["impedance"] = replace(nominal, stiffness=stiffness)
-    return DisturbedStation(build(**how), disturbances)
+        arguments["impedance"] = replace(nominal, stiffness=stiffness)
+    return DisturbedStation(build(**arguments), disturbances)
 
 
 def _sample_factor(rng: np.random.Generator, factors: tuple[float, ...]) -> float:
-    """A factor between two, as likely to double as to halve."""
+    """Return a factor sampled uniformly on a logarithmic scale."""
     low, high = np.log(factors)
     return float(np.exp(rng.uniform(low, high)))
 

@@ -1,4 +1,4 @@
-"""The tool centre on six rails: a Cartesian impedance without an arm, for learning at several times real time."""
+"""Gantry station: the tool center on six joints with an impedance, faster than real time because there is no arm."""
 
 from __future__ import annotations
 
@@ -50,43 +50,42 @@ GANTRY_JOINTS = (
     ("Ry", RevoluteJoint, [0.0, 1.0, 0.0]),
     ("Rx", RevoluteJoint, [1.0, 0.0, 0.0]),
 )
-CARRIAGE_MASS = (
-    1.5  # [kg], of all that moves: what an arm feels like at its tool when its controller shapes its inertia
-)
-CARRIAGE_INERTIA = 2e-3  # [kg m²]
-# A link between two rails weighs next to nothing; without any inertia the plant's mass matrix would be singular.
+# Mass [kg] and moment of inertia [kg m²] of all that moves: those at the tool of an arm with inertia shaping.
+CARRIAGE_MASS, CARRIAGE_INERTIA = 1.5, 2e-3
+# Of a link between two joints [kg], [m]; without inertia the plant's mass matrix would be singular.
 LINK_MASS, LINK_RADIUS = 1e-3, 0.01
 
 ImpedanceControl = Literal["joint", "cartesian"]
-# Of the plant [s], with a controller: its forces are held for a step, where the rails' own are solved with it. It is
-# then as near to the finest step as the rails' own are at `PLANT_PERIOD`: see `python -m research.benchmarks impedance`.
+# Time step of the plant with a Cartesian controller [s]. The controller's forces are constant within a step, those of
+# the joints' springs are not. At this step it is as accurate as the springs at `PLANT_PERIOD`: see
+# `python -m research.benchmarks impedance`.
 CARTESIAN_PLANT_PERIOD = PLANT_PERIOD / 2
 
 
 def damping(impedance: Impedance) -> np.ndarray:
-    """Of the rails with such an impedance, (6,) [N s/m, Nm s/rad]."""
+    """Return the damping of the joints for an impedance, (6,) [N s/m, Nm s/rad]."""
     masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
     return 2.0 * impedance.damping_ratio * np.sqrt(np.array(impedance.stiffness) * masses)
 
 
 class GantryOptions(ContactOptions):
-    """Of the rails' station."""
+    """Options of the gantry station."""
 
     impedance_control: ImpedanceControl = Field(
         "joint",
-        description="joint: springs and dampers of the rails themselves, solved with the contact; cartesian: the "
-        "controller that an arm has",
+        description="joint: springs and dampers of the joints, solved with the contact; cartesian: the controller of "
+        "an arm",
     )
 
 
 @register_station("gantry", world="workcell", options=GantryOptions)
 class GantryStation(Station):
-    """Joints x, y, z, Rz, Ry, Rx from the target frame to the tool centre, each with a spring, a damper and a limit.
+    """Gantry with joints x, y, z, Rz, Ry, Rx from the target frame to the tool center.
 
-    Their positions are the pose itself. Springs and dampers are the plant's own actuator gains, solved implicitly with
-    the contact: stable at any stiffness and time step. Or they are a `CartesianImpedanceController`'s, whose forces are
-    computed from the state at each step of the plant: what a real robot does, which asks for shorter steps. Weight is
-    compensated by leaving it out.
+    Each joint has a spring, a damper and a limit; the joint positions are the pose. Springs and dampers are the plant's
+    actuator gains, solved implicitly with the contact: stable at any stiffness and time step. Or they are those of a
+    `CartesianImpedanceController`, whose forces are computed explicitly at each step of the plant, as on a real robot,
+    which needs shorter steps. There is no gravity, as on a robot with gravity compensation.
     """
 
     def __init__(
@@ -97,16 +96,17 @@ class GantryStation(Station):
         wrench_time_constant: float = 0.01,
         impedance_control: ImpedanceControl = "joint",
     ):
-        """
+        """Construct the station.
+
         Args:
-            workcell: what stands in the world and what is held.
-            impedance: of the rails.
-            time_step: of the plant [s]; half a control period unless given, a quarter with a controller.
-            wrench_time_constant: of the wrench's low-pass filter [s]; 0 disables it.
+            workcell: Fixture in the world and held workpiece.
+            impedance: Impedance at the tool center.
+            time_step: Time step of the plant [s]; half a control period by default, a quarter with a controller.
+            wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
             impedance_control: "joint" or "cartesian", see above.
 
         Raises:
-            InputError: if the time step is too long for a controller with such an impedance.
+            InputError: If the time step is too long for a controller with this impedance.
         """
         super().__init__()
         builder = DiagramBuilder()
@@ -138,17 +138,17 @@ class GantryStation(Station):
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
+        """Put the tool at rest at `pose`, (6,); `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositions(plant_context, self.gantry, check_pose(pose, POSE_SIZE))
         self.plant.SetVelocities(plant_context, self.gantry, np.zeros(POSE_SIZE))
 
 
 def max_stable_time_step(impedance: Impedance) -> float:
-    """The time step [s] from which on a controller of the rails with that impedance is unstable.
+    """Return the time step [s] above which a Cartesian controller with an impedance is unstable.
 
-    With a force K e − D v that is held for a step h, and x' = v' where the step ends, a mode of frequency ω and damping
-    ratio ζ is stable as long as h ω < 2 (√(1 + ζ²) − ζ).
+    With a force K e − D v that is constant within a step h, and x' = v' at its end, a mode with frequency ω and damping
+    ratio ζ is stable if h ω < 2 (√(1 + ζ²) − ζ).
     """
     masses = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)
     fastest = float(np.sqrt(np.max(np.array(impedance.stiffness) / masses)))  # [rad/s]
@@ -167,7 +167,7 @@ def _check_time_step(impedance: Impedance, time_step: float) -> None:
 
 @dataclass(frozen=True)
 class GantryControllerPlant:
-    """The rails as their controller knows them: with the workpiece, without the fixture and without offsets."""
+    """Model of the gantry for its controller; see `ControllerPlant`."""
 
     plant: MultibodyPlant
     target: Frame
@@ -192,9 +192,9 @@ def _add_joint_control(
     pose: OutputPort,
     wrench: OutputPort,
 ) -> None:
-    """Adds what commands the rails' own springs, and exports a station's ports."""
+    """Add the command of the joints' springs, and export the ports of a station."""
     watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(CONTROL_PERIOD))
-    # The desired pose is the desired state's first half; the desired velocity is zero, so that damping damps.
+    # The desired pose is the first half of the desired state; the desired velocity is zero.
     desired_state = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * POSE_SIZE, POSE_SIZE)))
     monitor = builder.AddNamedSystem("monitor", ImpedanceMonitor(np.array(impedance.limits)))
     builder.Connect(watchdog.get_safe_pose_output_port(), desired_state.get_input_port())
@@ -216,7 +216,7 @@ def _add_joint_control(
 def _add_gantry(
     plant: MultibodyPlant, workcell: Workcell, impedance: Impedance, *, with_gains: bool
 ) -> ModelInstanceIndex:
-    """Adds the rails and behind them the tool with the workpiece, all weightless, with springs and dampers or none."""
+    """Add joints, tool and workpiece, all without gravity, and with springs and dampers if `with_gains` is True."""
     model = plant.AddModelInstance("gantry")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     for (name, joint_type, axis), stiffness, damps, limit in zip(
@@ -240,9 +240,9 @@ def _add_gantry(
 def _add_wrench(
     builder: DiagramBuilder, plant: MultibodyPlant, gantry: ModelInstanceIndex, pose: OutputPort, time_constant: float
 ) -> OutputPort:
-    """Adds the wrench of the plug's contact, low-pass filtered: one plant step old, as a sensor's is.
+    """Add the low-pass filtered wrench of the contact, one plant step old, as that of a sensor.
 
-    What runs at every plant step is Drake's own; the wrench is computed where somebody reads it.
+    At every plant step only systems of Drake run; the wrench is computed when it is read.
     """
     period = plant.time_step()
     decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""A Cartesian impedance controller in a station: of an arm, or of the rails."""
+"""Cartesian impedance controller of a station with an arm or a gantry."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from guiderail.systems.impedance_monitor import ImpedanceMonitor
 
 
 class ControllerPlant(Protocol):
-    """A robot as its controller knows it: with what it carries, without the fixture and without offsets."""
+    """Model of a robot for its controller: with tool and workpiece, without fixture and offsets."""
 
     @property
     def plant(self) -> MultibodyPlant:
-        """The robot and nothing else."""
+        """Plant with the robot only."""
 
     @property
     def target(self) -> Frame:
-        """T."""
+        """Target frame T."""
 
     @property
     def tool_centre(self) -> Frame:
-        """P."""
+        """Frame of the tool center P."""
 
     @property
     def posture(self) -> np.ndarray:
-        """Joint positions that the null space returns to, (n,)."""
+        """Joint positions to which the null space returns, (n,)."""
 
 
 def impedance_gains(impedance: Impedance, posture: np.ndarray) -> ImpedanceGains:
-    """The station's impedance, which is ordered as a pose is, as the controller wants it."""
+    """Return the gains of the controller for a station's impedance."""
     return ImpedanceGains(
         stiffness=np.diag(to_wrench_order(impedance.stiffness)),
         wrench_limits=to_wrench_order(impedance.limits),
@@ -52,7 +52,7 @@ def add_controller(
     *,
     compensate_gravity: bool,
 ) -> tuple[CartesianImpedanceController, ImpedanceMonitor]:
-    """Adds a robot's controller, sampled once in `period` [s], and what watches its wrench; the caller wires both."""
+    """Add a robot's controller, sampled with `period` [s], and the monitor of its wrench; the caller connects them."""
     controller = builder.AddNamedSystem(
         "controller",
         CartesianImpedanceController(
@@ -78,9 +78,19 @@ def add_impedance_control(
     wrench: OutputPort,
     compensate_gravity: bool = True,
 ) -> OutputPort:
-    """Adds the controller of a robot whose joints are at `state`, and exports a station's ports; returns the torque.
+    """Add the controller of a robot, and export the ports of a station.
 
-    Its watchdog checks commands once in `period` [s].
+    Args:
+        builder: Builder of the station.
+        controller_plant: Model of the robot.
+        impedance: Impedance at the tool center.
+        period: Sampling period of the controller and its command watchdog [s].
+        state: Port of joint positions and velocities, (2n,).
+        wrench: Port of the wrench, (6,).
+        compensate_gravity: Add the torque of the robot's weight.
+
+    Returns:
+        The port of the torques, (n,).
     """
     controller, monitor = add_controller(
         builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity

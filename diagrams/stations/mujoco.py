@@ -1,4 +1,4 @@
-"""The tool centre on six rails, in another physics engine: is a skill one of Drake's contact only?"""
+"""Gantry station in MuJoCo, to evaluate skills with another contact model than Drake's."""
 
 from __future__ import annotations
 
@@ -35,20 +35,27 @@ if TYPE_CHECKING:
 
 
 FIXTURE, TOOL, WORKPIECE = "fixture", "tool", "workpiece"
-"""Names of the model's bodies; the workpiece is the tool's child, and the tool's six joints are the model's first."""
+"""Names of the model's bodies. The workpiece is the tool's child; the tool's six joints are the model's first."""
 
-MAX_PAIRS = 31  # bits of a contact mask
+MAX_PAIRS = 31  # number of bits of a contact mask
 
 
 @dataclass(frozen=True)
 class MujocoContact:
-    """How MuJoCo's contacts give way, and how finely they are stepped: the engine's numbers, and no object's."""
+    """Parameters of MuJoCo's contact and integration, equal for all objects.
 
-    time_step: float = 0.001  # [s], or nearly: a whole number of them is the plant's period
-    time_constant: float = 0.002  # [s] of a contact: the least that the engine integrates is two time steps
-    impedance: float = 0.95  # how much of a contact's force is the constraint's, and not softness
-    friction_ratio: float = 10.0  # how much harder friction is than the normal direction: what sticks creeps less
-    # A spring's body is so heavy that an explicit step of it is stable: natural frequency times time step.
+    Attributes:
+        time_step: Time step [s], rounded so that a whole number of them is the station's.
+        time_constant: Time constant of a contact [s]; the smallest that the engine integrates is two time steps.
+        impedance: Constraint impedance of a contact, between 0 and 1.
+        friction_ratio: Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
+        spring_step: Natural frequency times time step of a spring, whose body is heavy enough for explicit integration.
+    """
+
+    time_step: float = 0.001
+    time_constant: float = 0.002
+    impedance: float = 0.95
+    friction_ratio: float = 10.0
     spring_step: float = 1.0
 
 
@@ -60,17 +67,18 @@ def mujoco_model(
     contact: MujocoContact,
     period: float,
 ) -> mujoco.MjModel:
-    """The compiled model; its world is the target frame T, so that its first six joints are the pose itself.
+    """Return the compiled model. Its world frame is the target frame T, so the first six joint positions are the pose.
 
     Args:
-        fixture, workpiece: what touches, in the frames of the two bodies.
-        inertia: of the workpiece, in its frame.
-        impedance: of the rails.
-        contact: of all surfaces.
-        period: that a whole number of steps makes up [s].
+        fixture: Contact surfaces of the fixture, in its frame.
+        workpiece: Contact surfaces of the workpiece, in its frame.
+        inertia: Spatial inertia of the workpiece, in its frame.
+        impedance: Impedance of the joints.
+        contact: Parameters of contact and integration.
+        period: Time that is a whole number of steps [s].
 
     Raises:
-        InputError: if MuJoCo isn't installed, or there are more kinds of pairs than a contact mask has bits.
+        InputError: If MuJoCo is not installed, or there are more kinds of pairs than a contact mask has bits.
     """
     mujoco = mujoco_engine()
     pairs = sorted({surface.pair for surface in (*fixture, *workpiece)})
@@ -84,29 +92,29 @@ def mujoco_model(
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     option = spec.option
     option.timestep = period / max(round(period / contact.time_step), 1)
-    option.gravity = [0.0, 0.0, 0.0]  # weight is compensated by leaving it out, as on Drake's rails
+    option.gravity = [0.0, 0.0, 0.0]  # as in the gantry in Drake
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     option.impratio = contact.friction_ratio
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.iterations, option.tolerance = 100, 1e-10
-    option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # [m]: these contacts are a micrometre deep
+    option.ccd_tolerance, option.ccd_iterations = 1e-9, 100  # [m]; these contacts are 1 µm deep
 
-    # The tool comes first, so that its joints do.
+    # The tool is added first, so that its joints are the first.
     tool = spec.worldbody.add_body(
         name=TOOL, mass=CARRIAGE_MASS, inertia=[CARRIAGE_INERTIA] * 3, ipos=[0.0, 0.0, 0.0], explicitinertial=True
     )
     _add_gantry(mujoco, spec, tool, impedance)
     moments = inertia.Shift(inertia.get_com()).CalcRotationalInertia().get_moments()
-    held = tool.add_body(
+    workpiece_body = tool.add_body(
         name=WORKPIECE, mass=inertia.get_mass(), inertia=moments, ipos=inertia.get_com(), explicitinertial=True
     )
-    stands = spec.worldbody.add_body(name=FIXTURE)
+    fixture_body = spec.worldbody.add_body(name=FIXTURE)
     masks = {pair: 1 << bit for bit, pair in enumerate(pairs)}
     for surface in workpiece:
-        _add_surface(mujoco, spec, held, surface, {"contype": masks[surface.pair], "conaffinity": 0}, contact)
+        _add_surface(mujoco, spec, workpiece_body, surface, {"contype": masks[surface.pair], "conaffinity": 0}, contact)
     for surface in fixture:
-        _add_surface(mujoco, spec, stands, surface, {"contype": 0, "conaffinity": masks[surface.pair]}, contact)
+        _add_surface(mujoco, spec, fixture_body, surface, {"contype": 0, "conaffinity": masks[surface.pair]}, contact)
     return spec.compile()
 
 
@@ -163,10 +171,10 @@ def _add_surface(mujoco: Any, spec: Any, body: Any, surface: Surface, masks: Any
 
 @register_station("mujoco", world="workcell", options=ContactOptions)
 class MujocoStation(Station):
-    """`GantryStation`'s twin, stepped by MuJoCo: ports, rails, impedance, watchdog and filter are the same.
+    """`GantryStation` in MuJoCo, with the same ports, joints, impedance, watchdog and filter.
 
-    Drake's plant is still there, without joints or a step: it knows where the fixture stands and how the workpiece
-    sits in the tool, which a reset draws into its context, and what all of it looks like.
+    A Drake plant without joints and time step holds the poses of fixture and workpiece, which a reset sets in its
+    context, and the visual geometry.
     """
 
     def __init__(
@@ -177,17 +185,17 @@ class MujocoStation(Station):
         wrench_time_constant: float = 0.01,
         contact: MujocoContact = MujocoContact(),
     ):
-        """
+        """Construct the station.
+
         Args:
-            workcell: what stands in the world and what is held.
-            impedance: of the rails.
-            time_step: at which commands are taken in, and poses and wrenches given out [s]; half a control period
-                unless given. The engine's own is finer.
-            wrench_time_constant: of the wrench's low-pass filter [s].
-            contact: of the engine.
+            workcell: Fixture in the world and held workpiece.
+            impedance: Impedance at the tool center.
+            time_step: Period of inputs and outputs [s]; half a control period by default. The engine's is shorter.
+            wrench_time_constant: Time constant of the wrench's low-pass filter [s].
+            contact: Parameters of contact and integration.
 
         Raises:
-            InputError: if MuJoCo isn't installed, or nobody described the workcell's surfaces as convex solids.
+            InputError: If MuJoCo is not installed, or the workcell is not described by convex solids.
         """
         super().__init__()
         time_step = time_step or PLANT_PERIOD
@@ -229,16 +237,16 @@ class MujocoStation(Station):
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the carriage at rest at `pose`, (6,); `context` is the root context."""
+        """Put the tool at rest at `pose`, (6,); `context` is the root context."""
         self.gantry.set_pose(self.gantry.GetMyMutableContextFromRoot(context), check_pose(pose, POSE_SIZE))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Multiplies the engine's friction and compliance; `context` is the root context."""
+        """Multiply friction and stiffness of the engine's contacts; `context` is the root context."""
         self.gantry.set_contact(self.gantry.GetMyMutableContextFromRoot(context), friction, modulus)
 
 
 def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Workcell) -> MovedBodies:
-    """Adds fixture, tool and workpiece to a plant in which nothing moves, and finalizes it."""
+    """Add fixture, tool and workpiece to a plant without joints, and finalize it."""
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     workcell.add_fixture(plant)
     if plant.num_bodies() != 2:  # with the world

@@ -1,4 +1,4 @@
-"""A plane with walls and a robot that is commanded by position."""
+"""Plane station: a point robot under position control among walls."""
 
 from dataclasses import dataclass
 
@@ -17,27 +17,27 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
 
-OBSTACLE_Z = -0.035  # [m] below the robot: it is drawn, and the robot may be above it
+OBSTACLE_Z = -0.035  # below the robot, which passes over the drawn obstacle [m]
 OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]
 
 
 @dataclass(frozen=True)
 class PlaneConfig:
-    """The robot and its clocks.
+    """Parameters of the robot and its time steps.
 
-    The robot is a light ball on two rails that move it like strong, well damped drives: a proportional force, limited,
-    against viscous friction that the plant integrates implicitly. Where it saturates it goes at `max_speed`, which
-    keeps what it covers in a plant step (20 mm) well below a wall's thickness: nothing tunnels. Below that it is
-    critically damped, so that it arrives within a control step and never overshoots a command.
+    The robot is a light ball on two prismatic joints, each with a limited proportional force against viscous friction
+    that the plant integrates implicitly. With a saturated force it moves at `max_speed`; its motion in a plant step, 20
+    mm, is much less than a wall's thickness. Otherwise it is critically damped: it reaches a command within a control
+    step and does not overshoot.
 
     Attributes:
-        plant_period: s, seconds of a plant step.
-        substeps: plant steps in a control step.
-        mass: kg, of the robot.
-        max_force: N, on each rail.
-        max_speed: m/s, on each rail.
-        friction: between robot and walls; high, so that a robot pressed against a wall doesn't slide along it.
-        stiffness: N/m, of the contact.
+        plant_period: Time step of the plant [s].
+        substeps: Plant steps per control step.
+        mass: Mass of the robot [kg].
+        max_force: Largest force of each joint [N].
+        max_speed: Largest speed of each joint [m/s].
+        friction: Friction between robot and walls; high, so that a robot pressed against a wall does not slide.
+        stiffness: Stiffness of the contact [N/m].
     """
 
     plant_period: float = round_period(0.002)
@@ -50,17 +50,17 @@ class PlaneConfig:
 
     @property
     def control_period(self) -> float:
-        """Seconds of a control step."""
+        """Time of a control step [s]."""
         return self.substeps * self.plant_period
 
     @property
     def damping(self) -> float:
-        """N s/m, with which full force means full speed."""
+        """Damping [N s/m] with which the largest force leads to the largest speed."""
         return self.max_force / self.max_speed
 
     @property
     def position_gain(self) -> float:
-        """N/m, for critical damping of the discrete loop.
+        """Position gain [N/m] for critical damping of the discrete loop.
 
         With a = m/(m + d h) and b = k h²/(m + d h) the loop's characteristic polynomial is z² − (1 + a − b) z + a;
         both roots are √a where b = (1 − √a)².
@@ -71,29 +71,30 @@ class PlaneConfig:
 
 @register_station("plane", world="plane")
 class PlaneStation(Station):
-    """A plane with walls and a robot that is commanded by position.
+    """Point robot under position control in a plane with walls.
 
-    ``desired_pose`` and ``pose`` are (x, y) of the robot's centre [m]. ``wrench`` (2,) is what the walls did to the
-    robot, averaged over the control step [N], and ``contact_force`` (1,) its norm. ``saturation`` (2,) is the force
-    that was asked of each rail beyond its limit [N]. ``query`` is the scene graph's, for cameras.
+    ``desired_pose`` and ``pose`` are the position (x, y) of the robot's center [m]. ``wrench`` (2,) is the force of the
+    walls on the robot, averaged over the control step [N], and ``contact_force`` (1,) its norm. ``saturation`` (2,) is
+    the force of each joint beyond its limit [N]. ``query`` is the scene graph's, for cameras.
 
-    Of its world it reads `walls` and `robot_radius`, which touch each other, and what it only draws: `goal`,
-    `goal_radius`, `zone_x`, `obstacle`, `obstacle_radius`, `obstacles` and `obstacles_move`. It stops nobody at
-    `zone_x` or at a disc: a task's constraints, conditions and rewards do, and a task puts the robot to its `start`.
+    `walls` and `robot_radius` of the world are simulated; `goal`, `goal_radius`, `zone_x`, `obstacle`,
+    `obstacle_radius`, `obstacles` and `obstacles_move` are only drawn, and have their effect by constraints,
+    terminations and rewards of a task.
     """
 
     def __init__(self, world: PassageGeometry, config: PlaneConfig = PlaneConfig()):
-        """
+        """Construct the station.
+
         Args:
-            world: what is where.
-            config: the robot.
+            world: Geometry of walls, goal and obstacles.
+            config: Parameters of the robot.
         """
         super().__init__()
         builder = DiagramBuilder()
         self.world, self.config = world, config
         self.control_period = config.control_period
         # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
-        # updates of the same instant, and a system that samples the pose there would see it one plant step late.
+        # updates of the same instant, and a system that samples the pose would get it one plant step late.
         plant_config = MultibodyPlantConfig(
             time_step=config.plant_period,
             discrete_contact_approximation="lagged",
@@ -105,10 +106,10 @@ class PlaneStation(Station):
         self._robot = _add_robot(self.plant, world, config)
         _add_walls(self.plant, world, config)
         _add_markings(self.plant, world)
-        self._places = _add_moving_obstacles(self.plant, world) if world.obstacles_move else []
+        self._obstacle_frames = _add_moving_obstacles(self.plant, world) if world.obstacles_move else []
         self.plant.Finalize()
 
-        # F = clip(k (x_d - x), ±F_max), against the rails' viscous friction.
+        # F = clip(k (x_d - x), ±F_max), against the joints' viscous friction.
         one = np.eye(2)
         pose = builder.AddNamedSystem("pose", MatrixGain(D=np.eye(2, 4)))
         watchdog = builder.AddNamedSystem("watchdog", CommandWatchdog(config.control_period, pose_size=2))
@@ -149,22 +150,22 @@ class PlaneStation(Station):
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the robot's centre at (x, y), at rest; `context` is the root context."""
+        """Put the robot's center at (x, y), at rest; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositionsAndVelocities(
             plant_context, self._robot, np.concatenate([check_pose(pose, 2), np.zeros(2)])
         )
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
-        """Puts the obstacles to (n, 2), in a world where they move; `context` is the root context."""
+        """Put the obstacles at (n, 2) [m], in a world with moving obstacles; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
-        for place, (x, y) in zip(self._places, obstacles, strict=True):
-            place.SetPoseInParentFrame(plant_context, RigidTransform([x, y, OBSTACLE_Z]))
+        for frame, (x, y) in zip(self._obstacle_frames, obstacles, strict=True):
+            frame.SetPoseInParentFrame(plant_context, RigidTransform([x, y, OBSTACLE_Z]))
 
 
 def _add_robot(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfig) -> ModelInstanceIndex:
     robot = plant.AddModelInstance("robot")
-    # The carriage between the rails is nearly massless: both axes move the same mass.
+    # The carriage between the joints is nearly massless, so both joints move the same mass.
     carriage = plant.AddRigidBody("carriage", robot, SpatialInertia.SolidSphereWithMass(1e-3 * config.mass, 0.01))
     ball = plant.AddRigidBody("ball", robot, SpatialInertia.SolidSphereWithMass(config.mass, world.robot_radius))
     x = PrismaticJoint("x", plant.world_frame(), carriage.body_frame(), [1, 0, 0], damping=config.damping)
@@ -178,7 +179,7 @@ def _add_robot(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfi
 
 
 def _add_walls(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfig) -> None:
-    # The centre's walls, less the robot's radius.
+    # `walls` are those for the robot's center, larger than the real ones by its radius.
     for name, lower, upper in zip(("left_wall", "right_wall"), *world.walls, strict=True):
         size = upper - lower - 2 * world.robot_radius
         X_WG = RigidTransform([*(lower + upper) / 2, 0.0])
@@ -188,7 +189,7 @@ def _add_walls(plant: MultibodyPlant, world: PassageGeometry, config: PlaneConfi
 
 
 def _add_markings(plant: MultibodyPlant, world: PassageGeometry) -> None:
-    """What is only there to be seen: the floor, the restricted zone, the obstacle and the goal."""
+    """Add floor, restricted zone, obstacle and goal as visual geometry."""
     body = plant.world_body()
 
     def mark(name, shape, x, y, z, color):
@@ -202,15 +203,15 @@ def _add_markings(plant: MultibodyPlant, world: PassageGeometry) -> None:
 
 
 def _add_moving_obstacles(plant: MultibodyPlant, world: PassageGeometry) -> list[FixedOffsetFrame]:
-    """Obstacles to be seen, each on a frame that a reset can move."""
-    model, places = plant.AddModelInstance("obstacles"), []
+    """Add visual obstacles, each welded to a frame that can be moved in the context; return the frames."""
+    model, frames = plant.AddModelInstance("obstacles"), []
     for number, (x, y) in enumerate(world.obstacles):
         X_WO = RigidTransform([x, y, OBSTACLE_Z])
-        places.append(plant.AddFrame(FixedOffsetFrame(f"place_{number}", plant.world_frame(), X_WO)))
+        frames.append(plant.AddFrame(FixedOffsetFrame(f"place_{number}", plant.world_frame(), X_WO)))
         body = plant.AddRigidBody(f"obstacle_{number}", model, SpatialInertia.SolidSphereWithMass(1.0, 0.01))
-        plant.WeldFrames(places[-1], body.body_frame())
+        plant.WeldFrames(frames[-1], body.body_frame())
         plant.RegisterVisualGeometry(body, RigidTransform(), _obstacle_shape(world), "disc", np.array(OBSTACLE_COLOR))
-    return places
+    return frames
 
 
 def _obstacle_shape(world: PassageGeometry) -> Cylinder:

@@ -1,4 +1,4 @@
-"""An arm under Cartesian position control that holds a thermos with two balls, and a mug on a table."""
+"""Pouring station: an arm under Cartesian position control with a thermos and balls, and a mug on a table."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -26,13 +26,13 @@ from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor
 
-# Half way between the pourings that the workspace allows, so that a search ends on the same branch for all of them.
+# Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.
 MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
 
-# More than any guidance asks for, so that it is the guidance that says how fast.
+# Above the speed of any guidance, so that the controller does not limit it.
 SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
 
-WRENCH_TIME_CONSTANT = 0.02  # [s] of the wrench sensor's low-pass filter
+WRENCH_TIME_CONSTANT = 0.02  # of the wrench sensor's low-pass filter [s]
 
 METAL = (0.55, 0.58, 0.62, 1.0)
 WOOD = (0.80, 0.68, 0.50, 1.0)
@@ -43,20 +43,20 @@ ORANGE = (0.95, 0.55, 0.10, 1.0)
 
 @dataclass(frozen=True)
 class PouringConfig:
-    """The scene and its clocks.
+    """Parameters of the scene and its time steps.
 
     Attributes:
-        mug: what is poured into.
-        thermos: what is poured from.
-        ball: each of those that are poured.
-        num_balls: how many.
-        p_WStand: m, the point of the table's surface above which the mug nominally stands.
-        stand_height: m, of a stand under the mug: the wrist needs room under a thermos that pours low.
-        grip: m, from the flange to the thermos's axis, which lies across the flange's.
-        grip_height: m, from the thermos's tip down to where it is held.
-        plant_period: s, seconds of a plant step.
-        substeps: plant steps in a control step.
-        robot: which arm, or its name; one whose data have drives and a level posture.
+        mug: Dimensions of the mug.
+        thermos: Dimensions of the thermos.
+        ball: Parameters of a ball.
+        num_balls: Number of balls.
+        p_WStand: Point of the table's surface under the nominal mug [m].
+        stand_height: Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
+        grip: Distance of the thermos's axis from the flange, to whose axis it is perpendicular [m].
+        grip_height: Distance of the grip from the thermos's tip [m].
+        plant_period: Time step of the plant [s].
+        substeps: Plant steps per control step.
+        robot: The arm, or its name; its data need drives and a level posture.
     """
 
     mug: Vessel = MUG
@@ -73,7 +73,7 @@ class PouringConfig:
 
     @cached_property
     def arm(self) -> Robot:
-        """The arm's data."""
+        """Data of the arm."""
         robot = find_robot(self.robot)
         if robot.drives is None or robot.level_posture is None:
             raise InputError(f"robot {robot.name!r} can't pour: its data have no drives or no level posture")
@@ -81,30 +81,30 @@ class PouringConfig:
 
     @property
     def control_period(self) -> float:
-        """Seconds of a control step."""
+        """Time of a control step [s]."""
         return self.substeps * self.plant_period
 
     def stack(self) -> np.ndarray:
-        """Where the balls lie in the upright thermos, in the frame of its tip, (n, 3) [m].
+        """Return the positions of the balls in the upright thermos, in the frame of its tip, (n, 3) [m].
 
-        To the left and to the right in turn, as far as the thermos is wider than a ball, and as low as they touch.
+        They are at the left and right wall alternately, each as low as possible.
         """
         radius = self.ball.diameter / 2
-        aside = self.thermos.inner_diameter / 2 - radius
-        # Each touches the one before it, or the one before that, which lies under it.
-        step = max(np.sqrt(max(self.ball.diameter**2 - (2 * aside) ** 2, 0.0)), radius)
+        offset = self.thermos.inner_diameter / 2 - radius
+        # Each ball touches the previous one, or the one before that, which is below it.
+        step = max(np.sqrt(max(self.ball.diameter**2 - (2 * offset) ** 2, 0.0)), radius)
         i = np.arange(self.num_balls)
-        return np.stack([aside * (-1.0) ** i, 0.0 * i, -self.thermos.depth + radius + i * step], axis=1)
+        return np.stack([offset * (-1.0) ** i, 0.0 * i, -self.thermos.depth + radius + i * step], axis=1)
 
     @cached_property
     def X_WT(self) -> RigidTransform:
-        """The target frame: the tip of the mug where it nominally stands. All poses of the station are X_TP."""
+        """Pose of the target frame T: the tip of the nominal mug. All poses of the station are X_TP."""
         x, y, z = self.p_WStand
         return RigidTransform([x, y, z + self.stand_height + self.mug.height])
 
     @cached_property
     def X_FlangeP(self) -> RigidTransform:
-        """The thermos's tip P at the flange: its axis across the flange's, along x of a flange that was turned."""
+        """Pose of the thermos's tip P at the flange, with its axis perpendicular to the flange's."""
         turned = RigidTransform(RotationMatrix.MakeZRotation(self.arm.tool_turn), [0.0, 0.0, 0.0])
         R = RotationMatrix(np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]))
         return turned @ RigidTransform(R, [self.grip_height, 0.0, self.grip])
@@ -112,7 +112,7 @@ class PouringConfig:
 
 @register_station("pouring", world="pouring")
 class PouringStation(Station):
-    """An arm under Cartesian position control that holds a thermos with balls, and a mug on a table.
+    """Arm under Cartesian position control that holds a thermos with balls, and a mug on a table.
 
     .. pydrake_system::
 
@@ -133,15 +133,14 @@ class PouringStation(Station):
         - touched
         - query
 
-    ``desired_pose`` and ``pose`` are X_TP of the thermos's tip P as (6,) [x y z Rz Ry Rx], metres and radians; T is the
-    tip of the mug where it nominally stands. ``wrench`` (6,) is what the balls and the surroundings do to the thermos,
-    at P in the axes of T, without its own weight and inertia; ``contact_force`` (1,) is how hard the arm or the thermos
-    touches table or mug [N]; ``saturation`` (1,) is 1 while the controller can't follow.
+    ``desired_pose`` and ``pose`` are X_TP of the thermos's tip P, (6,) [x y z Rz Ry Rx] in meters and radians; T is the
+    tip of the nominal mug. ``wrench`` (6,) is the wrench of balls and surroundings on the thermos at P in the axes of
+    T, without the thermos's weight and inertia; ``contact_force`` (1,) is the contact force of arm or thermos with
+    table or mug [N]; ``saturation`` (1,) is 1 while the controller cannot follow.
 
-    Beside the ports of every station: ``tip_in_mug`` is the tip's pose in the actual mug's, (6,) [x y z] and a rotation
-    vector; ``balls_in_mug`` and ``balls_in_thermos`` are the balls' poses in the vessels' tip frames in the same form,
-    one after the other. ``collision`` is 1 while the arm or the thermos touches table or mug, ``touched`` from the
-    first such plant step on; both (1,).
+    ``tip_in_mug`` is the tip's pose in the actual mug's frame, (6,), position and rotation vector; ``balls_in_mug`` and
+    ``balls_in_thermos`` are the poses of all balls in the vessels' tip frames in the same form. ``collision`` is 1
+    while the arm or the thermos touches table or mug, ``touched`` from the first such plant step on; both (1,).
     """
 
     wraps_angles = True
@@ -152,7 +151,7 @@ class PouringStation(Station):
         self.config = config
         self.control_period = config.control_period
         # Sampled output ports would make the plant's step an unrestricted update. Drake does those before the discrete
-        # updates of the same instant, and whatever samples a pose there would see it one plant step late.
+        # updates of the same instant, and a system that samples a pose would get it one plant step late.
         plant_config = MultibodyPlantConfig(
             time_step=config.plant_period,
             contact_model="point",
@@ -189,7 +188,7 @@ class PouringStation(Station):
             speed_limits=SPEED_LIMITS,
         )
         builder.AddNamedSystem("controller", controller)
-        # The drives want a velocity too: without it their damping holds the arm back by centimetres.
+        # Without a desired velocity the drives' damping delays the arm by centimeters.
         num_joints = config.arm.num_joints
         drives = StateInterpolatorWithDiscreteDerivative(
             num_joints, config.control_period, suppress_initial_transient=True
@@ -206,7 +205,7 @@ class PouringStation(Station):
         sensor = WrenchSensor(plant, wrist, [thermos], self._tip, axes, config.control_period, WRENCH_TIME_CONSTANT)
         builder.AddNamedSystem("wrench_sensor", sensor)
         sensor.connect(builder, plant)
-        seen = [
+        relative_poses = [
             ("tip_in_mug", RelativePoses(plant, [thermos], self._mug)),
             ("balls_in_mug", RelativePoses(plant, self._balls, self._mug)),
             ("balls_in_thermos", RelativePoses(plant, self._balls, thermos)),
@@ -228,7 +227,7 @@ class PouringStation(Station):
             saturation=controller.get_stuck_output_port(),
             command_timed_out=controller.get_command_timed_out_output_port(),
         )
-        for name, system in seen:
+        for name, system in relative_poses:
             builder.AddNamedSystem(name, system)
             builder.Connect(plant.get_body_poses_output_port(), system.get_body_poses_input_port())
             builder.ExportOutput(system.get_relative_poses_output_port(), name)
@@ -238,17 +237,17 @@ class PouringStation(Station):
         builder.BuildInto(self)
 
     def solve(self, pose: np.ndarray, posture: np.ndarray) -> np.ndarray:
-        """The joint positions (n,) nearest to `posture`, (n,), with the tip at `pose`, (6,)."""
+        """Return the joint positions (n,) closest to `posture`, (n,), with the tip at `pose`, (6,)."""
         X_TP = pose_to_transform(pose)
         return solve_inverse_kinematics(self._controller_plant, self._target, self._controller_tip, X_TP, posture)
 
     def set_mug(self, root_context: Context, X_TMug: RigidTransform) -> None:
-        """Moves the mug: its tip is then at X_TMug."""
+        """Move the mug so that its tip is at X_TMug."""
         context = self.plant.GetMyMutableContextFromRoot(root_context)
         self._mount.SetPoseInParentFrame(context, self.config.X_WT @ X_TMug)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
+        """Put the arm at rest with the tip at `pose`, (6,), and the balls into the thermos, which must be upright."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositions(plant_context, self.arm, self.solve(check_pose(pose, POSE_SIZE), self.posture))
         self.plant.SetVelocities(plant_context, self.arm, np.zeros(self.config.arm.num_joints))
@@ -258,13 +257,13 @@ class PouringStation(Station):
 
 
 def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[ModelInstanceIndex, Frame, WeldJoint]:
-    """Adds the arm at the world's origin, a hand, and the thermos in it; returns the arm, the tip and the wrist."""
+    """Add the arm at the world's origin, a hand and the thermos; return arm, tip and wrist."""
     arm = add_robot(plant, config.arm)
     thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
     wrist = plant.WeldFrames(arm.flange, thermos.body_frame(), config.X_FlangeP)
     _add_hand(plant, thermos, config)
     for model in (arm.model, thermos.model_instance()):
-        # Weight is compensated by leaving it out, as a position-controlled arm does by its integrators.
+        # The integrators of a position-controlled arm compensate gravity.
         plant.set_gravity_enabled(model, False)
     if config.arm.drives is not None:
         add_drives(arm.actuators, config.arm.drives)
@@ -272,7 +271,7 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
 
 
 def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) -> None:
-    """A stub from the flange to the thermos's wall; it counts as the thermos where something touches it."""
+    """Add a cylinder from the flange to the thermos's wall, whose contact counts as the thermos's."""
     length = config.grip - config.thermos.outer_radius
     X_PFlange = config.X_FlangeP.inverse()
     X_PG = X_PFlange @ RigidTransform([0.0, 0.0, length / 2])
@@ -280,7 +279,7 @@ def _add_hand(plant: MultibodyPlant, thermos: RigidBody, config: PouringConfig) 
 
 
 def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> None:
-    """It moves with the mug, and touching it is touching the mug."""
+    """Add the stand under the mug, which moves with it, and whose contact counts as the mug's."""
     if config.stand_height > 0:
         X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
         add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)
@@ -288,13 +287,17 @@ def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> 
 
 def _add_table(plant: MultibodyPlant, config: PouringConfig) -> None:
     x, y, z = config.p_WStand
-    # It begins where the arm's foot ends.
+    # The table begins next to the arm's base.
     X_WG = RigidTransform([x + 0.1, y - 0.1, z - 0.05])
     add_shape(plant, plant.world_body(), "table", X_WG, Box(1.0, 1.6, 0.1), WOOD)
 
 
 def make_mug(inner_diameter: float, depth: float, ball: Ball) -> Vessel:
-    """A mug of these sizes, if both balls go in."""
+    """Return a mug with these dimensions [m].
+
+    Raises:
+        InputError: If a ball does not fit, or the arm cannot reach.
+    """
     if not ball.diameter * 1.25 <= inner_diameter <= 0.2 or not ball.diameter * 1.5 <= depth <= 0.25:
         raise InputError(
             f"A mug of {inner_diameter} m inside and {depth} m deep doesn't take the balls or the arm; "

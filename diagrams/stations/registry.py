@@ -1,4 +1,4 @@
-"""Stations by name: what each works on, and how it is made."""
+"""Stations by name, for `station=`."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StationKind:
-    """A kind of station.
+    """Kind of station.
 
     Attributes:
-        name: what `station=` calls it.
-        build: from a world, and its options by name, to a station.
-        world: the kind of world that it works on: "workcell" for whoever puts a workpiece into a fixture.
-        options: a model of further options of the environment; none unless given.
-        words: what it is, in a line.
-        simulated: whether it is a simulation, which a reset can put to any state.
+        name: Name for `station=`.
+        build: Function from a world and options by name to a station.
+        world: Kind of world that it works on, such as "workcell" for a workpiece and a fixture.
+        options: Model of its environment options; None if it has none.
+        description: Summary in one line.
+        is_simulated: True for a simulation, whose state a reset can set.
     """
 
     name: str
     build: Callable[..., Station]
     world: str
     options: type[Options] | None
-    words: str
+    description: str
     is_simulated: bool = True
 
 
@@ -45,21 +45,23 @@ STATIONS: Registry[StationKind] = Registry(
 def register_station(
     name: str, *, world: str, options: type[Options] | None = None, is_simulated: bool = True
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
-    """A decorator that adds a station; it decorates a class or a function that takes a world and its options.
+    """Return a decorator that registers a class or function, which builds a station from a world and options.
 
     Args:
-        name: what `station=` calls it.
-        world, options, simulated: see `StationKind`.
+        name: Name for `station=`.
+        world: Kind of world that it works on.
+        options: Model of its environment options.
+        is_simulated: True for a simulation.
     """
 
     def add(build: Any) -> Any:
-        words = str(build.__doc__ or "").strip().splitlines()
-        STATIONS.register(name, StationKind(name, build, world, options, words[0] if words else "", is_simulated))
+        lines = str(build.__doc__ or "").strip().splitlines()
+        STATIONS.register(name, StationKind(name, build, world, options, lines[0] if lines else "", is_simulated))
         return build
 
     return add
 
 
 def stations_for(world: str) -> list[str]:
-    """The names of the stations that work on such a world."""
+    """Return the names of the stations that work on a kind of world."""
     return [name for name in STATIONS.names() if STATIONS.get(name).world == world]

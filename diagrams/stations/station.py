@@ -1,30 +1,30 @@
-"""What every station has in common: its ports, its numbers, and how it is placed at a reset.
+"""Base class of all stations, their ports, and the parts that they share.
 
-A *station* is a diagram with the robot, its controller and the objects of a task. Whatever the robot, it has
+A *station* is a diagram with a robot, its controller and the objects of a task. All stations have these ports:
 
 =================  =====  ==========================================================================================
 input              size   meaning
 =================  =====  ==========================================================================================
-`desired_pose`     6      where the tool centre P shall be: X_TP as [x y z Rz Ry Rx], metres and radians
-`command_time`     1      optional: when `desired_pose` was given [s]; where it stops, the last safe pose is held
+`desired_pose`     6      desired pose X_TP of the tool center P, [x y z Rz Ry Rx] in meters and radians
+`command_time`     1      optional: time of `desired_pose` [s]; if it stops, the last safe pose is held
 =================  =====  ==========================================================================================
 
 =================  =====  ==========================================================================================
 output             size   meaning
 =================  =====  ==========================================================================================
-`pose`             6      where P is: X_TP, in the same coordinates
-`wrench`           6      of the surroundings on the tool, at P, in the axes of T: [fx fy fz tx ty tz], N and Nm,
-                          without the tool's own weight and inertia, low-pass filtered
-`contact_force`    1      size of the force with which the impedance pushes [N]: what a collision is judged by
+`pose`             6      measured pose X_TP, in the same coordinates
+`wrench`           6      wrench of the surroundings on the tool at P in the axes of T, [fx fy fz tx ty tz],
+                          N and Nm, without the tool's weight and inertia, low-pass filtered
+`contact_force`    1      magnitude of the impedance's force [N], by which collisions are detected
 `saturation`       1      1 while the controller is at a limit of force or torque, otherwise 0
-`command_timed_out`          1      1 while commands have stopped, or are no numbers, and the last safe pose is held
+`command_timed_out`  1    1 while commands are missing or not finite, and the last safe pose is held
 =================  =====  ==========================================================================================
 
-A simulated station also has `query` (the scene graph's) and `body_poses` (the plant's): for cameras, and for judging
-what a robot can't see of itself.
+A simulated station also has `query` (of the scene graph) and `body_poses` (of the plant), for cameras, rewards and
+terminations.
 
-The orientation of X_TP is Rz(a) Ry(b) Rx(c), T being the target frame of the workcell: the pose is all zeros when the
-task is done. T lies still in the world, where the *nominal* fixture wants it: a station does not know of offsets.
+The orientation of X_TP is Rz(a) Ry(b) Rx(c). T is the target frame of the workcell: the pose is zero when the task is
+done. T is fixed in the world by the *nominal* fixture; offsets of the fixture do not move it.
 """
 
 from __future__ import annotations
@@ -52,20 +52,20 @@ Robot = TypeVar("Robot")
 
 INPUTS = ("desired_pose", "command_time")
 OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
-"""The ports of every station."""
+"""Output ports of every station; `INPUTS` are the input ports."""
 
 POSE_SIZE = 6
 CONTROL_PERIOD = 4 * round_period(0.005)  # [s]
-# `python -m research.benchmarks time_step` shows by how much a longer and a shorter one are wrong, and what they cost.
+# Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # [s]
 MAX_HALVINGS = 7
 
 
 class ContactOptions(Options):
-    """Of a station whose plant simulates an insertion's contact."""
+    """Options of a station whose plant simulates the contact of an insertion."""
 
     time_step: Number | None = Field(
-        None, gt=0, description="of the plant [s]: the control period, or half, a quarter, an eighth … of it"
+        None, gt=0, description="time step of the plant [s]: the control period, or half, a quarter, an eighth … of it"
     )
 
     @field_validator("time_step")
@@ -79,17 +79,23 @@ class ContactOptions(Options):
                 f"it is the control period, {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} "
                 "times halved"
             )
-        # Whose multiples are exact: see `round_period`.
+        # Its multiples are exact: see `round_period`.
         return CONTROL_PERIOD / 2 ** round(halvings)
 
 
 @dataclass(frozen=True)
 class Impedance:
-    """How the tool centre gives way, along and about the axes of T: [x y z Rz Ry Rx]."""
+    """Impedance at the tool center along and about the axes of T, [x y z Rz Ry Rx].
 
-    stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)  # [N/m], [Nm/rad]
+    Attributes:
+        stiffness: Stiffness [N/m], [Nm/rad].
+        damping_ratio: Damping ratio of every mode.
+        limits: Largest forces [N] and torques [Nm].
+    """
+
+    stiffness: tuple[float, ...] = (1500.0, 1500.0, 1500.0, 30.0, 30.0, 30.0)
     damping_ratio: float = 1.0
-    limits: tuple[float, ...] = (40.0, 40.0, 40.0, 3.0, 3.0, 3.0)  # [N], [Nm]
+    limits: tuple[float, ...] = (40.0, 40.0, 40.0, 3.0, 3.0, 3.0)
 
     def __post_init__(self) -> None:
         for name in ("stiffness", "limits"):
@@ -101,83 +107,91 @@ class Impedance:
 
 
 class Station(Diagram):
-    """A diagram with the ports above."""
+    """Diagram with the ports of every station.
+
+    Attributes:
+        plant: The simulated plant.
+        scene_graph: Its scene graph.
+        control_period: Time between commands [s].
+        wraps_angles: True if the pose's angles are in (−π, π] and jump there; those of a gantry are unbounded.
+    """
 
     plant: MultibodyPlant
     scene_graph: SceneGraph
     control_period: float = CONTROL_PERIOD
-    """Seconds between commands."""
     wraps_angles: bool = False
-    """Whether its pose's angles are in (−π, π] and jump there, as a body's do; rails' are how far they turned."""
 
     @property
     def nominal_period(self) -> float:
-        """Seconds between commands where its clock is right."""
+        """Time between commands with an undisturbed clock [s]."""
         return self.control_period
 
     @property
     def pose_size(self) -> int:
-        """O, numbers in a pose."""
+        """Number of coordinates of a pose, O."""
         return self.get_pose_output_port().size()
 
     @property
     def wrench_size(self) -> int:
-        """W, numbers in a wrench."""
+        """Number of coordinates of a wrench, W."""
         return self.get_wrench_output_port().size()
 
     def get_desired_pose_input_port(self):
-        """Where the tool centre shall be, (6,)."""
+        """Return the port of the desired pose, (O,)."""
         return self.GetInputPort("desired_pose")
 
     def get_command_time_input_port(self):
-        """When the desired pose was given, (1,) [s]; optional."""
+        """Return the port of the time of the desired pose, (1,) [s]; optional."""
         return self.GetInputPort("command_time")
 
     def get_pose_output_port(self):
-        """Where the tool centre is, (6,)."""
+        """Return the port of the measured pose, (O,)."""
         return self.GetOutputPort("pose")
 
     def get_wrench_output_port(self):
-        """The wrench of the surroundings on the tool, (6,)."""
+        """Return the port of the wrench of the surroundings on the tool, (W,)."""
         return self.GetOutputPort("wrench")
 
     def get_contact_force_output_port(self):
-        """The force with which the impedance pushes, (1,) [N]."""
+        """Return the port of the magnitude of the impedance's force, (1,) [N]."""
         return self.GetOutputPort("contact_force")
 
     def get_saturation_output_port(self):
-        """1 while the controller is at a limit, (1,)."""
+        """Return the port that is 1 while the controller is at a limit, (1,)."""
         return self.GetOutputPort("saturation")
 
     def get_command_timed_out_output_port(self):
-        """1 while the last safe pose is held, (1,)."""
+        """Return the port that is 1 while the last safe pose is held, (1,)."""
         return self.GetOutputPort("command_timed_out")
 
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Puts the robot at rest with its tool centre at `pose`, (6,); `context` is the root context.
+        """Put the robot at rest with its tool center at `pose`, (O,); `context` is the root context.
 
         Raises:
-            InputError: if these are not that many finite numbers (see `check_pose`).
+            InputError: If `pose` has another shape or is not finite.
         """
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Multiplies all friction and all compliance of the contact by a factor, until the next reset.
+        """Multiply friction and modulus of all contacts until the next reset.
 
-        `context` is the root context; it is Drake's contact here, and another engine's station overrides it.
+        Args:
+            context: The root context.
+            friction: Factor of the friction.
+            modulus: Factor of the hydroelastic modulus, or of another engine's stiffness.
         """
         scale_contact(self.plant, self.scene_graph, context, friction, modulus)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
-        """Draws what a reset draws of the station itself, and says so; `context` is the root context."""
+        """Sample the station's own disturbances at a reset, and return them by name; `context` is the root context."""
         return {}
 
 
 def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
-    """A pose (size,) that a robot can be put to: Drake would end the process for one that is not finite.
+    """Return a pose as an array (size,), which must be finite: Drake would abort the process otherwise.
 
     Raises:
-        InputError: if it is not so many finite numbers.
+        InputError: If it has another shape or is not finite.
     """
     try:
         numbers = np.asarray(pose, dtype=float)
@@ -191,7 +205,7 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
 def scale_contact(
     plant: MultibodyPlant, scene_graph: SceneGraph, context: Context, friction: float, modulus: float
 ) -> None:
-    """Multiplies friction and hydroelastic modulus of all of a plant's surfaces, in the root context alone."""
+    """Multiply friction and hydroelastic modulus of all surfaces of a plant, in the root context only."""
     own = scene_graph.GetMyMutableContextFromRoot(context)
     inspector = scene_graph.model_inspector()
     for geometry in inspector.GetAllGeometryIds(Role.kProximity):
@@ -207,7 +221,11 @@ def scale_contact(
 
 
 def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:
-    """A plant whose contact is that of the connector's files: polygons on compliant primitives, quietly regularized."""
+    """Add a plant with hydroelastic contact of compliant primitives.
+
+    Raises:
+        InputError: If the time step is not positive.
+    """
     if not time_step > 0.0:
         raise InputError(f"the plant's time step must be positive, not {time_step} s")
     config = MultibodyPlantConfig(
@@ -216,7 +234,7 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
         discrete_contact_approximation="lagged",
         contact_surface_representation="polygon",
         # A plant with sampled ports steps by an unrestricted update, which Drake runs *before* the discrete updates of
-        # the same instant: a new command would then reach it one step late.
+        # the same instant: a new command would arrive one step late.
         use_sampled_output_ports=False,
     )
     return AddMultibodyPlant(config, builder)
@@ -225,7 +243,7 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
 def add_workcell_plant(
     builder: DiagramBuilder, workcell: Workcell, time_step: float, add_robot: Callable[[MultibodyPlant], Robot]
 ) -> tuple[MultibodyPlant, SceneGraph, Robot]:
-    """A finalized plant with the workcell's fixture, and the robot that `add_robot` adds with the workpiece."""
+    """Add a finalized plant with the workcell's fixture, and the robot and workpiece that `add_robot` adds."""
     plant, scene_graph = add_contact_plant(builder, time_step)
     workcell.add_fixture(plant)
     robot = add_robot(plant)
@@ -243,7 +261,7 @@ def add_wrench_sensor(
     tool_centre: Frame,
     time_constant: float,
 ) -> OutputPort:
-    """Adds a sensor at the wrist, behind which `tool` hangs; returns the wrench as a station exports it."""
+    """Add a sensor at the wrist, to which `tool` is attached; return the wrench as a station exports it."""
     axes = workcell.X_WT.rotation()
     sensor = WrenchSensor(plant, wrist, tool, tool_centre, axes, plant.time_step(), time_constant)
     builder.AddNamedSystem("wrench_sensor", sensor)
@@ -252,7 +270,7 @@ def add_wrench_sensor(
 
 
 def to_wrench_order(values: Sequence[float]) -> np.ndarray:
-    """What is ordered as a pose is, [x y z Rz Ry Rx], as a wrench is: [x y z Rx Ry Rz]."""
+    """Reorder values from a pose's order, [x y z Rz Ry Rx], to a wrench's, [x y z Rx Ry Rz]."""
     return np.array(values)[[0, 1, 2, 5, 4, 3]]
 
 
@@ -267,7 +285,7 @@ def export_station_ports(
     saturation: OutputPort,
     command_timed_out: OutputPort,
 ) -> None:
-    """Exports the ports of the table above."""
+    """Export the ports of every station."""
     builder.ExportInput(desired_pose, "desired_pose")
     builder.ExportInput(command_time, "command_time")
     builder.ExportOutput(pose, "pose")
@@ -278,6 +296,6 @@ def export_station_ports(
 
 
 def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-    """Exports what only a simulation knows."""
+    """Export the ports of simulated stations."""
     builder.ExportOutput(scene_graph.get_query_output_port(), "query")
     builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")

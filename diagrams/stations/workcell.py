@@ -1,4 +1,4 @@
-"""What a station works on: the fixture that stands in the world and the workpiece that the robot holds."""
+"""Interface of a workcell: the fixture in the world and the workpiece in the robot's tool."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from guiderail.models.objects.surfaces import Surface
 
 
 class Workcell(Protocol):
-    """A task's objects. A station calls each method once, in this order, while it is built.
+    """Objects of a task. A station calls each method once, in this order, while it is built.
 
-    The target frame T is where the tool centre P is when the task is done; every pose that enters or leaves a station
-    is X_TP. Only the nominal world is known here: what a task draws anew for an episode is moved in the context.
+    The tool center P is at the target frame T when the task is done; all poses of a station are X_TP. Objects are added
+    at their nominal poses; offsets of an episode are set in the context.
     """
 
     @property
     def X_WT(self) -> RigidTransform:
-        """The target frame in the world."""
+        """Pose of the target frame in the world."""
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
-        """Adds what stands in the world."""
+        """Add the fixture."""
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
-        """Adds what the robot holds, fixed to the tool centre, and returns its body."""
+        """Add the workpiece, fixed to the tool center, and return its body."""
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        """Excludes pairs of geometry that can't or mustn't touch; called once the plant is finalized."""
+        """Exclude contact between pairs of geometries, after the plant is finalized."""
 
 
 @runtime_checkable
 class ConvexWorkcell(Protocol):
-    """What a workcell also has whose contact another engine than Drake can calculate."""
+    """Interface of a workcell whose contact other engines than Drake can compute too."""
 
     def fixture_surfaces(self) -> list[Surface]:
-        """What of the fixture touches, in its body's frame."""
+        """Return the contact surfaces of the fixture, in its body's frame."""
 
     def workpiece_surfaces(self) -> list[Surface]:
-        """What of the workpiece touches, in its body's frame."""
+        """Return the contact surfaces of the workpiece, in its body's frame."""
 
 
 def movable_frame(plant: MultibodyPlant, name: str) -> FixedOffsetFrame:
-    """A frame whose pose in its parent a reset may change in the context, and whatever is welded to it follows."""
+    """Return a frame whose pose in its parent can be set in the context; bodies welded to it follow."""
     frame = plant.GetFrameByName(name)
     assert isinstance(frame, FixedOffsetFrame)
     return frame
@@ -59,16 +59,24 @@ def exclude_contacts(
     workpiece: str,
     pairs: Iterable[tuple[Iterable[str], Iterable[str]]],
 ) -> None:
-    """Excludes contact between surfaces of two bodies: each pair names some of the fixture's, some of the workpiece's.
+    """Exclude contact between surfaces of fixture and workpiece.
 
-    `drake:collision_filter_group` inside an SDF file can't do this: it filters whole bodies.
+    `drake:collision_filter_group` in an SDF file filters whole bodies only.
+
+    Args:
+        plant: Finalized plant.
+        scene_graph: Its scene graph.
+        fixture: Name of the fixture's body.
+        workpiece: Name of the workpiece's body.
+        pairs: Pairs of surface names, of the fixture and of the workpiece.
     """
-    of_fixture, of_workpiece = (_geometries(plant, scene_graph, body) for body in (fixture, workpiece))
+    fixture_ids, workpiece_ids = (_geometries(plant, scene_graph, body) for body in (fixture, workpiece))
     manager = scene_graph.collision_filter_manager()
     for first, second in pairs:
         manager.Apply(
             CollisionFilterDeclaration().ExcludeBetween(
-                GeometrySet([of_fixture[name] for name in first]), GeometrySet([of_workpiece[name] for name in second])
+                GeometrySet([fixture_ids[name] for name in first]),
+                GeometrySet([workpiece_ids[name] for name in second]),
             )
         )
 

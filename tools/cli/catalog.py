@@ -130,7 +130,7 @@ def _guidance(name: str) -> dict[str, Any]:
 def _station(name: str) -> dict[str, Any]:
     kind = STATIONS.get(name)
     return {
-        "is": kind.words,
+        "is": kind.description,
         "world": kind.world,
         "inputs": list(STATION_INPUTS),
         "outputs": list(STATION_OUTPUTS),

@@ -1,0 +1,1 @@
+"""Policies on a robot: deployment, evaluation, training, simulated driver and safety monitor."""

@@ -109,8 +109,8 @@ class RobotConnection:
             raise InputError(f"only the {DEFAULT_ROBOT} has a simulated driver, not {self.robot}")
         if self.sim and self.lcm_url:
             raise InputError(
-                "a simulated driver has a bus of its own, so that no real driver receives its messages: leave --lcm-url "
-                "out"
+                "a simulated driver has a bus of its own, so that no real driver receives its messages: leave "
+                "--lcm-url out"
             )
         check_rate(self.rate)
 

@@ -49,7 +49,8 @@ def evaluate_on_robot(
 ) -> Mapping[str, Any]:
     """Run episodes of a policy, and write a row for each.
 
-    With a simulated driver they are those of `guiderail evaluate`: held-out conditions, and the run's own hidden offset.
+    With a simulated driver they are those of `guiderail evaluate` in simulation: held-out conditions, and the run's own
+    hidden offset.
 
     Args:
         run: Run folder.

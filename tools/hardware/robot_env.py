@@ -47,12 +47,12 @@ class RobotStoppedError(Exception):
 class RobotEnv(GuidedEnv):
     """Environment of a `TaskDiagram` with a hardware station.
 
-    A reset moves the arm: back along its path, and slowly to the start. If the arm is stopped, in an episode or a reset,
-    it comes to rest, `confirm_resume` is called, and the motion continues from where the arm is. An episode that was
-    stopped is truncated with `termination` "stopped", and `info["stopped"]` has the reason.
+    A reset moves the arm: back along its path, and slowly to the start. If the arm is stopped, in an episode or a
+    reset, it comes to rest, `confirm_resume` is called, and the motion continues from where the arm is. An episode that
+    was stopped is truncated with `termination` "stopped", and `info["stopped"]` has the reason.
 
-    A success by pose is confirmed by a pull on the workpiece; if it gives way, `termination` is "did_not_hold". Episodes
-    that end as "stopped" or "did_not_hold" must not be learned from.
+    A success by pose is confirmed by a pull on the workpiece; if it gives way, `termination` is "did_not_hold".
+    Episodes that end as "stopped" or "did_not_hold" must not be learned from.
 
     Attributes:
         fault: Fault that ended the last episode, or NONE.
@@ -277,8 +277,8 @@ class RobotEnv(GuidedEnv):
         if not is_near(self.pose, self._start):
             distance, angle = pose_distance(self.pose, self._start)
             raise InputError(
-                f"the arm did not reach the start: {distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are left; "
-                "is something in its way?"
+                f"the arm did not reach the start: {distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are "
+                "left; is something in its way?"
             )
         gc.collect()
 

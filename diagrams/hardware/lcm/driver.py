@@ -254,7 +254,7 @@ class IiwaDriver(LcmDriver):
 class PandaDriver(LcmDriver):
     """Drake's driver of a Franka Emika Panda, in torque mode.
 
-    Franka's external torque is that of the arm on the surroundings. The reflex limits are those of libfranka's examples.
+    Franka's external torque is that of the arm on the surroundings. Reflex limits are those of libfranka's examples.
     """
 
     name = "panda"

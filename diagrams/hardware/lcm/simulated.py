@@ -91,8 +91,8 @@ class SimulatedIiwa(Diagram):
     def simulator(self) -> Simulator:
         """Return a simulator of this diagram, not initialized.
 
-        The only continuous state is the driver's low-pass filter. An integrator computes the contact, the most expensive
-        part, for each evaluation of the filter's derivative: one evaluation a step is enough.
+        The only continuous state is the driver's low-pass filter. An integrator computes the contact, the most
+        expensive part, for each evaluation of the filter's derivative: one evaluation a step is enough.
         """
         simulator = Simulator(self)
         ResetIntegratorFromFlags(simulator, "explicit_euler", self.plant.time_step())
