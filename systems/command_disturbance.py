@@ -58,18 +58,18 @@ class CommandDisturbance(LeafSystem):
         self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
         self._count = self.DeclareDiscreteState(1)
         self._is_lost = self.DeclareDiscreteState(1)
-        self._last = self.DeclareDiscreteState(size)
+        self._last_delivered = self.DeclareDiscreteState(size)
         self._delay_line = self.DeclareDiscreteState(delay * size) if delay else None  # oldest command first
         self._command_port = self.DeclareVectorInputPort("command", size)
         self._pose_port = self.DeclareVectorInputPort("pose", size)
-        state = {self.discrete_state_ticket(index) for index in (self._is_lost, self._last)}
+        state = {self.discrete_state_ticket(index) for index in (self._is_lost, self._last_delivered)}
         source = (
             self._command_port.ticket() if self._delay_line is None else self.discrete_state_ticket(self._delay_line)
         )
         self._delivered_command_port = self.DeclareVectorOutputPort(
             "delivered_command", size, self._calc_delivered_command, prerequisites_of_calc=state | {source}
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_command_input_port(self) -> InputPort:
@@ -88,11 +88,11 @@ class CommandDisturbance(LeafSystem):
         """Set the seed of the losses; `context` is this system's."""
         context.get_mutable_numeric_parameter(self._seed).SetFromVector([float(seed)])
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         pose = self._pose_port.Eval(context)
         discrete_state.set_value(self._count, [0.0])
         discrete_state.set_value(self._is_lost, [0.0])
-        discrete_state.set_value(self._last, pose)
+        discrete_state.set_value(self._last_delivered, pose)
         if self._delay_line is not None:
             discrete_state.set_value(self._delay_line, np.tile(pose, self._delay))
         return EventStatus.Succeeded()
@@ -100,7 +100,7 @@ class CommandDisturbance(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = context.get_discrete_state(self._count).value()[0] + 1.0
         discrete_state.set_value(self._count, [count])
-        discrete_state.set_value(self._last, self._eval_delivered(context))
+        discrete_state.set_value(self._last_delivered, self._eval_delivered(context))
         if self._delay_line is not None:
             command = self._command_port.Eval(context)
             line = context.get_discrete_state(self._delay_line).value()
@@ -112,7 +112,7 @@ class CommandDisturbance(LeafSystem):
         return EventStatus.Succeeded()
 
     def _eval_delivered(self, context: Context) -> np.ndarray:
-        last = context.get_discrete_state(self._last).value()
+        last = context.get_discrete_state(self._last_delivered).value()
         if context.get_discrete_state(self._is_lost).value()[0]:
             return last
         if self._delay_line is None:

@@ -12,6 +12,7 @@ from pydrake.systems.framework import (
 )
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support.sampling import check_period
 
 
 class GripperCommand(LeafSystem):
@@ -50,8 +51,7 @@ class GripperCommand(LeafSystem):
             raise InputError("a gripper needs a lower limit, an upper limit and an opening for each of its joints")
         if not ((self._lower <= opening) & (opening <= self._upper)).all():
             raise InputError(f"a gripper's opening must be within its joints' limits, not {opening}")
-        if not period > 0.0:
-            raise InputError(f"a gripper command's period must be positive, not {period} s")
+        check_period(period)
         num_joints = len(opening)
         self._position_port = self.DeclareVectorInputPort("position", num_joints)
         self._last_position = self.DeclareDiscreteState(opening)

@@ -68,14 +68,14 @@ class SensorDisturbance(LeafSystem):
         self._disturbed_measurement_port = self.DeclareVectorOutputPort(
             "disturbed_measurement",
             size,
-            self._calc_disturbed,
+            self._calc_disturbed_measurement,
             prerequisites_of_calc={
                 source,
                 self.discrete_state_ticket(self._noise_sample),
                 self.all_parameters_ticket(),
             },
         )
-        self.DeclareInitializationDiscreteUpdateEvent(self._start)
+        self.DeclareInitializationDiscreteUpdateEvent(self._reset)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
 
     def get_measurement_input_port(self) -> InputPort:
@@ -91,7 +91,7 @@ class SensorDisturbance(LeafSystem):
         for index, values in ((self._scale, scale), (self._bias, bias), (self._seed, [seed])):
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 
-    def _start(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         size = len(self._noise)
         discrete_state.set_value(self._count, np.zeros(1))
         discrete_state.set_value(self._noise_sample, np.zeros(size))
@@ -112,7 +112,7 @@ class SensorDisturbance(LeafSystem):
             discrete_state.set_value(self._delay_line, np.concatenate([line[len(newest) :], newest]))
         return EventStatus.Succeeded()
 
-    def _calc_disturbed(self, context: Context, output: BasicVector) -> None:
+    def _calc_disturbed_measurement(self, context: Context, output: BasicVector) -> None:
         if self._delay_line is None:
             measured = self._measurement_port.Eval(context)
         else:
