@@ -182,7 +182,9 @@ def _learned(env: Any) -> PolicyFn:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         given = {"guidance": "skgrl"}
-        start_or_resume("NarrowPassage", out, environment=given, preset="tqc_cheap_correlated", episodes=LEARNING_EPISODES, seed=0)
+        start_or_resume(
+            "NarrowPassage", out, environment=given, preset="tqc_cheap_correlated", episodes=LEARNING_EPISODES, seed=0
+        )
         return Policy.load(out)
 
 

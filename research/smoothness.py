@@ -18,7 +18,7 @@ import pandas as pd
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
-from guiderail.diagrams.tasks.insertion import FARTHEST
+from guiderail.diagrams.tasks.insertion import MAX_GIVEN_OFFSET
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.insertion import HISTORY_VARIANCE
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
@@ -90,7 +90,7 @@ TASK = "BncConnector"
 ACTION_REPEAT = 10  # control steps of an action when the connector is learned
 SLOW = 25  # control steps of an action that is as slow as a low-pass filter of 1 Hz
 PLACES = ("free", "connector")
-OUT_OF_REACH = (FARTHEST, FARTHEST)  # jack offset for motions in free space [m]
+OUT_OF_REACH = (MAX_GIVEN_OFFSET, MAX_GIVEN_OFFSET)  # jack offset for motions in free space [m]
 ALONE = "demonstration alone"
 OUTPUTS = {"all": (0, 1, 2, 3, 4, 5), "xy": (0, 1)}
 

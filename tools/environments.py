@@ -1,4 +1,4 @@
-"""Tasks by name: the one place where tools ask which there are and what they take."""
+"""Environments by name: known tasks, their options, imports that register them, and `make_environment`."""
 
 import hashlib
 import inspect
@@ -22,25 +22,25 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import parse_yaml
 
-_IMPORTED: dict[Path, bytes] = {}
-"""What each file said when it was imported."""
-IMPORTED = ", or --import the file that registers it"  # how a name is found that nothing installed has
+_IMPORTED_FILES: dict[Path, bytes] = {}  # content of each file when it was imported
+IMPORT_HINT = ", or --import the file that registers it"
 
 
 def known_tasks() -> list[str]:
-    """The tasks that there are: those that are declared, and environments that somebody registered as guiderail's."""
+    """Return the names of all registered tasks and of all environments in the namespace "guiderail"."""
     registered = (spec.name for spec in gymnasium.registry.values() if spec.namespace == "guiderail")
     return sorted({*TASKS.names(), *registered})
 
 
 def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
-    """Imports modules or files (.py) that register tasks, guidance, stations or learners; returns how to name them.
+    """Import modules, files (.py) or task folders that register tasks, guidance, stations or learners.
 
-    A task folder, which `guiderail onboard` makes, counts as one. A file or a folder is named by its absolute path, so
-    that whoever goes on with a run elsewhere on the machine finds it.
+    Returns:
+        Names to import them again; files and folders by their absolute paths, so that a run can be resumed from another
+        folder.
 
     Raises:
-        InputError: if there is no such module or file, or it can't be imported.
+        InputError: If there is no such module, file or folder, or it cannot be imported.
     """
     names = []
     for module in modules:
@@ -51,17 +51,18 @@ def import_modules(modules: Iterable[str]) -> tuple[str, ...]:
         elif path.suffix == ".py" and path.is_file():
             names.append(_import_file(path))
         elif _is_module(module):
-            names.append(_imported(module, partial(import_module, module)).__name__)
+            names.append(_import_or_refuse(module, partial(import_module, module)).__name__)
         else:
-            raise InputError(f"--import takes a module or a file (.py), and there is none for {brief(module)}")
+            kind = "file or task folder" if path.is_absolute() or len(path.parts) > 1 else "module, file or task folder"
+            raise InputError(f"there is no {kind} {module} to import: restore it, or give another --import")
     return tuple(names)
 
 
 def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
-    """A task's name for what a person typed, its own name or a task folder's path, and what a run has to import for it.
+    """Return the task of a name or of a task folder's path, and what a run has to import for it.
 
     Raises:
-        InputError: if something in the folder makes no sense.
+        InputError: If the folder's task is not valid.
     """
     if typed in TASKS.names() or not is_task_folder(typed):
         return typed, ()
@@ -70,27 +71,27 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
 
 
 def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[str]) -> str:
-    """A digest of the files that a task is made of, as they are now; empty where there are none but installed ones.
+    """Return a digest of the files that a task consists of; empty if there are only installed ones.
 
     Args:
-        task: its name.
-        environment: its options: of those that name a file, such as demonstrations, the file counts.
-        imports: what registers it, as `import_modules` names it: of files, what they say counts.
+        task: Name of the task.
+        environment: Options of its environment; a file that one names, such as demonstrations, is included.
+        imports: Imports that register the task, as `import_modules` returns them; files are included.
 
     Raises:
-        InputError: if it is of a folder that is none any more, or a file cannot be read.
+        InputError: If its task folder does not exist any more, or a file cannot be read.
     """
     folder = getattr(TASKS.get(task), "folder", None) if task in TASKS.names() else None
-    told = ""
+    folder_digest = ""
     if folder is not None:
-        from guiderail.diagrams.tasks.part.file import task_folder_digest  # Drake takes a second
+        from guiderail.diagrams.tasks.part.file import task_folder_digest  # imports Drake
 
-        told = task_folder_digest(folder)
+        folder_digest = task_folder_digest(folder)
     named = [*imports, *(value for _, value in sorted(environment.items()) if isinstance(value, str))]
     files = [path for path in map(Path, named) if path.is_absolute() and folder not in path.parents and path.is_file()]
     if not files:
-        return told
-    digest = hashlib.blake2b(told.encode(), digest_size=16)
+        return folder_digest
+    digest = hashlib.blake2b(folder_digest.encode(), digest_size=16)
     for file in files:
         digest.update(_read(file))
     return digest.hexdigest()
@@ -105,38 +106,38 @@ def _read(file: Path) -> bytes:
 
 
 def _is_module(name: str) -> bool:
-    """Whether there is a module of that name; one whose package can't be imported is there."""
+    """Return True if there is a module of that name, even if its package cannot be imported."""
     try:
         return find_spec(name) is not None
     except ModuleNotFoundError as error:
         return not f"{name}.".startswith(f"{error.name}.")
-    except (ImportError, ValueError, TypeError):  # no name at all, or a relative one
+    except (ImportError, ValueError, TypeError):  # empty or relative name
         return False
 
 
 def _import_file(path: Path) -> str:
-    """Runs a file, which finds those beside it as a program would; once, as long as it stays what it is."""
+    """Run a file, with its folder on the path as for a program; once for each content."""
     path = path.resolve()
     content = path.read_bytes()
-    if _IMPORTED.get(path) == content:
+    if _IMPORTED_FILES.get(path) == content:
         return str(path)
     name = f"guiderail_imported_{path.stem}"
     spec = spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     module = sys.modules[name] = module_from_spec(spec)
-    beside = str(path.parent)
-    sys.path.insert(0, beside)
+    folder = str(path.parent)
+    sys.path.insert(0, folder)
     try:
-        _imported(path.name, partial(spec.loader.exec_module, module))
+        _import_or_refuse(path.name, partial(spec.loader.exec_module, module))
     finally:
-        sys.path.remove(beside)
-    _IMPORTED[path] = content
+        sys.path.remove(folder)
+    _IMPORTED_FILES[path] = content
     return str(path)
 
 
-def _imported(what: str, load: Callable[[], Any]) -> Any:
-    """What is imported; whatever is wrong in it gets a sentence with its place."""
+def _import_or_refuse(name: str, load: Callable[[], Any]) -> Any:
+    """Return the imported module; raise an InputError with the line of an error in it."""
     try:
         return load()
     except InputError:
@@ -145,19 +146,19 @@ def _imported(what: str, load: Callable[[], Any]) -> Any:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
         words = " ".join(str(error).split())
-        raise InputError(f"importing {what} failed: {where}{type(error).__name__}: {words}") from error
+        raise InputError(f"importing {name} failed: {where}{type(error).__name__}: {words}") from error
 
 
 def task_options(task: str) -> dict[str, Any]:
-    """What a task's environment takes, with its defaults; `inspect.Parameter.empty` where it has none.
+    """Return the options of a task's environment with their defaults, or `inspect.Parameter.empty`.
 
     Raises:
-        InputError: for an unknown task.
+        InputError: If the task is unknown.
     """
     if task in TASKS.names():
         return check_environment(task, {})
     if task not in known_tasks():
-        raise InputError(f"there is no task {brief(task)}: {did_you_mean(task, known_tasks(), IMPORTED)}")
+        raise InputError(f"there is no task {brief(task)}: {did_you_mean(task, known_tasks(), IMPORT_HINT)}")
     entry = gymnasium.spec(environment_id(task)).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
     taken = inspect.signature(creator).parameters.items()
@@ -165,13 +166,13 @@ def task_options(task: str) -> dict[str, Any]:
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments of a task's environment, its defaults filled in.
+    """Return the arguments of a task's environment with all defaults filled in.
 
     Raises:
-        InputError: for an unknown task, or an argument that it does not take.
+        InputError: If the task or an argument is unknown, or a value is refused.
     """
     if task in TASKS.names():
-        from guiderail.diagrams.envs.config import EnvConfig  # Drake takes a second, and a list of names should not
+        from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
 
         return EnvConfig.resolve(task, arguments).options
     options = task_options(task)
@@ -185,66 +186,67 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def check_reset(task: str, options: Mapping[str, Any]) -> None:
-    """Refuses options that no reset of a task takes; of an environment that is no task's, whatever it takes is its own.
+    """Refuse options that the reset of a task does not take; other environments check their own.
 
     Raises:
-        InputError: for an unknown option, or a value of another kind or out of range.
+        InputError: If an option is unknown, or a value has the wrong type or is out of range.
     """
     if task in TASKS.names():
         validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
 
 
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of an environment's arguments that it would not have anyway.
+    """Return the arguments of an environment that differ from the defaults.
 
     Args:
-        task: its name.
-        environment: all of its arguments.
+        task: Name of the task.
+        environment: All arguments of the environment.
 
     Returns:
-        Guidance, station and difficulty that are not the task's own, and what differs from what these three stand for.
+        Guidance, station and difficulty if they are not the task's defaults, and other arguments that differ from the
+        defaults for these three.
 
     Raises:
-        InputError: for an unknown task, or if one of the three is unknown.
+        InputError: If the task or one of the three is unknown.
     """
     chosen = {key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment}
-    usual = check_environment(task, chosen) | {key: check_environment(task, {}).get(key) for key in chosen}
-    unlike = object()
-    return {key: value for key, value in environment.items() if usual.get(key, unlike) != value}
+    defaults = check_environment(task, chosen) | {key: check_environment(task, {}).get(key) for key in chosen}
+    missing = object()
+    return {key: value for key, value in environment.items() if defaults.get(key, missing) != value}
 
 
 def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """A run's arguments of its environment, with others in their place.
+    """Return the arguments of a run's environment with changes.
 
-    Another difficulty is other settings: those that the run has of its own difficulty alone make way for them. Another
-    station has no options of the run's station that it doesn't know.
+    Another difficulty replaces the settings that the run has only from its own difficulty. For another station, options
+    that it does not have are removed.
 
     Args:
-        task: the run's.
-        environment: all of its arguments.
-        changes: the others.
+        task: Task of the run.
+        environment: All arguments of the run's environment.
+        changes: Arguments to change.
 
     Raises:
-        InputError: if there is no such difficulty.
+        InputError: If there is no such difficulty.
     """
-    gone = _of_the_station_alone(environment.get("station"), changes.get("station"))
-    environment = {key: value for key, value in environment.items() if key not in gone}
+    removed = _options_of_station_only(environment.get("station"), changes.get("station"))
+    environment = {key: value for key, value in environment.items() if key not in removed}
     own = environment.get("difficulty")
     if changes.get("difficulty", own) == own:
         return {**environment, **changes}
     return check_environment(task, {**beyond_defaults(task, environment), **changes})
 
 
-def _of_the_station_alone(own: Any, other: Any) -> set[str]:
-    """The options that a station has and another one doesn't."""
+def _options_of_station_only(own: Any, other: Any) -> set[str]:
+    """Return the options that the station `own` has and `other` does not have."""
     if other in (None, own) or not {own, other} <= {*STATIONS.names()}:
         return set()
-    mine, its = ((STATIONS.get(name).options or Options).model_fields for name in (own, other))
-    return {*mine} - {*its}
+    own_options, other_options = ((STATIONS.get(name).options or Options).model_fields for name in (own, other))
+    return {*own_options} - {*other_options}
 
 
 def _is_like(value: Any, default: Any) -> bool:
-    """Whether a value has the type of a default, as far as that says anything."""
+    """Return True if a value has the type of a default, or the default has no type."""
     if default is None or default is inspect.Parameter.empty:
         return True
     if isinstance(default, float):
@@ -255,7 +257,7 @@ def _is_like(value: Any, default: Any) -> bool:
 
 
 def as_value(text: str) -> Any:
-    """A typed value: what YAML reads; what is no YAML is a word."""
+    """Return a value typed on the command line, parsed as YAML; text that is not YAML is returned unchanged."""
     try:
         return _numbers(parse_yaml(text))
     except InputError:
@@ -272,13 +274,13 @@ def _numbers(value: Any) -> Any:
 
 
 def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
-    """The environment of a task. From here on this process calculates with one thread.
+    """Make the environment of a task. From this call on the process computes with one thread.
 
-    Matrices are small here. Where another process wants the cores too, threads that wait for each other take eighty
-    times as long (a movement primitive with a history: 78 s for 1), and sums would depend on how many there are.
+    Matrices are small here. Where other processes use the cores, threads that wait for each other take eighty times as
+    long (a movement primitive with a history: 78 s instead of 1 s), and sums would depend on their number.
 
     Raises:
-        InputError: for an unknown task or argument, or a pairing that makes no sense.
+        InputError: If the task or an argument is unknown, or options do not go together.
     """
     threadpool_limits(1)
     arguments = check_environment(task, arguments)

@@ -18,7 +18,7 @@ from guiderail.diagrams.envs.options import (
 )
 from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind, check_guidance, possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances
-from guiderail.diagrams.stations.registry import STATIONS, StationKind, stations_for
+from guiderail.diagrams.stations.registry import STATIONS, StationKind
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
@@ -173,7 +173,7 @@ def _freeze(value: Any) -> tuple[str, Any]:
 
 def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     name = task.name
-    stations = stations_for(task.workcell_kind)
+    stations = task.stations()
     if not stations:
         kinds = {STATIONS.get(station).world for station in STATIONS.names()}
         raise InputError(
@@ -220,7 +220,7 @@ def _check_declared_options(task: type[Task], known: set[str]) -> None:
             anywhere = {
                 each
                 for guidance in possible_guidance(task.provides())
-                for station in stations_for(task.workcell_kind)
+                for station in task.stations()
                 for model in option_models(task, guidance, station).values()
                 for each in model.model_fields
             }

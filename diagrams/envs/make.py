@@ -123,7 +123,7 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     # The sources that a reset sets are part of the diagram, so the new task adopts those of the task that built it.
     # What is hidden for a run belongs to the new task alone.
     assert built.diagram.declaration is not None
-    declared.drawn = built.diagram.declaration.drawn
+    declared.episode_constants = built.diagram.declaration.episode_constants
     randomize = make_randomize(declared, built.station, built.guidance)
     diagram = replace(built.diagram, randomize=randomize, declaration=declared)
     release = partial(_POOL.give_back, key, built)

@@ -1,4 +1,4 @@
-"""What tasks share in which a robot puts one thing into another, by contact, without knowing exactly where it is."""
+"""Base class of insertion tasks: a workpiece in the tool and a fixture whose position is not exactly known."""
 
 from __future__ import annotations
 
@@ -18,34 +18,36 @@ from guiderail.diagrams.tasks.task import Task
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.relative_poses import RelativePoses
 
-FARTHEST = 0.3  # [m] along x or y: out of the way of every tool; what is more was meant in millimetres
+MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimetres
 
 
 class InsertionReset(ResetOptions):
-    """Of a reset of an insertion."""
+    """Options of a reset of an insertion task."""
 
-    new_run: bool = Field(False, description="draw anew what is hidden and constant in a run")
+    new_run: bool = Field(False, description="sample again what is hidden for a run")
     offset: Numbers | None = Field(
         None,
         min_length=2,
         max_length=2,
-        description="(x, y) [m] of the fixture or the workpiece, instead of drawing it",
+        description="(x, y) of the fixture or the workpiece [m]; default: sampled",
     )
 
     @field_validator("offset")
     @classmethod
     def _is_near(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and max(map(abs, value)) > FARTHEST:
-            raise ValueError(f"give x and y in metres, from {-FARTHEST} to {FARTHEST}")
+        if value is not None and max(map(abs, value)) > MAX_GIVEN_OFFSET:
+            raise ValueError(f"give x and y in metres, from {-MAX_GIVEN_OFFSET} to {MAX_GIVEN_OFFSET}")
         return value
 
 
 class InsertionTask(Task):
-    """A workpiece in the tool and a fixture in the world, whose offsets a reset draws; too much force ends an episode.
+    """Insertion of a workpiece in the tool into a fixture, with sampled offsets of both and a force limit.
 
     Attributes:
-        workpiece, fixture: names of their bodies; where the one is in the other is the signal named as the workpiece.
-        simulated_rewards: that ask for more of that signal than a robot can tell.
+        workpiece: Name of the workpiece's body, and of the signal of its pose in the fixture.
+        fixture: Name of the fixture's body.
+        simulated_rewards: Rewards that need more of that signal than a robot can measure.
+        offsets: Sampler of the offsets; it holds what is hidden for a run.
     """
 
     Reset: ClassVar[type[ResetOptions]] = InsertionReset
@@ -55,20 +57,19 @@ class InsertionTask(Task):
     simulated_rewards: ClassVar[tuple[str, ...]] = ()
 
     offsets: HiddenOffsets
-    """What a reset draws; made once, as it remembers what is hidden in a run."""
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Where the workpiece really is in the fixture, (6,): position and rotation vector, offsets included.
+        """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
 
-        Only a simulation knows that; a robot has what it can tell from its own pose, where somebody wrote that down.
+        On hardware it is what `observable_success` computes from the robot's own pose, if the task defines that.
         """
         if not station.HasOutputPort("body_poses"):
-            seen = self.observable_success()
-            if seen is None:
+            observable = self.observable_success()
+            if observable is None:
                 return {}
-            told = builder.AddNamedSystem(f"{self.workpiece}_as_seen", affine(*seen))
-            builder.Connect(station.get_pose_output_port(), told.get_input_port())
-            return {self.workpiece: told.get_output_port()}
+            estimate = builder.AddNamedSystem(f"{self.workpiece}_as_seen", affine(*observable))
+            builder.Connect(station.get_pose_output_port(), estimate.get_input_port())
+            return {self.workpiece: estimate.get_output_port()}
         plant = station.plant
         relative = RelativePoses(plant, [plant.GetBodyByName(self.workpiece)], plant.GetBodyByName(self.fixture))
         builder.AddNamedSystem(f"{self.workpiece}_in_{self.fixture}", relative)
@@ -76,21 +77,21 @@ class InsertionTask(Task):
         return {self.workpiece: relative.get_relative_poses_output_port()}
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """D (6, 6) and y0 (6,) of D X_TP + y0: where a robot without eyes would say that the workpiece is.
+        """Return D (6, 6) and y0 (6,) of the estimate D X_TP + y0 of the workpiece's pose from the robot's pose X_TP.
 
-        None where nobody wrote it down: then the task can't be learned on a robot.
+        With None, the default, the task cannot be learned on hardware.
         """
         return None
 
     def force_limit(self) -> TerminationTerm:
-        """Ends an episode as a collision where the impedance pushes harder than `collision.above` [N]."""
+        """Return the term that ends an episode as a collision above the force `collision.above` [N]."""
         limit = self.collision.above
         return TerminationTerm("collision", {"contact_force": 1}, lambda contact_force: contact_force[0] > limit)
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Draws the offsets, moves fixture and workpiece, and puts the tool to where an episode starts."""
+        """Sample the offsets, move fixture and workpiece, and put the tool at its start pose."""
         fixture, workpiece = self.offsets.draw(rng, options)
         self.set_part_offsets(station, context, fixture, workpiece)
         station.set_pose(context, self.start_pose(rng))
@@ -98,14 +99,15 @@ class InsertionTask(Task):
 
     @abstractmethod
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Moves fixture and workpiece by their offsets, as this task draws them; `context` is the root context.
+        """Move fixture and workpiece by their offsets.
 
         Args:
-            station: whose context it is in.
-            context: the root context.
-            fixture, workpiece: their offsets (n,), in the units of this task's ranges.
+            station: Station.
+            context: Root context.
+            fixture: Offset of the fixture, (n,), as this task samples it.
+            workpiece: Offset of the workpiece, (n,).
         """
 
     @abstractmethod
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """The pose at which an episode starts, (6,)."""
+        """Return the pose at which an episode starts, (6,)."""

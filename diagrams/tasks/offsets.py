@@ -1,4 +1,4 @@
-"""Where things really are: offsets that a reset draws, hidden for a run or anew every episode."""
+"""Hidden offsets of fixture and workpiece, sampled for a run or for each episode, and their random streams."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from guiderail.models.common.poses import POSE_SIZE
 from guiderail.models.common.units import MM
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
 
-LARGEST_OFFSET = 4.0 * MM  # farther away a plug no longer stands on the rim of what it belongs in
+LARGEST_OFFSET = 4.0 * MM  # beyond it a plug does not stand on the rim of its socket
 
 
 class FixtureOffsetOptions(Options):
-    """Of a task whose fixed part is not where it should be."""
+    """Options of a task whose fixture is offset from its nominal position."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
-        "per_run", description="where the fixed part may be: one place for a run, one for each episode, or known"
+        "per_run", description="offset of the fixture: sampled per run, per episode, or none"
     )
     offset_range: Numbers | None = Field(
         None,
         min_length=2,
         max_length=2,
-        description="least and greatest distance of the fixed part from where it should be [m], the uncertainty's own",
+        description="least and greatest offset of the fixture [m]; default: that of fixture_offset",
     )
 
     @field_validator("offset_range")
@@ -42,15 +42,15 @@ class FixtureOffsetOptions(Options):
 
 
 def reference_of_file(path: Path, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
-    """What a file's demonstrations have in common, as long as they last on average.
+    """Return the reference trajectory of a file's demonstrations, with their mean duration.
 
     Args:
-        path: .npz or .csv, poses (N, 6) in the target frame.
-        components: of their mixture; by information criterion unless given.
-        floor: standard deviation (6,) that a hand has anyway.
+        path: File .npz or .csv with poses (N, 6) in the target frame.
+        components: Components of their mixture; None: by information criterion.
+        floor: Standard deviation of a hand, (6,), added to theirs.
 
     Raises:
-        InputError: if there is no such file, or it holds no demonstrations of a pose.
+        InputError: If there is no such file, or it holds no demonstrations of a pose.
     """
     if not path.is_file():
         raise InputError(f"there is no file {path}: name demonstrations, such as guiderail teach makes")
@@ -59,7 +59,7 @@ def reference_of_file(path: Path, components: int | None, floor: tuple[float, ..
 
 @cache
 def _fitted(path: Path, changed: int, components: int | None, floor: tuple[float, ...]) -> ReferenceTrajectory:
-    """Fitted once a process and version."""
+    """Fit the file's demonstrations, once for each time that it `changed` in this process."""
     demonstrations = Demonstrations.load(path)
     if demonstrations.num_outputs != POSE_SIZE:
         raise InputError(
@@ -75,53 +75,57 @@ def _fitted(path: Path, changed: int, components: int | None, floor: tuple[float
 
 
 class HiddenOffsets(ABC):
-    """Draws, at every reset, where a fixture and a workpiece really are: offsets (2,) [m] in the target frame's xy.
+    """Sampler of the actual offsets of fixture and workpiece at every reset, (2,) [m] in the target frame's xy.
 
-    A run begins with the first reset, and with every one that has the option `new_run`. Other options: `held_out` draws
-    from a stream that training never draws from, with what the run has hidden; `offset` (x, y) [m] says where instead.
+    A run begins with the first reset and with every reset with the option `new_run`. The option `held_out` samples from
+    a stream that training never uses, with the run's hidden offset; the option `offset` (x, y) [m] replaces the sample.
     """
 
     def __init__(self) -> None:
         self._run: Any = None
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Offsets (2,) [m] of the fixture and of the workpiece in the tool; `options` are an `InsertionReset`."""
-        # Every reset draws the same numbers, used or not, so that a seed means the same at the first reset and later.
+        """Return the offsets (2,) [m] of the fixture and of the workpiece in the tool.
+
+        Args:
+            rng: Random generator of the environment.
+            options: Instance of `InsertionReset`.
+        """
+        # Every reset samples the same numbers, used or not, so that a seed has the same meaning at any reset.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)
         if self._run is None or options.new_run:
             self._run = hidden
         if options.offset is not None:
-            return self._given(np.array(options.offset))
+            return self._offsets_of(np.array(options.offset))
         return self._draw_episode(episode, self._run)
 
     @abstractmethod
     def _draw_run(self, rng: np.random.Generator) -> Any:
-        """What stays hidden for a run."""
+        """Sample what stays hidden for a run."""
 
     @abstractmethod
     def _draw_episode(self, rng: np.random.Generator, run: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The offsets of an episode of a run."""
+        """Sample the offsets of an episode of a run."""
 
     @abstractmethod
-    def _given(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The offsets that the option `offset` stands for."""
+    def _offsets_of(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the offsets for the option `offset`."""
 
 
-# No seed of a training run leads to this stream.
-_HELD_OUT_STREAM = 0x8E1D
+_HELD_OUT_STREAM = 0x8E1D  # stream that no training seed leads to
 
 
 def episode_stream(rng: np.random.Generator, held_out: bool) -> np.random.Generator:
-    """The generator that an episode's conditions are drawn from: training's, or one that only evaluation has.
+    """Return the generator of an episode's conditions, of the training or the held-out stream.
 
-    It takes one number from `rng` whichever it is, so that a seed means the same at the first reset and later.
+    Both take one number from `rng`, so that a seed has the same meaning at any reset.
     """
     return np.random.default_rng([int(rng.integers(2**62)), _HELD_OUT_STREAM if held_out else 0])
 
 
 def in_ring(rng: np.random.Generator, inner: float, outer: float) -> np.ndarray:
-    """A point (2,) whose density is the same everywhere between two circles."""
+    """Return a point (2,) of uniform density between two circles around the origin."""
     radius = np.sqrt(rng.uniform(inner**2, outer**2))
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return radius * np.array([np.cos(angle), np.sin(angle)])

@@ -1,4 +1,4 @@
-"""A task as a declaration: what `build_task_diagram` needs to know to make a diagram of it."""
+"""Base class of tasks: the declaration that `build_task_diagram` wires."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from guiderail.diagrams.envs.scene import Scene, in_plane
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
+from guiderail.diagrams.stations.registry import stations_for
 from guiderail.diagrams.stations.station import Station
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
@@ -33,33 +34,33 @@ ScriptedPolicy = Callable[[np.ndarray], np.ndarray]
 
 
 class EpisodeConstant:
-    """Numbers that are constant during an episode, for whoever observes, rewards or ends it."""
+    """Episode-constant signal, set at reset, usable by observations, rewards and terminations."""
 
     def __init__(self, builder: DiagramBuilder, name: str, size: int):
-        """Adds their source to the builder; they are zero until a reset sets them."""
+        """Add its source to the builder; the values are zero until a reset sets them."""
         self._source = builder.AddNamedSystem(name, ConstantVectorSource(np.zeros(size)))
 
     @property
     def port(self) -> OutputPort:
-        """Where they come out, (size,)."""
+        """Output port, (size,)."""
         return self._source.get_output_port()
 
     def set(self, root_context: Context, values: np.ndarray) -> None:
-        """Sets them, (size,); the context is the root diagram's."""
+        """Set the values, (size,); the context is the root diagram's."""
         context = self._source.GetMyMutableContextFromRoot(root_context)
         self._source.get_mutable_source_value(context).SetFromVector(values)
 
 
 @dataclass(frozen=True)
 class Threshold:
-    """A signal that means a collision while it is above a limit.
+    """Signal that indicates a collision while it is above a limit.
 
-    The episode statistics count these collisions, in `collisions` and `collision_steps`. They do not end an episode: a
+    The episode statistics `collisions` and `collision_steps` count these collisions. They do not end an episode; a
     `TerminationTerm` does.
 
     Attributes:
-        signal: the name of a signal of one number.
-        above: the limit, in its unit.
+        signal: Name of a signal of one number.
+        above: Limit, in the signal's unit.
     """
 
     signal: str = "contact_force"
@@ -67,42 +68,44 @@ class Threshold:
 
 
 class Task(ABC):
-    """What is done, in what world, for what reward, and how an episode begins and ends.
+    """Declaration of a task: workcell, prior knowledge, observation, reward, terminations and reset.
 
-    A subclass says what there is, and `build_task_diagram` wires it. Reward terms, conditions and observations name signals. A
-    signal is an output port of the station, of the guidance or of `signals`; `action` and `termination` are signals
-    too. "last_" before a name means its value of the control step before.
+    `build_task_diagram` wires what a subclass declares. Reward terms, termination terms and observation terms name
+    signals. A signal is an output port of the station, of the guidance or of `signals`, or `action` or `termination`.
+    With the prefix "last_" it is the value one control step earlier.
 
     Attributes:
-        name: set by `register_task`.
-        workcell_kind: the kind of world, "workcell" unless given: only stations that are registered for it can be used.
-        Options: the model of the task's own options, a subclass of `guiderail.Options`.
-        Reset: the model of the options of a reset, a subclass of `guiderail.ResetOptions`.
-        rewards: names that `reward=` chooses from; the first one unless given. `config.reward` is the chosen one.
-        observations: names that `observation=` chooses from; the first one unless given.
-        defaults: options of the environment, by name, that differ from what they are elsewhere, such as the guidance.
-        difficulties: names that `difficulty=` chooses from, each with the options that it stands for. "standard" must
-            be one of them. What is given replaces what a difficulty says, and that replaces `defaults`.
-        learner: the algorithm and the preset that `guiderail train` uses unless told otherwise.
-        num_steps: control steps after which an episode is over; must be given, in the class or in `__init__`.
-        clip: the largest absolute value in an observation; larger ones are clipped.
-        collision: the signal that the statistic `collisions` counts, and its limit; any contact force unless given, and
-            then an evaluation leaves the count out. A `TerminationTerm` that ends an episode as a collision is not counted by
-            itself.
+        name: Name, set by `register_task`.
+        workcell_kind: Kind of the workcell; only stations that are registered for it can be used.
+        excluded_stations: Names of stations for this kind that cannot be used nevertheless.
+        Options: Model of the task's own options, a subclass of `guiderail.Options`.
+        Reset: Model of the options of a reset, a subclass of `guiderail.ResetOptions`.
+        rewards: Values of the option `reward`; the first is the default.
+        observations: Values of the option `observation`; the first is the default.
+        defaults: Options of the environment by name, in place of their usual defaults, such as the guidance.
+        difficulties: Options by name for each value of the option `difficulty`, one of which is "standard". They
+            override `defaults`, and given options override them.
+        learner: Default algorithm and preset of `guiderail train`.
+        num_steps: Control steps of an episode; set in the class or in `__init__`.
+        clip: Largest absolute value in an observation.
+        collision: Signal and limit of the statistic `collisions`; default: any contact force. An evaluation omits the
+            statistic if the task does not declare it. A `TerminationTerm` that ends an episode as a collision is not
+            counted by itself.
         statistics: Statistics of a table of episodes that only this task has; studies name them.
-        isotropic_groups: indices of outputs of one unit, group by group; residual learning moves all outputs of a group
-            alike. None is one group of all.
-        pushable: whether `GuidedEnv.push` may displace the robot.
-        options: the task's own options, checked: an instance of `Options`.
+        isotropic_groups: Indices of outputs of one unit, group by group; residual learning moves all outputs of a group
+            by the same amount. None: one group of all.
+        pushable: True if `GuidedEnv.push` may displace the robot.
         config: Configuration of the environment.
-        has_held_out_distribution: whether `reset` draws from conditions that training never draws where `options.held_out` is
-            true. Without it an evaluation repeats conditions of training, and says so.
-        drawn: what `signals` adds to a diagram and a reset sets, by name. A diagram is used again by whoever asks for
-            the same, whose task gets these with it: systems that a task keeps anywhere else are missing there.
+        options: The task's own options, an instance of `Options`.
+        has_held_out_distribution: True if `reset` samples from a held-out distribution if `options.held_out` is true.
+            Otherwise an evaluation repeats conditions of training, and reports so.
+        episode_constants: Constants that `signals` adds to a diagram and a reset sets, by name. A later environment
+            with the same options reuses the diagram together with them, so no other attribute may hold systems.
     """
 
     name: ClassVar[str] = ""
     workcell_kind: ClassVar[str] = "workcell"
+    excluded_stations: ClassVar[tuple[str, ...]] = ()
     Options: ClassVar[type[option_models.Options]] = option_models.Options
     Reset: ClassVar[type[option_models.ResetOptions]] = option_models.ResetOptions
     rewards: ClassVar[tuple[str, ...]] = ("sparse",)
@@ -126,93 +129,92 @@ class Task(ABC):
         """
         self.config = config
         self.options = config.parts["task"]
-        self.drawn: dict[str, EpisodeConstant] = {}
-
-    # What there is.
+        self.episode_constants: dict[str, EpisodeConstant] = {}
 
     @abstractmethod
     def workcell(self) -> Any:
-        """What a station of `workcell_kind` works on: the first argument that the station is built with."""
+        """Return the workcell, which is the first argument of the station's builder."""
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Further signals: a mapping from names to output ports of systems that this adds to the builder.
-
-        They are found under these names by reward terms, conditions, observations and `collision`.
+        """Add systems and return their output ports by name, as signals of this task.
 
         Args:
-            builder: of the root diagram.
-            station: already in it; its output ports are what a system here can be connected to.
+            builder: Builder of the root diagram.
+            station: Station, already in the builder.
         """
         return {}
 
-    # What is known of it. Guidance can be made of what a task overrides here (see `provides`).
+    # Prior knowledge. Guidance can be built from the methods that a task overrides here (see `provides`).
 
     def reference(self) -> ReferenceTrajectory:
-        """What demonstrations have in common; its clock is the control period."""
+        """Return the reference trajectory of demonstrations, in steps of the control period."""
         raise NotImplementedError
 
     def keep_out(self) -> KeepOut:
-        """Walls that safe residual learning stops before."""
+        """Return the walls that safe residual learning stops at."""
         raise NotImplementedError
 
     def template(self) -> PlacedTemplate:
-        """A shared control template."""
+        """Return a shared control template and the poses of its objects."""
         raise NotImplementedError
 
     def approach(self) -> ScriptedApproach:
-        """A scripted approach."""
+        """Return a scripted approach."""
         raise NotImplementedError
 
     def constraints(self) -> LinearConstraints | None:
-        """G y ≥ c on every commanded pose; None where only guidance knows (a template's active constraints)."""
+        """Return G y ≥ c on every commanded pose; None if only the guidance has constraints, such as a template's."""
         return None
 
-    # What a policy sees, and what it is told.
+    # Observation, reward and termination.
 
     @abstractmethod
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """What a policy sees, for `config.observation`."""
+        """Return the terms of the observation `config.observation`, or the camera of an image."""
 
     @abstractmethod
     def reward_terms(self, num_actions: int) -> Sequence[RewardTerm]:
-        """The terms of a control step's reward, for `config.reward`."""
+        """Return the terms of a control step's reward `config.reward`."""
 
     @abstractmethod
     def termination_terms(self) -> Sequence[TerminationTerm]:
-        """What ends an episode; the first that holds counts."""
+        """Return the terms that end an episode; the first true one is the reason."""
 
     def symmetry(self) -> Symmetry | None:
-        """Turns and mirrors under which the task stays what it is; an action displaces the explored outputs.
+        """Return rotations and reflections under which the task is invariant; actions displace the explored outputs.
 
-        Guidance that is not registered with `displaces=True` takes actions for something else, and has none.
+        They are ignored with guidance that is not registered with `displaces=True`.
         """
         return None
 
     def near_symmetry(self) -> Symmetry | None:
-        """More of them, from which only most of an episode stays what it is; the exact ones unless there are more."""
+        """Return symmetries that hold only for most of an episode; default: the exact ones."""
         return self.symmetry()
 
-    # How an episode begins.
+    # Start of an episode.
 
     @abstractmethod
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Draws an episode's conditions and writes them into the root context; returns what `info` says of them.
+        """Sample an episode's conditions, write them into the root context and return them by name for `info`.
 
-        `options` is an instance of `Reset`. Where its `held_out` is True, draw from conditions that training never
-        draws: evaluation resets so.
+        Rewards and terminations read the conditions as signals: they may belong to a diagram that was built for an
+        earlier environment with the same options. Attributes of the task may only hold what its next reset needs.
 
-        They go nowhere else: rewards and conditions read signals, and may belong to a diagram that was built for an
-        earlier environment with the same options. What is remembered in the task is for its next reset.
+        Args:
+            station: Station.
+            guidance: Guidance.
+            context: Root context.
+            rng: Random generator of the environment.
+            options: Instance of `Reset`. If its `held_out` is true, sample from the held-out distribution.
         """
 
     def start_within(self) -> np.ndarray | float:
-        """How far beside the demonstrations' first pose a reset may put the robot at most: certificates assume it.
+        """Return the largest start offset of a reset, training or held-out, which certificates assume.
 
-        Of each output, (O,), in its unit, or one number for all of them. It covers all that a reset draws, held out or
-        not, and no place that somebody names in a reset's options. The option `start_offset_max` unless overridden, 0 for a
-        task that has none.
+        It is the distance from the demonstrations' first pose for each output, (O,), or one number for all of them.
+        Poses that a reset's options name are not included. Default: the option `start_offset_max`, or 0.
         """
         return float(getattr(self.options, "start_offset_max", 0.0))
 
@@ -221,28 +223,35 @@ class Task(ABC):
         """Return scripted policies by name; the first one is the default for `difficulty`."""
         return {}
 
-    # How it is drawn.
+    # Drawing.
 
     def camera(self) -> Camera | None:
-        """What `render_mode="rgb_array"` sees; None where a task has no picture."""
+        """Return the camera of `render_mode="rgb_array"`; None if the task has no picture."""
         return None
 
     def scene(self) -> Scene:
-        """What is drawn beside the robot, and where to look from."""
+        """Return what a picture shows besides the robot, and the viewpoints."""
         return Scene(to_world=in_plane)
+
+    # Capabilities of the class.
+
+    @classmethod
+    def stations(cls) -> list[str]:
+        """Return the names of the stations that the task can be done on."""
+        return [name for name in stations_for(cls.workcell_kind) if name not in cls.excluded_stations]
 
     @classmethod
     def declares_collision(cls) -> bool:
-        """Whether somebody said what a collision is, for the class or in its constructor."""
+        """Return True if the class or its constructor declares what a collision is."""
         return cls.collision is not Task.collision or cls.__init__ is not Task.__init__
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:
-        """Which of "demonstrations" (`reference`), "keep_out", "template" and "approach" the task overrides."""
-        hooks = {
+        """Return the kinds of prior knowledge, names in `REQUIREMENTS`, whose method the task overrides."""
+        methods = {
             "demonstrations": "reference",
             "keep_out": "keep_out",
             "template": "template",
             "approach": "approach",
         }
-        return tuple(name for name, hook in hooks.items() if getattr(cls, hook) is not getattr(Task, hook))
+        return tuple(name for name, method in methods.items() if getattr(cls, method) is not getattr(Task, method))

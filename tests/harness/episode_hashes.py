@@ -24,7 +24,7 @@ import numpy as np
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.guidance.registry import possible_guidance
-from guiderail.diagrams.stations.registry import STATIONS, stations_for
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.robot import robot_names
@@ -44,7 +44,7 @@ def all_cases() -> list[tuple[str, dict[str, Any]]]:
     cases = []
     for task in ("NarrowPassage", "BncConnector", "GridClamp", "Pouring"):
         declared = TASKS.get(task)
-        stations = [name for name in stations_for(declared.workcell_kind) if STATIONS.get(name).is_simulated]
+        stations = [name for name in declared.stations() if STATIONS.get(name).is_simulated]
         for guidance in possible_guidance(declared.provides()):
             for options in _station_options(task, stations):
                 for difficulty in ("standard", "hard"):

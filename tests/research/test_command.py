@@ -47,7 +47,7 @@ def test_help_has_an_example(program, capsys):
         (benchmarks, ["training", "Puring"], "did you mean Pouring?"),
         (benchmarks, ["training", "Bead", "--env", "wal=1"], "did you mean wall?"),
         (benchmarks, ["training", "Bead", "--env", "wall"], "--env takes key=value"),
-        (benchmarks, ["training", "lab/Own", "--import", "none.py"], "there is none for 'none.py'"),
+        (benchmarks, ["training", "lab/Own", "--import", "none.py"], "there is no module, file or task folder none.py"),
         (action_fuzzing, ["BncConector"], "did you mean BncConnector?"),
         (action_fuzzing, ["Pouring", "--episodes", "0"], "at least one episode"),
         (action_fuzzing, ["all"], "give --steps"),

@@ -7,7 +7,6 @@ import pytest
 from guiderail.diagrams.envs.config import option_models
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances
-from guiderail.diagrams.stations.registry import stations_for
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.tools.learning.train import configure, with_defaults
 from research.thesis import HISTORY, NEUTRAL, THESIS, describe_differences
@@ -104,7 +103,7 @@ def _options():
     for task in THESIS:
         declared = TASKS.get(task)
         for guidance in possible_guidance(declared.provides()):
-            for station in stations_for(declared.workcell_kind):
+            for station in declared.stations():
                 for model in option_models(declared, guidance, station).values():
                     for name, field in model.model_fields.items():
                         yield task, guidance, station, name, field

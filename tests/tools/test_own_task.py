@@ -279,7 +279,7 @@ def test_a_file_finds_those_beside_it_and_what_fails_in_it_is_said(tmp_path):
     assert import_modules([str(good)]) == (str(good),)
     with pytest.raises(InputError, match=r"importing own_wrong\.py failed: own_wrong\.py, line 2: ModuleNotFoundError"):
         import_modules([str(wrong)])
-    with pytest.raises(InputError, match="there is none for 'nowhere_to_be_found'"):
+    with pytest.raises(InputError, match="there is no module, file or task folder nowhere_to_be_found"):
         import_modules(["nowhere_to_be_found"])
     assert sys.path == path
     sys.modules.pop("beside_own")

@@ -11,7 +11,7 @@ from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances
-from guiderail.diagrams.stations.registry import STATIONS, stations_for
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
@@ -59,7 +59,7 @@ def describe_task(name: str) -> dict[str, Any]:
         "is": _first_line(declared),
         "environment": environment_id(name),
         "guidance": possible_guidance(declared.provides()),
-        "stations": stations_for(declared.workcell_kind),
+        "stations": declared.stations(),
         "rewards": list(declared.rewards),
         "observations": list(declared.observations),
         "difficulties": {level: dict(settings) for level, settings in declared.difficulties.items()},
@@ -81,7 +81,7 @@ def describe_task_options(name: str) -> dict[str, str]:
     declared = TASKS.get(name)
     choices = {
         "guidance": possible_guidance(declared.provides()),
-        "station": stations_for(declared.workcell_kind),
+        "station": declared.stations(),
         "reward": declared.rewards,
         "observation": declared.observations,
         "difficulty": tuple(declared.difficulties),

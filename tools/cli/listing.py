@@ -22,7 +22,7 @@ def list_(
     With a task it lists the options of its environment and of a reset; with metrics, the definition of every number in
     a table. `guiderail list --json` prints everything: each entry with its ports, options and ranges.
     """
-    from guiderail.tools.environments import IMPORTED, import_modules
+    from guiderail.tools.environments import IMPORT_HINT, import_modules
 
     import_modules(imports or ())
     name = None if what is None else cli.find_task(what)[0]
@@ -48,5 +48,5 @@ def list_(
             describe_task(name) if as_json and is_declared(name) else describe_task_options(name), as_json, "_"
         )
     else:
-        known = did_you_mean(name, [*cli.CHOICES["listed"](), "metrics"], IMPORTED)
+        known = did_you_mean(name, [*cli.CHOICES["listed"](), "metrics"], IMPORT_HINT)
         raise InputError(f"there is no list of {name!r}: {known}")

@@ -16,7 +16,7 @@ from guiderail.diagrams.envs.recording import DrivenStation, along, drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.part.file import PartTaskFile
-from guiderail.diagrams.tasks.part.task import PartInsertion, workcell
+from guiderail.diagrams.tasks.part.task import PartInsertion, write_workcell
 from guiderail.diagrams.tasks.part.workcell import PLUG, SOCKET
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.poses import pose_to_transform
@@ -128,7 +128,7 @@ def insert(
     times, poses = (
         plan_straight_insertion(numbers.travel, numbers.rim, file.turn, numbers.push) if motion is None else motion
     )
-    world = workcell(folder, file)
+    world = write_workcell(folder, file)
     station = GantryStation(world, time_step=file.time_step)
     driven = DrivenStation(station, along(times, poses), num_samples=round(times[-1] / CONTROL_PERIOD))
     world.set_socket_offset(station.plant, driven.plant_context, RigidTransform([*offset, 0.0]))
@@ -232,7 +232,7 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray) -> bool:
-    driven, _ = drive_along(GantryStation(workcell(folder, file), time_step=file.time_step), times, motion)
+    driven, _ = drive_along(GantryStation(write_workcell(folder, file), time_step=file.time_step), times, motion)
     plant = driven.station.plant
     X = plant.GetFrameByName(PLUG).CalcPose(driven.plant_context, plant.GetFrameByName(SOCKET))
     turn = X.rotation().ToAngleAxis()

@@ -1,4 +1,4 @@
-"""The rewards that the connector is learned from (thesis, equations 4.27 and 4.28)."""
+"""Rewards, observations and symmetries of the connector (thesis, equations 4.27 and 4.28)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from guiderail.systems.reward_system import RewardTerm
 
 OBSERVATIONS = ("state", "center_of_pressure")
 
-# The wrench's torques are small, and they are what tells on which side of the rim the plug sits: 0.02 Nm at 4 N.
+# The torques are small, and they indicate on which side of the rim the plug stands: 0.02 Nm at 4 N.
 POSE_CENTRE = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
 
 
 def observation_terms(observation: str, num_steps: int = NUM_STEPS) -> tuple[ObservationTerm, ...]:
-    """Time, pose and wrench; "center_of_pressure" adds the contact's lever and the commanded x and y."""
+    """Return time, pose and wrench; "center_of_pressure" adds the center of pressure and the commanded x and y."""
     half = 0.5 * num_steps * CONTROL_PERIOD
     state = (
         ObservationTerm("time", half, half),
@@ -42,29 +42,30 @@ def observation_terms(observation: str, num_steps: int = NUM_STEPS) -> tuple[Obs
 
 
 def half_turn(observation: str) -> tuple[float, ...]:
-    """What half a turn about the jack's axis multiplies an observation by."""
+    """Return the signs of an observation after half a turn about the jack's axis."""
     across = () if observation == "state" else (-1.0,) * 4
     return (1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH, *across)
 
 
 def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Seven other sides from which a plug on the rim feels the same: quarter turns about the axis, and their mirrors.
+    """Return the seven symmetries of a plug on the rim: quarter turns about the axis, and reflections.
 
-    Vectors across the axis turn; a mirror also changes the sign of torques and tilts. What is about the axis stays.
+    Vectors across the axis rotate; a reflection also changes the sign of torques and tilts. Components about the axis
+    stay.
 
     Args:
-        observation: one of `OBSERVATIONS`.
-        explored: the outputs that actions move.
+        observation: One of `OBSERVATIONS`.
+        action_dims: Indices of the outputs that actions move.
 
     Returns:
-        Of observations (7, n, n) and of actions (7, A, A); None where actions move x and not y, or one tilt alone.
+        Matrices of observations (7, n, n) and of actions (7, A, A); None if actions move x and not y, or one tilt.
     """
     quarter, mirror = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
     observations, actions, outputs = [], [], list(action_dims)
     for across in [*turns[1:], *(turn @ mirror for turn in turns)]:
         axial = np.linalg.det(across).round() * across
-        # A pose has Ry before Rx.
+        # In a pose, Ry comes before Rx.
         pose = block_diag(across, np.eye(2), axial[::-1, ::-1])
         wrench = block_diag(across, np.eye(1), axial, np.eye(1))
         further = () if observation == "state" else (across, across)
@@ -75,25 +76,30 @@ def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.n
     return np.array(observations), np.array(actions)
 
 
-# The thesis gives no unit of f: here it is 10 N and 0.5 Nm.
+# The thesis gives no unit of f; here it is 10 N and 0.5 Nm.
 ACTION_WEIGHT = FORCE_WEIGHT = 0.01
 REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
 TERMINAL = {"success": 60.0, "collision": -50.0}
-# [1/mm]. A lock comes when the demonstrations end, however soon the plug dropped: paid at the end only, a policy that
-# wiggles until it drops is worth as much as one that feels where to go, and fails now and then. From the start to the
-# lock it is 15.6 mm, the last 5.5 of them in the jack.
+# [1/mm] The connector locks when the demonstrations end, however early the plug dropped. With a terminal reward alone,
+# a policy that moves at random until it drops would be worth as much as one that uses the contact, and would sometimes
+# fail. The way from the start to the lock is 15.6 mm, the last 5.5 mm of it in the jack.
 DEPTH_REWARD = 5.0
-# [1/mm] of coming nearer to the jack's axis. On the rim, the depth says nothing of where it is better.
+# [1/mm] towards the jack's axis: on the rim, the depth does not indicate the direction.
 ALIGNMENT_REWARD = 5.0
 
 REWARDS = ("sparse", "shaped", "aligned")
 
 
 def reward_terms(reward: str, num_actions: int) -> list[RewardTerm]:
-    """ "sparse" is the thesis's reward, "shaped" adds the depth gained, "aligned" nearness to the jack's axis, too.
+    """Return the terms of a reward.
 
-    Where the axis is, only a simulation knows: it is rewarded and not observed. What is added is gained from step to
-    step, a difference of potentials.
+    "sparse" is the thesis's reward, "shaped" adds the depth gained, and "aligned" also adds the distance gained towards
+    the jack's axis. The latter is privileged: it uses simulation state that the policy does not observe. Both additions
+    are differences of potentials.
+
+    Args:
+        reward: One of `REWARDS`.
+        num_actions: A.
     """
     terms = [
         RewardTerm("action_cost", {"action": num_actions}, lambda action: -ACTION_WEIGHT * float(action @ action)),

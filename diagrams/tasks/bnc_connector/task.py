@@ -1,4 +1,4 @@
-"""BncConnector: insert, align and lock a bayonet connector whose place is not exactly known (4.4.2, 5.4.2)."""
+"""BncConnector: insert, align and lock a bayonet connector whose position is not exactly known (4.4.2, 5.4.2)."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ NUM_STEPS, COMPONENTS = inserting.NUM_STEPS, 16
 FLOOR = np.array(REPEATABILITY_STD)
 DEMONSTRATIONS = {"insert": inserting, "search": searching}
 TOOL_VIEW = ((0.62, -0.085, 0.19), (0.55, 0.0, 0.172))
-LOCKED_STEPS = 3  # control steps for which the plug must be locked before that counts
+LOCKED_STEPS = 3  # consecutive control steps that count as locked
 
 
 @cache
 def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
-    """What demonstrations have in common: Gaussian mixture and regression, fitted once a process.
+    """Return the Gaussian mixture regression of demonstrations, fitted once a process.
 
     Args:
-        demonstrations: the name of those that come along, or a file.
+        demonstrations: Name of shipped demonstrations, or path of a file.
     """
     if demonstrations not in DEMONSTRATIONS:
         return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()))
@@ -67,7 +67,10 @@ def reference_trajectory(demonstrations: str) -> ReferenceTrajectory:
 
 @register_task("BncConnector")
 class BncConnector(InsertionTask):
-    """Insert, align and lock: "sparse" is the thesis's reward (4.27, 4.28); "shaped" and "aligned" add to it."""
+    """Insert, align and lock the connector.
+
+    Rewards: "sparse" is the thesis's (4.27, 4.28); "shaped" and "aligned" add to it.
+    """
 
     Options = BncOptions
     options: BncOptions
@@ -83,7 +86,7 @@ class BncConnector(InsertionTask):
         "action_dims": (0, 1),
         "history_variance": HISTORY_VARIANCE,
     }
-    isotropic_groups = ((0, 1, 2), (3, 4, 5))  # outputs of one unit, which residual learning moves alike
+    isotropic_groups = ((0, 1, 2), (3, 4, 5))
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
@@ -96,30 +99,30 @@ class BncConnector(InsertionTask):
         self.num_steps = NUM_STEPS if o.demonstrations in DEMONSTRATIONS else self.reference().num_steps
 
     def workcell(self) -> BncWorkcell:
-        """A jack in the world, a plug in the tool."""
+        """Return the jack in the world and the plug in the tool."""
         return self._workcell
 
     def reference(self) -> ReferenceTrajectory:
-        """Of five demonstrations, or of one's own."""
+        """Return the reference trajectory of the chosen demonstrations."""
         return reference_trajectory(self.options.demonstrations)
 
     def constraints(self) -> LinearConstraints:
-        """|x|, |y| ≤ 2 mm, equation 4.26, or another bound."""
+        """Return |x|, |y| ≤ `bound`: 2 mm in equation 4.26."""
         bound = np.array([self.options.bound, self.options.bound, np.inf, np.inf, np.inf, np.inf])
         return LinearConstraints.box(-bound, bound)
 
     def keep_out(self) -> KeepOut:
-        """No walls are known: what safe residual learning is projected to is the alignment alone."""
+        """Return no walls: safe residual learning is projected to the alignment constraint alone."""
         return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Beside where the plug is, the lever of what it stands on."""
+        """Return the plug's pose in the jack and the center of pressure."""
         lever = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
         builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
         return {**super().signals(builder, station), "center_of_pressure": lever.get_center_of_pressure_output_port()}
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Height and turn tell whether it is locked. How far beside the jack it is nobody knows: a pull tells."""
+        """Return the estimate of height and turn; lateral offset cannot be measured, and is checked by pulling."""
         size = self._workcell.dimensions
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = D[5, 3] = 1.0
@@ -127,31 +130,31 @@ class BncConnector(InsertionTask):
         return D, y0
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Time, pose and wrench; "center_of_pressure" adds the contact's lever and the commanded x and y."""
+        """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
         return observation_terms(self.config.observation, self.num_steps)
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Of actions, forces and the end; of depth where the reward is shaped."""
+        """Return costs of actions and forces, the terminal reward, and the additions of "shaped" and "aligned"."""
         return reward_terms(self.config.reward, num_actions)
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Locked for a while, or pushed too hard."""
+        """Return success when locked, and collision above the force limit."""
         return [TerminationTerm("success", {"plug": 6}, self._workcell.locks, steps=LOCKED_STEPS), self.force_limit()]
 
     def symmetry(self) -> Symmetry:
-        """Half a turn about the jack's axis."""
+        """Return half a turn about the jack's axis."""
         action_dims = self.config.options["action_dims"]
         action = HALF_TURN if action_dims is None else HALF_TURN[list(action_dims)]
         return Symmetry.of_signs(half_turn(self.config.observation), action)
 
     def near_symmetry(self) -> Symmetry:
-        """Quarter turns and mirrors too: alike as long as the plug stands on the rim, which has no sides."""
+        """Return quarter turns and reflections too, which hold while the plug stands on the rim."""
         action_dims = self.config.options["action_dims"]
         sides = sides_of_the_rim(self.config.observation, range(POSE_SIZE) if action_dims is None else action_dims)
         return self.symmetry() if sides is None else Symmetry(*sides)
 
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Moves the jack by (x, y) and its turn, the plug by (x, y) and its tilt about x and y, where they have one."""
+        """Move the jack by (x, y) and its turn, and the plug by (x, y) and its tilt about x and y, if they have any."""
         plant_context = station.plant.GetMyMutableContextFromRoot(context)
         tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
         turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
@@ -159,7 +162,7 @@ class BncConnector(InsertionTask):
         self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform(tilt, [*workpiece[:2], 0.0]))
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """Where the demonstrations start, or somewhere beside it, inside the constraints."""
+        """Return the demonstrations' start plus a sampled offset, inside the constraints."""
         start = self.reference().means[0].copy()
         if self.options.start_offset_max > 0.0:
             start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
@@ -174,18 +177,18 @@ class BncConnector(InsertionTask):
         return {policy.__name__: policy for policy in ordered}
 
     def camera(self) -> Camera:
-        """Looks slightly down at the jack."""
+        """Return a camera that looks slightly down at the jack."""
         X_WC = look_from_front(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04)
         return Camera((640, 480), np.deg2rad(30.0), X_WC)
 
     def scene(self) -> Scene:
-        """The demonstrations, and the square that commands stay in."""
+        """Return the demonstrations and the box of the alignment constraint."""
         to_world = in_frame(self._workcell.X_WT)
         near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
         bound = self.options.bound
         return Scene(
             to_world=to_world,
-            demonstrations=tuple(_shown(self.options.demonstrations).outputs),
+            demonstrations=tuple(_load_demonstrations(self.options.demonstrations).outputs),
             constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},
@@ -193,6 +196,6 @@ class BncConnector(InsertionTask):
         )
 
 
-def _shown(demonstrations: str) -> Demonstrations:
+def _load_demonstrations(demonstrations: str) -> Demonstrations:
     known = DEMONSTRATIONS.get(demonstrations)
     return Demonstrations.load(Path(demonstrations)) if known is None else known.load()

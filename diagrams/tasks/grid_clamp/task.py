@@ -1,4 +1,4 @@
-"""GridClamp: push five pegs into five holes at once until they snap, with forces as small as they can be (3.4.2)."""
+"""GridClamp: push five pegs into five holes until they snap in, with small forces (thesis, section 3.4.2)."""
 
 from __future__ import annotations
 
@@ -40,31 +40,37 @@ from guiderail.systems.reward_system import RewardTerm
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-# More than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m.
-COLLISION_FORCE = 35.0  # [N], of the impedance
-# The hand-designed skill before hands over a clamp above the hole, about here.
-START_HEIGHT = (0.015, 0.018)  # [m]: the tips 3 to 6 mm above the table
-HEIGHTS = (0.013, 0.060)  # [m] that it may begin at: above the table, and well inside the cuboid
-DRAWN = GridClampDimensions()
+# [N] more than the cuboid lets the impedance push with: 6 mm below the seat and 8 mm beside, at 1500 N/m
+COLLISION_FORCE = 35.0
+START_HEIGHT = (0.015, 0.018)  # [m] the preceding skill hands over the clamp with its tips 3 to 6 mm above the table
+HEIGHTS = (0.013, 0.060)  # [m] range of start heights: above the table, and well inside the cuboid
+NOMINAL = GridClampDimensions()
 
 
 class GridClampOptions(Options):
-    """Of the clamp."""
+    """Options of GridClamp."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
-        "per_run", description="where table and clamp may be"
+        "per_run", description="offsets of table and clamp: sampled per run, per episode, or none"
     )
     start_height: Numbers = Field(
-        START_HEIGHT, min_length=2, max_length=2, description="least and greatest height at which it begins [m]"
+        START_HEIGHT, min_length=2, max_length=2, description="least and greatest start height [m]"
     )
-    force_limit: Number = Field(COLLISION_FORCE, ge=8, le=60, description="more than that ends an episode [N]")
-    seconds: Number = Field(10.0, ge=2, le=30, description="that an episode may take")
-    hole_chamfer: Number = Field(DRAWN.hole_chamfer, ge=0.1 * MM, le=0.8 * MM, description="of the holes [m]")
-    peg_chamfer: Number = Field(DRAWN.peg_chamfer, ge=0.1 * MM, le=0.8 * MM, description="of the pegs' tips [m]")
+    force_limit: Number = Field(
+        COLLISION_FORCE, ge=8, le=60, description="force that ends an episode as a collision [N]"
+    )
+    seconds: Number = Field(10.0, ge=2, le=30, description="duration of an episode [s]")
+    hole_chamfer: Number = Field(NOMINAL.hole_chamfer, ge=0.1 * MM, le=0.8 * MM, description="chamfer of the holes [m]")
+    peg_chamfer: Number = Field(
+        NOMINAL.peg_chamfer, ge=0.1 * MM, le=0.8 * MM, description="chamfer of the pegs' tips [m]"
+    )
     clearance: Number = Field(
-        DRAWN.clearance, ge=0.05 * MM, le=0.15 * MM, description="between a peg and its hole, on each side [m]"
+        NOMINAL.clearance,
+        ge=0.05 * MM,
+        le=0.15 * MM,
+        description="clearance between a peg and its hole on each side [m]",
     )
-    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="of pegs, holes and table")
+    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of pegs, holes and table")
 
     @field_validator("start_height")
     @classmethod
@@ -74,32 +80,33 @@ class GridClampOptions(Options):
         return value
 
     def workcell(self) -> GridClampWorkcell:
-        """The clamp and the table that are meant."""
+        """Return the workcell with these options."""
         dimensions = replace(
-            DRAWN.with_clearance(self.clearance), hole_chamfer=self.hole_chamfer, peg_chamfer=self.peg_chamfer
+            NOMINAL.with_clearance(self.clearance), hole_chamfer=self.hole_chamfer, peg_chamfer=self.peg_chamfer
         )
         return GridClampWorkcell(dimensions, friction=self.friction)
 
 
 HARD: dict[str, Any] = {"force_limit": 10.0}
-"""The force limit is the difficulty: what comes down anywhere but in a hole, and goes on, has pushed too hard before it
-has slid there by itself; the snap alone asks for six of the ten newtons."""
+"""Options of difficulty="hard": a lower force limit. A clamp that is pushed down outside of its holes exceeds it before
+it slides into them by itself; snapping in alone takes six of the ten newtons."""
 
 
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # [1/m], [1/N²]
-# Of coming nearer to the holes' axis [1/m], and of an end by too much force: steps are parts of a millimetre, and
-# whoever presses gently and long must not lose more than whoever gives up at once.
+# Reward towards the holes' axis [1/m] and terminal reward of a collision. Steps are fractions of a millimetre, and a
+# policy that presses gently for long must not lose more than one that ends the episode at once.
 ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
 
 REWARDS = ("shaped", "no_force", "sparse", "aligned")
 
 
 def reward_terms(reward: str, num_actions: int, action_repeat: int) -> list[RewardTerm]:
-    """ "shaped" is the thesis's, "no_force" the same without the cost of force, "sparse" without the distance gained.
+    """Return the terms of a reward.
 
-    "aligned" adds nearness to the holes' axis, which only a simulation knows and a policy does not see, and a cost of
-    pushing too hard. What the thesis gives once a decision is divided among its `action_repeat` control steps.
+    "shaped" is the thesis's, "no_force" omits the cost of force, and "sparse" the distance gained. "aligned" adds the
+    distance gained towards the holes' axis, a privileged reward because the policy does not observe it, and a cost of
+    collisions. Values that the thesis defines per action are divided among its `action_repeat` control steps.
     """
     terms = [
         RewardTerm("terminal_reward", {"termination": 1}, _terminal_reward),
@@ -135,29 +142,30 @@ def _collision_cost(termination: np.ndarray) -> float:
     return COLLISION_REWARD * (TERMINATIONS[int(termination[0])] == "collision")
 
 
-NUM_PLACES = 6  # where clamps are picked up
-# Parallel jaws centre what they close on; along the jaws, which is x, a clamp stays where it happened to be.
-ALONG_JAWS = 1.0 * MM  # the six places' offsets spread over ± this
+NUM_PLACES = 6  # pick-up places of clamps
+# Parallel jaws centre the clamp across the jaws, and not along them, which is x.
+ALONG_JAWS = 1.0 * MM  # half range of the six places' offsets
 ACROSS_JAWS = 0.2 * MM
-CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest error of the hole's place
+CALIBRATION = (1.8 * MM, 2.2 * MM)  # least and largest offset of the table
 REPEATABILITY = 0.1 * MM  # of one pick-up place
-KNOWN_RADIUS = 0.15 * MM
+KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with "none"
 
 
 class GridClampUncertainty(HiddenOffsets):
-    """Draws the offsets of table and clamp; `HiddenOffsets` has the options of a reset.
+    """Sampler of the offsets of table and clamp; `HiddenOffsets` has the options of a reset.
 
-    - "per_run": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp
-      offset of its own, all hidden and the same for a whole run. An episode picks up at one of the places, drawn, with
-      a repeatability of 0.1 mm. The thesis's case.
-    - "per_episode": the error of the table and the six grasp offsets are drawn anew every episode.
-    - "none": the clamp is within 0.15 mm of where it is thought to be.
+    - "per_run": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp offset,
+      all hidden and the same for a whole run. An episode picks up at a sampled place, with a repeatability of 0.1 mm.
+      This is the thesis's case.
+    - "per_episode": the offsets of the table and of the six places are sampled each episode.
+    - "none": the clamp is within 0.15 mm of its nominal place in the tool.
 
-    The option `offset` puts the clamp there in the tool and the table in its place.
+    The option `offset` sets the clamp's place in the tool, with the table at its nominal place.
     """
 
     def __init__(self, kind: str):
-        """
+        """Construct the sampler.
+
         Args:
             kind: "per_run", "per_episode" or "none".
         """
@@ -165,7 +173,7 @@ class GridClampUncertainty(HiddenOffsets):
         self.kind = kind
 
     def _draw_run(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """The table's offset (2,) and the grasp offsets (6, 2) of the places."""
+        """Sample the table's offset (2,) and the places' grasp offsets (6, 2)."""
         step = 2 * ALONG_JAWS / NUM_PLACES
         along = -ALONG_JAWS + step * (np.arange(NUM_PLACES) + rng.uniform(0.0, 1.0, NUM_PLACES))
         across = rng.uniform(-ACROSS_JAWS, ACROSS_JAWS, NUM_PLACES)
@@ -179,16 +187,15 @@ class GridClampUncertainty(HiddenOffsets):
         table, grasps = self._draw_run(rng) if self.kind == "per_episode" else run
         return table, grasps[rng.integers(NUM_PLACES)] + in_ring(rng, 0.0, REPEATABILITY)
 
-    def _given(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _offsets_of(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(2), offset
 
 
-SEATED_STEPS = 3  # control steps for which it must be seated before that counts
+SEATED_STEPS = 3  # consecutive control steps that count as seated
 
-# The command waits while the clamp is farther than this from it: 12 N, twice what the snap asks for.
-LEASH = 8.0 * MM
+MAX_TRACKING_ERROR = 8.0 * MM  # 12 N of the impedance, twice the force of snapping in
 
-START_BESIDE = 0.2 * MM  # along x and along y, where a clamp is handed over
+START_OFFSET = 0.2 * MM  # largest offset of the start along x and y
 
 
 def make_template() -> SharedControlTemplate:
@@ -198,9 +205,12 @@ def make_template() -> SharedControlTemplate:
 
 @register_task("GridClamp")
 class GridClamp(InsertionTask):
-    """Insert the clamp: "shaped" is the thesis's reward (3.11, 3.12), "no_force" the same without the cost of force,
-    "sparse" without the distance gained, "aligned" with nearness to the holes' axis. Without `active_constraints` only
-    the impedance's own limits of force hold a policy back."""
+    """Insert the clamp.
+
+    Rewards: "shaped" is the thesis's (3.11, 3.12), "no_force" omits the cost of force, "sparse" the distance gained,
+    and "aligned" adds the distance gained towards the holes' axis. Without `active_constraints`, only the impedance
+    limits the forces of a policy.
+    """
 
     Options = GridClampOptions
     options: GridClampOptions
@@ -214,53 +224,56 @@ class GridClamp(InsertionTask):
         super().__init__(config)
         self.offsets = GridClampUncertainty(self.options.fixture_offset)
         self.collision = Threshold("contact_force", self.options.force_limit)
-        # 100 decisions at 10 Hz unless given; the thesis's episodes take 140 on average.
+        # The default is 100 actions at 10 Hz; the thesis's episodes take 140 on average.
         self.num_steps = round(self.options.seconds / CONTROL_PERIOD)
         self._workcell = self.options.workcell()
 
     def workcell(self) -> GridClampWorkcell:
-        """A table with holes, a clamp in the tool."""
+        """Return the table with holes and the clamp in the tool."""
         return self._workcell
 
     def template(self) -> PlacedTemplate:
-        """One phase: a cuboid above the hole, upright."""
+        """Return the template with one phase: an upright clamp in a cuboid above the hole."""
         active = self.config.options["active_constraints"]
         return PlacedTemplate(
-            make_template(), {"hole": RigidTransform()}, active_constraints=active, max_tracking_error=LEASH
+            make_template(),
+            {"hole": RigidTransform()},
+            active_constraints=active,
+            max_tracking_error=MAX_TRACKING_ERROR,
         )
 
     def approach(self) -> ScriptedApproach:
-        """Straight down into the hole."""
+        """Return a straight descent into the hole."""
         parameters = make_template().parameters
         heights = (max(self.options.start_height), -parameters["push_m"])
         return ScriptedApproach(heights, speed=parameters["speed_m_per_s"], reach=parameters["width_m"] / 2)
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Position of the clamp in the hole's frame, and force."""
+        """Return the clamp's position in the hole's frame and the force."""
         first_three = (0, 1, 2)
         return ObservationTerm("pose", CENTRE[:3], SCALE[:3], first_three), ObservationTerm(
             "wrench", 0.0, SCALE[3:], first_three
         )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Equations 3.11 and 3.12."""
+        """Return the terms of equations 3.11 and 3.12, and those of the other rewards."""
         return reward_terms(self.config.reward, num_actions, self.config.action_repeat)
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Seated for a while, or pushed too hard."""
+        """Return success when seated, and collision above the force limit."""
         seated = TerminationTerm("success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=SEATED_STEPS)
         return [seated, self.force_limit()]
 
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Moves the table, and the clamp in the tool, by (x, y)."""
+        """Move the table, and the clamp in the tool, by (x, y)."""
         plant_context = station.plant.GetMyMutableContextFromRoot(context)
         self._workcell.set_table_offset(station.plant, plant_context, RigidTransform([*fixture, 0.0]))
         self._workcell.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece, 0.0]))
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """About where the skill before hands over."""
+        """Return a sampled pose of the hand-over by the preceding skill."""
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
-        start[:3] = *rng.uniform(-START_BESIDE, START_BESIDE, 2), rng.uniform(lowest, highest)
+        start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
         return start
 
     @classmethod
@@ -272,12 +285,12 @@ class GridClamp(InsertionTask):
         return {policy.__name__: policy for policy in ordered}
 
     def camera(self) -> Camera:
-        """Looks slightly down at the holes."""
+        """Return a camera that looks slightly down at the holes."""
         target = np.array(self._workcell.p_WG) + [0.0, 0.0, 0.01]
         return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=0.17, height=0.075))
 
     def scene(self) -> Scene:
-        """The cuboid that commands stay in, as high as the clamp begins."""
+        """Return the cuboid of commands, up to the start height."""
         to_world, parameters = in_frame(self._workcell.X_WT), make_template().parameters
         half = 0.5 * parameters["width_m"]
         edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))

@@ -1,4 +1,4 @@
-"""NarrowPassage: a planar robot that must get through a gap and around what was put in its way (4.4.1, 5.4.1)."""
+"""NarrowPassage: a planar robot passes a gap and obstacles (thesis, sections 4.4.1 and 5.4.1)."""
 
 from __future__ import annotations
 
@@ -34,9 +34,8 @@ from guiderail.systems.reward_system import RewardTerm
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
-USUAL = PassageGeometry()
-# Half way through the wide part behind the passage, on the demonstrations' mean.
-SECOND_OBSTACLE = (0.446, 0.78)
+DEFAULT_GEOMETRY = PassageGeometry()
+SECOND_OBSTACLE = (0.446, 0.78)  # [m] half way through the wide part behind the gap, on the demonstrations' mean
 
 HARD: Mapping[str, Any] = {
     "gap_width": 0.03,
@@ -46,43 +45,48 @@ HARD: Mapping[str, Any] = {
     "obstacles_end": True,
     "start_deviation": 0.03,
 }
-"""A passage half as wide, and a slalom around two obstacles that may not be touched: from left or right, as drawn."""
+"""A gap half as wide, and a slalom around two obstacles that end the episode when touched, on sampled sides."""
 
 
 class NarrowPassageOptions(Options):
-    """Of the passage."""
+    """Options of NarrowPassage."""
 
     gap_width: Number = Field(
-        round(USUAL.gap_x[1] - USUAL.gap_x[0], 9), ge=0.02, le=0.2, description="of the passage, for the centre [m]"
+        round(DEFAULT_GEOMETRY.gap_x[1] - DEFAULT_GEOMETRY.gap_x[0], 9),
+        ge=0.02,
+        le=0.2,
+        description="width of the gap for the robot's centre [m]",
     )
-    obstacle_radius: Number = Field(USUAL.obstacle_radius, ge=0.01, le=0.1, description="of the obstacles [m]")
-    second_obstacle: bool = Field(False, description="whether there is another obstacle behind the passage")
+    obstacle_radius: Number = Field(
+        DEFAULT_GEOMETRY.obstacle_radius, ge=0.01, le=0.1, description="radius of the obstacles [m]"
+    )
+    second_obstacle: bool = Field(False, description="add an obstacle behind the gap")
     obstacle_beside: Number = Field(
         0.0,
         ge=0,
         le=0.1,
-        description="how far beside their places obstacles stand, in turn left and right, as drawn [m]",
+        description="sampled lateral offset of the obstacles, alternately left and right [m]",
     )
-    obstacles_end: bool = Field(False, description="whether touching an obstacle ends an episode, as a collision")
+    obstacles_end: bool = Field(False, description="end the episode as a collision when an obstacle is touched")
     start_deviation: Number = Field(
-        0.0, ge=0, le=0.05, description="standard deviation of every start along x and y; 0: of held-out ones alone [m]"
+        0.0, ge=0, le=0.05, description="standard deviation of the start along x and y [m]; 0: held-out starts only"
     )
 
     @property
-    def drawn(self) -> bool:
-        """Whether a reset says where the obstacles are; otherwise there is the usual one, which only costs."""
+    def has_sampled_obstacles(self) -> bool:
+        """True if a reset sets the obstacles; otherwise there is the default one, which only costs reward."""
         return self.obstacle_beside > 0 or self.obstacles_end or self.second_obstacle
 
     def workcell(self) -> PassageGeometry:
-        """Where things usually are with these options."""
-        middle = 0.5 * (USUAL.gap_x[0] + USUAL.gap_x[1])
+        """Return the nominal geometry with these options."""
+        middle = 0.5 * (DEFAULT_GEOMETRY.gap_x[0] + DEFAULT_GEOMETRY.gap_x[1])
         default = self.gap_width == type(self).model_fields["gap_width"].default
         half = 0.5 * self.gap_width
         return PassageGeometry(
-            gap_x=USUAL.gap_x if default else (middle - half, middle + half),
+            gap_x=DEFAULT_GEOMETRY.gap_x if default else (middle - half, middle + half),
             obstacle_radius=self.obstacle_radius,
             second_obstacle=SECOND_OBSTACLE if self.second_obstacle else None,
-            obstacles_move=self.drawn,
+            obstacles_move=self.has_sampled_obstacles,
         )
 
 
@@ -101,33 +105,36 @@ def avoids_obstacle_from(rows: Any, cost: float = 1.0, streak: int = 5) -> int |
 
 
 class NarrowPassageReset(ResetOptions):
-    """Of a reset of the passage."""
+    """Options of a reset of NarrowPassage."""
 
     start: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="(x, y) [m] to start from, instead of where the demonstrations do"
+        None, min_length=2, max_length=2, description="(x, y) of the start [m]; default: that of the demonstrations"
     )
 
 
 SUCCESS_REWARD = 200.0
-PROGRESS = 100.0  # [1/m] of a shaped reward
+PROGRESS = 100.0  # shaped reward for progress [1/m]
 
 
-def reward_terms(reward: str, world: PassageGeometry, drawn: bool = False) -> list[RewardTerm]:
-    """ "sparse" is the thesis's, "shaped" adds how much nearer the goal came.
+def reward_terms(reward: str, geometry: PassageGeometry, has_sampled_obstacles: bool = False) -> list[RewardTerm]:
+    """Return the terms of a reward.
 
-    With `drawn` the obstacles are where the signal of this name says, and each costs.
+    Args:
+        reward: "sparse" is the thesis's (4.22 to 4.25); "shaped" adds the distance gained towards the goal.
+        geometry: Geometry of the passage.
+        has_sampled_obstacles: The signal `obstacles` holds the obstacles' positions, each of which costs.
     """
     two_poses = {"pose": 2, "last_pose": 2}
 
     def progress(pose: np.ndarray, last_pose: np.ndarray) -> float:
-        return PROGRESS * (math.dist(last_pose, world.goal) - math.dist(pose, world.goal))
+        return PROGRESS * (math.dist(last_pose, geometry.goal) - math.dist(pose, geometry.goal))
 
     def costs(pose: np.ndarray, obstacles: np.ndarray) -> float:
-        return sum(world.obstacle_cost(pose, obstacle) for obstacle in obstacles.reshape(-1, 2))
+        return sum(geometry.obstacle_cost(pose, obstacle) for obstacle in obstacles.reshape(-1, 2))
 
-    obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2}, world.obstacle_cost)
-    if drawn:
-        obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2, "obstacles": world.obstacles.size}, costs)
+    obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2}, geometry.obstacle_cost)
+    if has_sampled_obstacles:
+        obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2, "obstacles": geometry.obstacles.size}, costs)
     terms = [
         RewardTerm("action_cost", two_poses, lambda pose, last_pose: action_cost(pose - last_pose)),
         obstacle_cost,
@@ -144,21 +151,23 @@ BLOCKED_STEPS = 20
 BLOCKED_PROGRESS = 1e-4  # [m] along y
 
 
-def conditions(world: PassageGeometry, touching_ends: bool = False) -> list[TerminationTerm]:
-    """At the goal; or pressed against a wall, or stopped before it by a filter, and getting nowhere.
+def termination_terms(geometry: PassageGeometry, is_touching_collision: bool = False) -> list[TerminationTerm]:
+    """Return the termination terms: success at the goal, and blocked at a wall without progress.
 
-    With `touching_ends` also with the robot's centre in an obstacle, wherever the signal `obstacles` says that they
-    are, and first of all.
+    Args:
+        geometry: Geometry of the passage.
+        is_touching_collision: Also end the episode, with priority, when the robot's centre is in an obstacle of the
+            signal `obstacles`.
     """
 
     def blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:
-        return (contact_force[0] > 0 or fallback[0] > 0) and world.in_passage(pose)
+        return (contact_force[0] > 0 or fallback[0] > 0) and geometry.in_passage(pose)
 
     def touched(pose: np.ndarray, obstacles: np.ndarray) -> bool:
-        return any(world.obstacle_distance(pose, obstacle) < 0.0 for obstacle in obstacles.reshape(-1, 2))
+        return any(geometry.obstacle_distance(pose, obstacle) < 0.0 for obstacle in obstacles.reshape(-1, 2))
 
-    usual = [
-        TerminationTerm("success", {"pose": 2}, world.at_goal),
+    terms = [
+        TerminationTerm("success", {"pose": 2}, geometry.at_goal),
         TerminationTerm(
             "blocked",
             {"pose": 2, "contact_force": 1, "fallback": 1},
@@ -168,43 +177,46 @@ def conditions(world: PassageGeometry, touching_ends: bool = False) -> list[Term
             min_progress=BLOCKED_PROGRESS,
         ),
     ]
-    collision = TerminationTerm("collision", {"pose": 2, "obstacles": world.obstacles.size}, touched)
-    return [collision, *usual] if touching_ends else usual
+    collision = TerminationTerm("collision", {"pose": 2, "obstacles": geometry.obstacles.size}, touched)
+    return [collision, *terms] if is_touching_collision else terms
 
 
-# Phases, from -1 to 1, while the demonstrations are beside the first and the second obstacle.
-BESIDE = ((-0.8, -0.25), (0.1, 0.7))
-AWAY = 1.0  # of a full action
-# Where [phase, first obstacle, second obstacle] lie in an observation: x and y each, x as a side from -1 to 1.
+# Phases, from −1 to 1, in which the demonstrations pass the first and the second obstacle.
+PASSING = ((-0.8, -0.25), (0.1, 0.7))
+SLALOM_ACTION = 1.0
+# Indices into the observation [phase, first obstacle, second obstacle]: x and y each, x as a side from −1 to 1.
 PHASE, SIDES = 0, (1, 3)
 
 
 def scripted_slalom(observation: np.ndarray) -> np.ndarray:
-    """Away from the obstacle that is being passed, along x, (2,)."""
-    for (first, last), side in zip(BESIDE, SIDES, strict=True):
+    """Return an action away from the obstacle that is being passed, along x, (2,)."""
+    for (first, last), side in zip(PASSING, SIDES, strict=True):
         if first < observation[PHASE] < last:
-            return np.array([-AWAY * observation[side], 0.0])
+            return np.array([-SLALOM_ACTION * observation[side], 0.0])
     return np.zeros(2)
 
 
-IMAGE_SIZE = (144, 110)  # width and height of the policy's image (4.4.1, end)
-COMPONENTS = 20  # of the mixture: with 8 to 16 of them the passage is blurred
-FLOOR = 0.002  # [m], how well a hand repeats itself: added to the demonstrations' covariance as a standard deviation
-HELD_OUT_DEVIATION = 0.01  # [m] of a held-out start from the usual one
-FARTHEST_DRAW = 4.0  # deviations of a start along x and along y: one in 8000 draws would be farther, and is put there
-FARTHEST_START = 2.0  # [m] along x and y
+IMAGE_SIZE = (144, 110)  # width and height of the observed image [pixels] (4.4.1, end)
+COMPONENTS = 20  # of the mixture; 8 to 16 blur the gap
+FLOOR = 0.002  # [m] repeatability of a hand, added to the demonstrations' covariance as a standard deviation
+HELD_OUT_DEVIATION = 0.01  # [m] standard deviation of a held-out start
+MAX_DEVIATIONS = 4.0  # clip of a sampled start along x and y [standard deviations]: exceeded by 1 in 8000 samples
+MAX_START = 2.0  # [m] largest coordinate of a given start
 
 
 @lru_cache(maxsize=1)
 def reference_trajectory() -> ReferenceTrajectory:
-    """What the nine demonstrations have in common: Gaussian mixture and regression, fitted once a process."""
+    """Return the Gaussian mixture regression of the nine demonstrations, fitted once a process."""
     return ReferenceTrajectory.from_demonstrations(demonstrations.load(), components=COMPONENTS, floor=FLOOR)
 
 
 @register_task("NarrowPassage")
 class NarrowPassage(Task):
-    """Through the gap: "sparse" is the thesis's reward (4.22-4.25), "shaped" adds how much nearer the goal came, in
-    centimetres; "state" is the time in [-1, 1] (the thesis's policy state), "image" is 110 x 144 x 3."""
+    """Pass the gap to the goal.
+
+    Rewards: "sparse" is the thesis's (4.22 to 4.25), "shaped" adds the distance gained towards the goal in centimetres.
+    Observations: "state" is the time in [−1, 1] (the thesis's policy state), "image" is 110 × 144 × 3.
+    """
 
     workcell_kind = "plane"
     Options = NarrowPassageOptions
@@ -228,78 +240,75 @@ class NarrowPassage(Task):
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
-        self._world = self.options.workcell()
+        self._geometry = self.options.workcell()
 
     def workcell(self) -> PassageGeometry:
-        """Walls, a zone, an obstacle and a goal."""
-        return self._world
+        """Return the walls, the restricted zone, the obstacle and the goal."""
+        return self._geometry
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Where the obstacles are, one after the other."""
-        if not self.options.drawn:
+        """Return the obstacles' positions, one after the other, if a reset sets them."""
+        if not self.options.has_sampled_obstacles:
             return {}
-        self.drawn["obstacles"] = EpisodeConstant(builder, "obstacles", self._world.obstacles.size)
-        return {"obstacles": self.drawn["obstacles"].port}
+        self.episode_constants["obstacles"] = EpisodeConstant(builder, "obstacles", self._geometry.obstacles.size)
+        return {"obstacles": self.episode_constants["obstacles"].port}
 
     def reference(self) -> ReferenceTrajectory:
-        """Of the nine demonstrations."""
+        """Return the reference trajectory of the nine demonstrations."""
         return reference_trajectory()
 
     def constraints(self) -> LinearConstraints:
-        """The restricted zone is not entered."""
-        return self._world.constraints
+        """Return the constraint that the restricted zone is not entered."""
+        return self._geometry.constraints
 
     def keep_out(self) -> KeepOut:
-        """Walls and zone."""
-        return self._world.keep_out()
+        """Return the walls and the restricted zone."""
+        return self._geometry.keep_out()
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """The phase, and where obstacles are that a reset draws; or the plane from above, lying on its side: the way up
-        is to the right."""
+        """Return the phase and sampled obstacles, or the camera above the plane, whose image shows +y to the right."""
         if self.config.observation == "state":
-            usual = self._world.obstacles.ravel()
-            beside = ObservationTerm("obstacles", usual, self.options.obstacle_beside or 1.0)
-            return (ObservationTerm("phase"), beside) if self.options.obstacle_beside else (ObservationTerm("phase"),)
+            offset = self.options.obstacle_beside
+            obstacles = ObservationTerm("obstacles", self._geometry.obstacles.ravel(), offset or 1.0)
+            return (ObservationTerm("phase"), obstacles) if offset else (ObservationTerm("phase"),)
         R_WC = RotationMatrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
         return Camera(IMAGE_SIZE, np.deg2rad(30), RigidTransform(R_WC, [0.42, 0.5, 1.5]))
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Of the way gone, the obstacle and the goal; of the way to the goal where the reward is shaped."""
-        return reward_terms(self.config.reward, self._world, self.options.drawn)
+        """Return costs of motion and obstacles, the terminal reward, and progress with the shaped reward."""
+        return reward_terms(self.config.reward, self._geometry, self.options.has_sampled_obstacles)
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """At the goal, or getting nowhere; where touching obstacles ends an episode, that."""
-        return conditions(self._world, self.options.obstacles_end)
+        """Return success, blocked, and collision with an obstacle if it ends the episode."""
+        return termination_terms(self._geometry, self.options.obstacles_end)
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Starts where the demonstrations do, or as far beside it as it is asked for; held out, a little beside it."""
-        start, obstacles = reference_trajectory().means[0].copy(), self._world.obstacles
+        """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles at sampled sides."""
+        start, obstacles = reference_trajectory().means[0].copy(), self._geometry.obstacles
         deviation = self._start_deviation(options.held_out)
-        if self.options.drawn:
+        if self.options.has_sampled_obstacles:
             rng = episode_stream(rng, options.held_out)
             sides = (-1.0) ** (rng.integers(2) + np.arange(len(obstacles)))
             obstacles[:, 0] += self.options.obstacle_beside * sides
         if deviation:
-            start = start + deviation * np.clip(rng.standard_normal(2), -FARTHEST_DRAW, FARTHEST_DRAW)
+            start = start + deviation * np.clip(rng.standard_normal(2), -MAX_DEVIATIONS, MAX_DEVIATIONS)
         if options.start is not None:
             start = np.array(options.start)
-        if np.abs(start).max() > FARTHEST_START:
-            raise InputError(
-                f"the reset option 'start' is at most {FARTHEST_START:g} m along x and y, not {start.tolist()}"
-            )
+        if np.abs(start).max() > MAX_START:
+            raise InputError(f"the reset option 'start' is at most {MAX_START:g} m along x and y, not {start.tolist()}")
         station.set_pose(context, start)
-        if not self.options.drawn:
+        if not self.options.has_sampled_obstacles:
             return {"start": start}
         assert isinstance(station, PlaneStation)
-        self.drawn["obstacles"].set(context, obstacles.ravel())
+        self.episode_constants["obstacles"].set(context, obstacles.ravel())
         station.set_obstacles(context, obstacles)
         return {"start": start, "obstacles": obstacles}
 
     def start_within(self) -> float:
-        """As far as a start is drawn, held out or not."""
-        return FARTHEST_DRAW * max(self._start_deviation(held_out) for held_out in (False, True))
+        """Return the largest start offset of a reset, training or held-out [m]."""
+        return MAX_DEVIATIONS * max(self._start_deviation(held_out) for held_out in (False, True))
 
     def _start_deviation(self, held_out: bool) -> float:
         return self.options.start_deviation or (HELD_OUT_DEVIATION if held_out else 0.0)
@@ -311,13 +320,13 @@ class NarrowPassage(Task):
         return {policy.__name__: policy for policy in policies}
 
     def camera(self) -> Camera:
-        """The plane from above."""
+        """Return a camera above the plane."""
         X_WC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.4, 0.5, 1.5])
         return Camera((480, 640), np.deg2rad(40), X_WC)
 
     def scene(self) -> Scene:
-        """The demonstrations, and the edge of the zone."""
-        edge = np.array([[self._world.zone_x, -0.1, 0.0], [self._world.zone_x, 1.1, 0.0]])
+        """Return the demonstrations and the edge of the restricted zone."""
+        edge = np.array([[self._geometry.zone_x, -0.1, 0.0], [self._geometry.zone_x, 1.1, 0.0]])
         return Scene(
             to_world=in_plane,
             demonstrations=tuple(demonstrations.load().outputs),

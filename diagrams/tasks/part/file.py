@@ -1,4 +1,4 @@
-"""A task folder's `task.yaml`: every number of a task made of two meshes, in one file that a person reads and edits."""
+"""File `task.yaml` of a task folder: every number of a task of two meshes, to be read and edited by users."""
 
 from __future__ import annotations
 
@@ -30,44 +30,50 @@ _LARGEST = float(np.finfo(float).max)
 
 
 class Piece(Options):
-    """A mesh that touches."""
+    """Collision mesh."""
 
-    file: str = Field(description="OBJ beside this file, in the target frame [m]")
-    modulus: Number | None = Field(None, gt=0, description="[Pa] of a compliant convex mesh; none is rigid")
-    friction: Number = Field(0.2, ge=0, le=2, description="of the surface, static and dynamic")
-    # What is pressed in a millionth of a metre too deep within a step would otherwise be thrown out by it: with 100 s/m
-    # nothing leaves a contact faster than 10 mm/s.
-    dissipation: Number = Field(100.0, ge=0, description="Hunt and Crossley's [s/m]")
+    file: str = Field(description="OBJ file next to this file, in the target frame [m]")
+    modulus: Number | None = Field(
+        None, gt=0, description="hydroelastic modulus of a compliant convex mesh [Pa]; default: rigid"
+    )
+    friction: Number = Field(0.2, ge=0, le=2, description="friction coefficient of the surface, static and dynamic")
+    # A contact that is a micrometre too deep after a step would otherwise eject the plug: with 100 s/m nothing leaves a
+    # contact faster than 10 mm/s.
+    dissipation: Number = Field(100.0, ge=0, description="Hunt-Crossley dissipation [s/m]")
 
 
 class PartModel(Options):
-    """Of the plug or the socket."""
+    """Model of the plug or the socket."""
 
-    source: str = Field("", description="the file that it was made of")
-    visual: str = Field(description="OBJ that is seen, in the target frame [m]")
-    mass: Number = Field(gt=0, description="[kg]")
-    centre: Numbers = Field(min_length=3, max_length=3, description="of mass, in the target frame [m]")
+    source: str = Field("", description="source file")
+    visual: str = Field(description="OBJ file of the visual, in the target frame [m]")
+    mass: Number = Field(gt=0, description="mass [kg]")
+    centre: Numbers = Field(min_length=3, max_length=3, description="centre of mass in the target frame [m]")
     gyration: Number = Field(gt=0, description="radius of gyration [m]")
-    pieces: tuple[Piece, ...] = Field(min_length=1, description="what touches")
+    pieces: tuple[Piece, ...] = Field(min_length=1, description="collision meshes")
 
 
 class MotionNumbers(Options):
-    """How the plug goes in along z of the target frame."""
+    """Motion of the plug along z of the target frame."""
 
     travel: Number = Field(gt=0, le=0.5, description="height of the start above the target [m]")
     rim: Number = Field(gt=0, le=0.5, description="height at which the plug stands on the rim [m]")
-    turn: Number = Field(0.0, ge=-180, le=180, description="about z, at the bottom [degrees]")
-    push: Number = Field(4.0 * MM, ge=0, le=30 * MM, description="commanded below the target while it goes in [m]")
-    press: Number = Field(2.5 * MM, ge=0, le=10 * MM, description="commanded below the rim while it searches [m]")
+    turn: Number = Field(0.0, ge=-180, le=180, description="turn about z at the bottom [degrees]")
+    push: Number = Field(
+        4.0 * MM, ge=0, le=30 * MM, description="depth of the command below the target while it is inserted [m]"
+    )
+    press: Number = Field(
+        2.5 * MM, ge=0, le=10 * MM, description="depth of the command below the rim during a search [m]"
+    )
 
 
 class Tolerance(Options):
-    """Success by pose: how far from the target the plug may be, in the socket."""
+    """Largest deviation of the plug from the target at success."""
 
     height: Number = Field(0.5 * MM, gt=0, description="along z [m]")
-    beside: Number = Field(1.0 * MM, gt=0, description="across it [m]")
+    beside: Number = Field(1.0 * MM, gt=0, description="across z [m]")
     turn: Number = Field(4.0, gt=0, description="about z [degrees]")
-    steps: int = Field(3, ge=1, description="control steps for which it must hold")
+    steps: int = Field(3, ge=1, description="consecutive control steps that count as success")
 
 
 class Bounds(Options):
@@ -76,7 +82,10 @@ class Bounds(Options):
     lower: tuple[Any, ...]
     upper: tuple[Any, ...]
     phases: tuple[Number, ...] | None = Field(
-        None, min_length=1, validate_default=True, description="where in the motion each list begins to hold, from 0 on"
+        None,
+        min_length=1,
+        validate_default=True,
+        description="fraction of the motion from which each list applies; the first is 0",
     )
 
     @field_validator("lower", "upper")
@@ -91,7 +100,7 @@ class Bounds(Options):
     @classmethod
     def _fit(cls, phases: tuple[float, ...] | None, others: ValidationInfo) -> tuple[float, ...] | None:
         if not {"lower", "upper"} <= others.data.keys():
-            return phases  # what is wrong with those is said of them
+            return phases  # the error of those fields is reported instead
         lower, upper = _filled(others.data["lower"], -np.inf), _filled(others.data["upper"], np.inf)
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
             raise ValueError("bounds that change need phases, and a list of lower and of upper ones for each")
@@ -103,11 +112,11 @@ class Bounds(Options):
         return phases
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper, each (6,) or one row a phase (K, 6), infinite where there is none."""
+        """Return lower and upper bounds, (6,) or one row for each phase (K, 6), infinite if absent."""
         return _filled(self.lower, -np.inf), _filled(self.upper, np.inf)
 
     def constraints(self, num_steps: int) -> LinearConstraints:
-        """G y ≥ c: the same at each of N steps, or those of the phase that a step is in."""
+        """Return G y ≥ c, constant or of the phase of each of `num_steps` steps."""
         lower, upper = self.arrays()
         if self.phases is None:
             return LinearConstraints.box(lower, upper)
@@ -116,7 +125,7 @@ class Bounds(Options):
 
 
 def _is_row(row: Any) -> bool:
-    # Asked this way round, what is no number is none either, and so is one that no double holds.
+    # The comparison is also false for NaN and for integers beyond the range of doubles.
     return (
         isinstance(row, list | tuple)
         and len(row) == POSE_SIZE
@@ -134,26 +143,28 @@ def _replaced(rows: Any, missing: float) -> Any:
     return missing if rows is None else rows
 
 
-class Shown(Options):
+class DemonstrationFile(Options):
     """Demonstrations in the folder."""
 
-    file: str = Field("demonstrations.npz", description=".npz or .csv, poses in the target frame")
-    components: int | None = Field(None, ge=1, description="of their mixture; by information criterion unless given")
+    file: str = Field("demonstrations.npz", description="file .npz or .csv of poses in the target frame")
+    components: int | None = Field(
+        None, ge=1, description="components of their mixture; default: by information criterion"
+    )
     floor: Numbers = Field(
         REPEATABILITY_STD,
         min_length=6,
         max_length=6,
-        description="standard deviation that a hand has anyway [m], [rad]",
+        description="standard deviation of a hand, added to theirs [m], [rad]",
     )
 
 
 class Recommended(Options):
-    """How it is learned where nobody says otherwise."""
+    """Defaults of environment and learner."""
 
     environment: dict[str, Any] = Field(
         {
             "fixture_offset": "per_episode",
-            "offset_range": (1.5 * MM, 2.0 * MM),  # as far off as a straight insertion must fail, and as bounds allow
+            "offset_range": (1.5 * MM, 2.0 * MM),  # a straight insertion must fail, and the bounds must allow it
             "observation": "center_of_pressure",
             "reward": "aligned",
             "action_repeat": 5,
@@ -162,31 +173,35 @@ class Recommended(Options):
     )
     learner: dict[str, Any] = Field(
         {"algorithm": "tqc", "preset": "tqc_contact", "settings": {"symmetry": "near"}},
-        description="algorithm, preset, and settings in place of the preset's",
+        description="algorithm, preset, and settings that override the preset",
     )
 
 
 class PartTaskFile(Options):
-    """What a task folder says."""
+    """Content of `task.yaml`."""
 
     format: str = FILE_FORMAT
-    name: str = Field(pattern=r"^[\w:-]+/[\w:.-]+$", description="what the task is called")
+    name: str = Field(pattern=r"^[\w:-]+/[\w:.-]+$", description="name of the task")
     plug: PartModel
     socket: PartModel
-    place: Numbers = Field((0.55, 0.0, 0.15), min_length=3, max_length=3, description="of the target in the world [m]")
-    scenario: tuple[str, ...] = Field((), description="Drake model directives (.yaml) of what else stands there")
+    place: Numbers = Field(
+        (0.55, 0.0, 0.15), min_length=3, max_length=3, description="position of the target in the world [m]"
+    )
+    scenario: tuple[str, ...] = Field((), description="Drake model directives (.yaml) of further objects")
     motion: MotionNumbers
     tolerance: Tolerance = Tolerance.model_validate({})
     bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})
-    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
-    time_step: Number | None = Field(None, gt=0, description="of the simulation [s]; its own unless given")
-    stiction_tolerance: Number = Field(1e-5, gt=0, description="how fast a contact that sticks may creep [m/s]")
-    demonstrations: Shown = Shown.model_validate({})
-    action_dims: tuple[int, ...] | None = Field((0, 1), description="outputs that a policy moves")
-    sides: tuple[str, ...] = Field((), description="from which the parts look the same: see models/parts/sides.py")
-    rim_sides: tuple[str, ...] = Field((), description="from which a plug on the rim feels nearly the same")
+    force_limit: Number = Field(
+        COLLISION_FORCE, ge=1, le=60, description="force that ends an episode as a collision [N]"
+    )
+    time_step: Number | None = Field(None, gt=0, description="time step of the simulation [s]; default: the station's")
+    stiction_tolerance: Number = Field(1e-5, gt=0, description="largest creep of a sticking contact [m/s]")
+    demonstrations: DemonstrationFile = DemonstrationFile.model_validate({})
+    action_dims: tuple[int, ...] | None = Field((0, 1), description="indices of the outputs that an action moves")
+    sides: tuple[str, ...] = Field((), description="symmetries of both parts: see models/parts/symmetry.py")
+    rim_sides: tuple[str, ...] = Field((), description="symmetries that nearly hold for a plug on the rim")
     recommended: Recommended = Recommended.model_validate({})
-    measured: dict[str, Any] = Field({}, description="what onboarding measured; nothing reads it")
+    measured: dict[str, Any] = Field({}, description="measurements of create-task, for information only")
 
     @field_validator("time_step")
     @classmethod
@@ -198,56 +213,58 @@ class PartTaskFile(Options):
     def _are_sides(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for name in value:
             if name not in SYMMETRIES:
-                raise ValueError(f"there is no side {name!r}: {did_you_mean(name, SYMMETRIES)}")
+                raise ValueError(f"there is no symmetry {name!r}: {did_you_mean(name, SYMMETRIES)}")
         return value
 
     @property
     def files(self) -> tuple[str, ...]:
-        """The files that it names, beside it."""
+        """Names of the files that it refers to, in its folder."""
         models = (self.plug, self.socket)
         meshes = [*(model.visual for model in models), *(piece.file for model in models for piece in model.pieces)]
         return (*meshes, self.demonstrations.file, *self.scenario)
 
     @cached_property
     def turn(self) -> float:
-        """The turn at the bottom [rad]."""
+        """Turn at the bottom [rad]."""
         return self.motion.turn * DEGREE
 
 
 def read_task_file(folder: Path) -> PartTaskFile:
-    """The task of a folder.
+    """Read the task of a folder.
 
     Raises:
-        InputError: if it is none, something in it makes no sense, or a file that it names is missing.
+        InputError: If the folder is missing or not a task, a value is invalid, or a file that it names is missing.
     """
     path = folder / FILE_NAME
+    if not folder.is_dir():
+        raise InputError(f"there is no task folder {folder}: restore it, or make it by guiderail create-task")
     if not path.is_file():
-        raise InputError(f"{folder} is no task: it has no {FILE_NAME}; guiderail onboard makes one")
+        raise InputError(f"{folder} is no task: it has no {FILE_NAME}; guiderail create-task makes one")
     data = load_yaml(path, "task")
     if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
         raise InputError(f"{path} is no task: its first line must be 'format: {FILE_FORMAT}'")
     file = validate_options(PartTaskFile, data, str(path))
     for name in file.files:
         if not (folder / name).is_file():
-            raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or onboard the parts again")
+            raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or create the task again")
     return file
 
 
 def task_folder_digest(folder: Path) -> str:
-    """A digest of what decides a task: what its file says but for what was measured, and the files that it names.
+    """Return a digest of a task: of its file without the measurements, and of the files that it names.
 
     Raises:
-        InputError: as `read_task_file`.
+        InputError: As `read_task_file`.
     """
     file = read_task_file(folder)
-    found = hashlib.blake2b(file.model_dump_json(exclude={"measured"}).encode(), digest_size=16)
+    content = hashlib.blake2b(file.model_dump_json(exclude={"measured"}).encode(), digest_size=16)
     for name in file.files:
-        found.update(hashlib.blake2b((folder / name).read_bytes()).digest())
-    return found.hexdigest()
+        content.update(hashlib.blake2b((folder / name).read_bytes()).digest())
+    return content.hexdigest()
 
 
 def write_task_file(folder: Path, file: PartTaskFile) -> Path:
-    """Writes `task.yaml`; what it holds reads back as the same."""
+    """Write `task.yaml`; reading it returns an equal task."""
     path = folder / FILE_NAME
     values = _plain(file.model_dump())
     text = yaml.safe_dump(values, sort_keys=False, width=110, default_flow_style=None)

@@ -1,4 +1,4 @@
-"""A task of two meshes: its folder says every number, and makes it a task as those that come along are."""
+"""Task of two meshes, whose folder declares every number."""
 
 from __future__ import annotations
 
@@ -51,23 +51,28 @@ WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
 class PartOptions(FixtureOffsetOptions):
-    """Of a task of two meshes."""
+    """Options of a task of two meshes."""
 
     start_offset_max: Number = Field(
-        0.0, ge=0, le=2 * MM, description="how far beside its start the tool may begin [m]"
+        0.0, ge=0, le=2 * MM, description="largest sampled offset of the start along x and y [m]"
     )
-    force_limit: Number = Field(COLLISION_FORCE, ge=1, le=60, description="more than that ends an episode [N]")
+    force_limit: Number = Field(
+        COLLISION_FORCE, ge=1, le=60, description="force that ends an episode as a collision [N]"
+    )
 
 
 class PartInsertion(InsertionTask):
-    """Insert a plug into a socket: "sparse" costs action and force and rewards the end, "shaped" adds the depth gained,
-    "aligned" nearness to the socket's axis, too.
+    """Insert a plug into a socket.
+
+    Rewards: "sparse" has costs of action and force and a terminal reward, "shaped" adds the depth gained, and "aligned"
+    also the distance gained towards the socket's axis.
 
     Attributes:
-        folder: of the task.
-        file: what `task.yaml` says.
+        folder: Folder of the task.
+        file: Content of `task.yaml`.
     """
 
+    excluded_stations = ("mujoco",)  # it simulates analytic surfaces, not meshes
     Options = PartOptions
     options: PartOptions
     workpiece, fixture = PLUG, SOCKET
@@ -84,40 +89,40 @@ class PartInsertion(InsertionTask):
         self.num_steps = self.reference().num_steps
 
     def workcell(self) -> PartWorkcell:
-        """The socket in the world, the plug in the tool."""
+        """Return the socket in the world and the plug in the tool."""
         return self._workcell
 
     @cached_property
     def _workcell(self) -> PartWorkcell:
-        return workcell(self.folder, self.file)
+        return write_workcell(self.folder, self.file)
 
     def reference(self) -> ReferenceTrajectory:
-        """Of the folder's demonstrations."""
-        shown = self.file.demonstrations
-        return reference_of_file(self.folder / shown.file, shown.components, shown.floor)
+        """Return the reference trajectory of the folder's demonstrations."""
+        source = self.file.demonstrations
+        return reference_of_file(self.folder / source.file, source.components, source.floor)
 
     def constraints(self) -> LinearConstraints:
-        """The folder's bounds."""
+        """Return the folder's bounds."""
         return self.file.bounds.constraints(self.reference().num_steps)
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:
-        """As of every task; but what is to be kept out of can't change on the way."""
+        """Return the kinds of prior knowledge; walls to keep out of cannot change between phases."""
         changes = cls.file.bounds.phases is not None
         return tuple(one for one in super().provides() if not (one == "keep_out" and changes))
 
     def keep_out(self) -> KeepOut:
-        """No walls are known: what safe residual learning is projected to are the bounds alone."""
+        """Return no walls: safe residual learning is projected to the bounds alone."""
         return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Beside where the plug is, the lever of what it stands on."""
+        """Return the plug's pose in the socket and the center of pressure."""
         lever = builder.AddNamedSystem("center_of_pressure", CenterOfPressure(MIN_CONTACT_FORCE))
         builder.Connect(station.get_wrench_output_port(), lever.get_wrench_input_port())
         return {**super().signals(builder, station), "center_of_pressure": lever.get_center_of_pressure_output_port()}
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Time, pose and wrench; "center_of_pressure" adds the contact's lever and the commanded x and y."""
+        """Return time, pose and wrench, and with "center_of_pressure" that and the commanded x and y."""
         half = 0.5 * self.num_steps * CONTROL_PERIOD
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         centre = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
@@ -136,23 +141,23 @@ class PartInsertion(InsertionTask):
         )
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Of actions, forces and the end; of depth and nearness where the reward says so."""
+        """Return the terms of `config.reward`."""
         return reward_terms(self.config.reward, num_actions)
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """At the target for a while, or pushed too hard."""
+        """Return success at the target, and collision above the force limit."""
         seated = TerminationTerm("success", {PLUG: POSE_SIZE}, self.is_seated, steps=self.file.tolerance.steps)
         return [seated, self.force_limit()]
 
     def symmetry(self) -> Symmetry | None:
-        """The sides from which both parts look the same."""
-        return self._seen_from(self.file.sides)
+        """Return the symmetries of both parts."""
+        return self._select_symmetries(self.file.sides)
 
     def near_symmetry(self) -> Symmetry | None:
-        """And those from which a plug on the rim feels nearly the same."""
-        return self._seen_from((*self.file.sides, *self.file.rim_sides))
+        """Return these and the symmetries that nearly hold for a plug on the rim."""
+        return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
 
-    def _seen_from(self, names: Sequence[str]) -> Symmetry | None:
+    def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
         action_dims = self.config.options["action_dims"]
         every = sides_of_the_rim(self.config.observation, range(POSE_SIZE) if action_dims is None else action_dims)
         chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
@@ -160,7 +165,7 @@ class PartInsertion(InsertionTask):
 
     @classmethod
     def is_seated(cls, plug: np.ndarray) -> bool:
-        """Whether a plug at `plug`, position and rotation vector in the socket (6,), is at the target."""
+        """Return True if a plug, as position and rotation vector in the socket (6,), is at the target."""
         tolerance = cls.file.tolerance
         return bool(
             abs(plug[2]) < tolerance.height
@@ -169,28 +174,28 @@ class PartInsertion(InsertionTask):
         )
 
     def set_part_offsets(self, station: Station, context: Context, fixture: np.ndarray, workpiece: np.ndarray) -> None:
-        """Moves the socket, and the plug in the tool, by (x, y)."""
+        """Move the socket, and the plug in the tool, by (x, y)."""
         plant_context = station.plant.GetMyMutableContextFromRoot(context)
-        world = self.workcell()
+        workcell = self.workcell()
         turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
-        world.set_socket_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
-        world.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
+        workcell.set_socket_offset(station.plant, plant_context, RigidTransform(turn, [*fixture[:2], 0.0]))
+        workcell.set_grasp_offset(station.plant, plant_context, RigidTransform([*workpiece[:2], 0.0]))
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """Where the demonstrations start, or somewhere beside it, inside the bounds."""
+        """Return the demonstrations' start plus a sampled offset, inside the bounds."""
         start = self.reference().means[0].copy()
         if self.options.start_offset_max > 0.0:
             start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
         return self.constraints().nearest(start)
 
     def camera(self) -> Camera:
-        """Looks slightly down at the socket."""
+        """Return a camera that looks slightly down at the socket."""
         size = self.file.motion.travel
         target = np.array(self.file.place) + [0.0, 0.0, 0.5 * size]
         return Camera((640, 480), np.deg2rad(30.0), look_from_front(target, distance=6 * size, height=3 * size))
 
     def scene(self) -> Scene:
-        """The demonstrations, and the box that commands stay in, in each phase."""
+        """Return the demonstrations and the box of the bounds of each phase."""
         to_world, size = in_frame(self.workcell().X_WT), self.file.motion.travel
         near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
         lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())
@@ -206,11 +211,11 @@ class PartInsertion(InsertionTask):
         )
 
 
-def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
-    """What a task folder is about, its SDF files written beside its meshes.
+def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
+    """Write the SDF files of a task folder next to its meshes, and return its workcell.
 
     Raises:
-        InputError: if they can't be written.
+        InputError: If they cannot be written.
     """
     for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
         text = part_sdf(
@@ -224,7 +229,7 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         )
         path = folder / f"{name}.sdf"
         if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            write_atomically(path, text.encode())  # other processes read it too
+            write_atomically(path, text.encode())  # other processes read it at the same time
     return PartWorkcell(
         str(folder / f"{PLUG}.sdf"),
         str(folder / f"{SOCKET}.sdf"),
@@ -235,10 +240,10 @@ def workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
 
 
 def load_task_folder(folder: Path) -> type[PartInsertion]:
-    """The task of a folder, as a class that a registry takes.
+    """Return the task class of a folder.
 
     Raises:
-        InputError: if it is no task folder, or something in it makes no sense.
+        InputError: As `read_task_file`.
     """
     folder = folder.resolve()
     return _task_class(folder, task_folder_digest(folder))
@@ -246,7 +251,7 @@ def load_task_folder(folder: Path) -> type[PartInsertion]:
 
 @cache
 def _task_class(folder: Path, content: str) -> type[PartInsertion]:
-    """One class for each folder and what is in it, so that environments of it can share diagrams."""
+    """Return one class for each folder and content, so that its environments can share diagrams."""
     file = read_task_file(folder)
     defaults = {
         "guidance": "skgrl",

@@ -1,4 +1,4 @@
-"""A workcell of two meshes that somebody brought: a socket in the world, a plug in the tool."""
+"""Workcell of two meshes: a socket in the world and a plug in the tool."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ PLUG, SOCKET = "plug", "socket"
 
 @dataclass(frozen=True)
 class PartWorkcell:
-    """A socket at its place and a plug in the tool; both meshes are drawn in the target frame, in which they are
-    assembled.
+    """Socket in the world and plug in the tool; both meshes are in the target frame, in which they are assembled.
 
-    Args:
-        plug_sdf, socket_sdf: paths of the models.
-        place: where the target is in the world, (3,) [m].
-        stiction_tolerance: how fast a contact that sticks may creep [m/s].
-        scenario: files of Drake model directives of what else stands there.
+    Attributes:
+        plug_sdf: Path of the plug's model.
+        socket_sdf: Path of the socket's model.
+        place: Position of the target in the world, (3,) [m].
+        stiction_tolerance: Largest creep of a sticking contact [m/s].
+        scenario: Paths of Drake model directives of further objects.
     """
 
     plug_sdf: str
@@ -38,11 +38,11 @@ class PartWorkcell:
 
     @property
     def X_WT(self) -> RigidTransform:
-        """The target: the plug in the nominal socket."""
+        """Pose of the target: the plug in the nominal socket."""
         return RigidTransform(np.array(self.place))
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
-        """Adds the socket, on a frame that `set_socket_offset` moves, and what the scenario places."""
+        """Add the socket, on a frame that `set_socket_offset` moves, and the objects of the scenario."""
         plant.set_stiction_tolerance(self.stiction_tolerance)
         model = add_model(plant, self.socket_sdf)
         mount = plant.AddFrame(FixedOffsetFrame("socket_mount", plant.world_frame(), self.X_WT))
@@ -51,7 +51,7 @@ class PartWorkcell:
             add_models(plant, file)
 
     def add_workpiece(self, plant: MultibodyPlant, tool_centre: Frame) -> RigidBody:
-        """Adds the plug, on a frame that `set_grasp_offset` moves."""
+        """Add the plug, on a frame that `set_grasp_offset` moves."""
         model = add_model(plant, self.plug_sdf)
         grasp = plant.AddFrame(FixedOffsetFrame("grasp", tool_centre, RigidTransform()))
         plug = plant.GetBodyByName(PLUG, model)
@@ -59,12 +59,12 @@ class PartWorkcell:
         return plug
 
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        """Nothing: every piece of the plug may meet every piece of the socket."""
+        """Filter nothing: every piece of the plug may touch every piece of the socket."""
 
     def set_socket_offset(self, plant: MultibodyPlant, plant_context, X_TTactual: RigidTransform) -> None:
-        """Moves the socket so that the plug seats at X_TTactual instead of at the target."""
+        """Move the socket so that the plug seats at X_TTactual instead of at the target."""
         movable_frame(plant, "socket_mount").SetPoseInParentFrame(plant_context, self.X_WT @ X_TTactual)
 
     def set_grasp_offset(self, plant: MultibodyPlant, plant_context, X_PPlug: RigidTransform) -> None:
-        """Moves the plug in the tool."""
+        """Move the plug in the tool."""
         movable_frame(plant, "grasp").SetPoseInParentFrame(plant_context, X_PPlug)

@@ -1,4 +1,4 @@
-"""What pouring can be asked for, and what is hard about it."""
+"""Options of Pouring, the overrides of difficulty="hard", and its templates."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, Ball
 from guiderail.models.templates import SharedControlTemplate, load_template
 
-FULL_SPEED = 0.15  # [m/s] of a full input, along one axis
+FULL_SPEED = 0.15  # speed of a full input along one axis [m/s]
 FULL_TILT = 0.8  # [rad/s]
-# What is rewarded only once it is done is found only if random inputs sometimes do it.
-SPARSE_INPUT_SPEED = 1.7
+SPARSE_INPUT_SPEED = 1.7  # a sparse reward is only found if random inputs sometimes succeed
 
 
 def make_template(config: PouringConfig, input_speed: float = 1.0) -> SharedControlTemplate:
@@ -51,9 +50,9 @@ def frames_of(template: SharedControlTemplate, X_TMug: RigidTransform) -> dict[s
     return {"mug_tip": X_TMug}
 
 
-MAX_MUG_OFFSET = 0.04  # [m] along x and y: farther off the arm would reach few of the starts
+MAX_MUG_OFFSET = 0.04  # [m] along x and y; beyond it the arm reaches few of the starts
 POSITION_SCALE = 5.0  # [1/m] makes positions near the mug as large as angles in the observation
-MAX_MUG_ERROR = 0.06  # [m] as far as an aimed Pour leads from where the mug is believed
+MAX_MUG_ERROR = 0.06  # [m] largest distance that an aimed Pour leads from the believed mug
 
 HARD: Mapping[str, Any] = {
     "aim": True,
@@ -62,58 +61,61 @@ HARD: Mapping[str, Any] = {
     "mug_inner_diameter": 0.07,
     "time_limit": 6.0,
 }
-"""The mug stands elsewhere than the template believes, anew every episode, and whoever pours has to see that."""
+"""Options of difficulty="hard": the mug is not where the template assumes, by an error that is sampled and observed."""
 
 
 MOST_BALLS = 8
 
 
 class PouringOptions(Options):
-    """Of pouring."""
+    """Options of Pouring."""
 
-    balls: Integer = Field(2, ge=2, le=MOST_BALLS, description="how many are poured")
+    balls: Integer = Field(2, ge=2, le=MOST_BALLS, description="number of balls")
     balls_in: Integer | None = Field(
-        None, ge=1, le=MOST_BALLS, description="how many of them have to be in the mug; all of them unless given"
+        None, ge=1, le=MOST_BALLS, description="balls that have to be in the mug; default: all"
     )
-    ball_diameter: Number = Field(Ball().diameter, ge=0.02, le=0.045, description="[m]")
+    ball_diameter: Number = Field(Ball().diameter, ge=0.02, le=0.045, description="diameter of a ball [m]")
     input_speed: Number | None = Field(
-        None, ge=0.2, le=2.0, description="how much faster the template's inputs are; 1, and 1.7 where sparse, if None"
+        None,
+        ge=0.2,
+        le=2.0,
+        description="factor of the template's input speed; default: 1, or 1.7 with the sparse reward",
     )
-    mug_inner_diameter: Number = Field(MUG.inner_diameter, description="of the mug that stands there [m]")
-    mug_depth: Number = Field(MUG.depth, description="[m]")
+    mug_inner_diameter: Number = Field(MUG.inner_diameter, description="inner diameter of the mug [m]")
+    mug_depth: Number = Field(MUG.depth, description="inner depth of the mug [m]")
     mug_offset: Number = Field(
-        0.0, ge=0, le=MAX_MUG_OFFSET, description="up to which the mug is moved along x and y at every reset [m]"
+        0.0, ge=0, le=MAX_MUG_OFFSET, description="largest sampled offset of the mug along x and y [m]"
     )
     mug_error_least: Number = Field(
-        0.0, ge=0, le=MAX_MUG_ERROR, description="least distance from the mug to where it is believed to be [m]"
+        0.0, ge=0, le=MAX_MUG_ERROR, description="least sampled distance between the mug and the believed mug [m]"
     )
     mug_error_most: Number = Field(
-        0.0, ge=0, le=MAX_MUG_ERROR, description="largest one; distance and direction are drawn at every reset [m]"
+        0.0, ge=0, le=MAX_MUG_ERROR, description="largest sampled distance between the mug and the believed mug [m]"
     )
-    time_limit: Number = Field(15.0, ge=3.0, le=30.0, description="after which an episode ends [s]")
-    aim: bool = Field(False, description="whether Pour can be aimed; the policy then sees error and template's state")
-    aim_speed: Number = Field(
-        1.0, ge=0.1, le=1.0, description="part of the inputs' full speed with which Pour is aimed"
-    )
-    pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="part of the full tilt's with which an aimed Pour tips")
+    time_limit: Number = Field(15.0, ge=3.0, le=30.0, description="duration of an episode [s]")
+    aim: bool = Field(False, description="allow to aim in Pour, and observe the error and the template's state")
+    aim_speed: Number = Field(1.0, ge=0.1, le=1.0, description="fraction of the inputs' full speed while aiming")
+    pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="fraction of the full tilt speed in an aimed Pour")
 
     @property
     def needed(self) -> int:
-        """How many balls have to be in the mug."""
+        """Number of balls that have to be in the mug."""
         return self.balls if self.balls_in is None else self.balls_in
 
     @property
     def ball(self) -> Ball:
-        """Each of them: a shell, whose mass grows with its surface."""
-        usual = Ball()
-        return replace(usual, diameter=self.ball_diameter, mass=usual.mass * (self.ball_diameter / usual.diameter) ** 2)
+        """Ball: a shell, whose mass grows with its surface."""
+        default = Ball()
+        return replace(
+            default, diameter=self.ball_diameter, mass=default.mass * (self.ball_diameter / default.diameter) ** 2
+        )
 
     def check(self) -> None:
-        """Refuses numbers that don't go together.
+        """Refuse options that do not go together.
 
         Raises:
-            InputError: if the least error is larger than the largest one, more balls have to be in than there are, or
-                they don't go into the thermos.
+            InputError: If the least error is larger than the largest one, more balls are needed than there are, or the
+                balls do not fit into the thermos.
         """
         if self.needed > self.balls:
             raise InputError(f"balls_in must be at most balls, which is {self.balls}, not {self.needed}: give both")
@@ -131,20 +133,20 @@ class PouringOptions(Options):
 
 
 class PouringReset(ResetOptions):
-    """Of a reset of pouring."""
+    """Options of a reset of Pouring."""
 
     start: Numbers | None = Field(
         None,
         min_length=3,
         max_length=3,
-        description="(x, y, z) [m] of the upright thermos's tip in the frame of the mug, where that is believed to be",
+        description="(x, y, z) of the upright thermos's tip in the frame of the believed mug [m]",
     )
     mug_position: Numbers | None = Field(
         None,
         min_length=2,
         max_length=2,
-        description="(x, y) [m] of the mug, where that is believed to be, from where it nominally stands",
+        description="(x, y) of the believed mug from its nominal position [m]",
     )
     mug_error: Numbers | None = Field(
-        None, min_length=2, max_length=2, description="(x, y) [m] from the mug to where it is believed to be"
+        None, min_length=2, max_length=2, description="(x, y) from the mug to the believed mug [m]"
     )

@@ -1,4 +1,4 @@
-"""The rewards that pouring is learned from (thesis, equations 3.5 to 3.10)."""
+"""Rewards of Pouring (thesis, equations 3.5 to 3.10)."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,20 +12,28 @@ REWARDS = ("sparse", "shaped", "hand_shaped")
 TERMINAL = {"success": 200.0, "collision": -10.0}  # equation 3.5
 SHAPING = 200.0  # equation 3.7
 APPROACH = 15.0  # [1/m] equation 3.9
-NEAR_BONUS = 0.2  # a decision
+NEAR_BONUS = 0.2  # per action
 TILT = 20.0  # [1/rad] equation 3.10
-NEAR = 0.07  # [m] where pouring begins; the thesis's 0.04 is nearer than these vessels' rims let the tips come
+NEAR = 0.07  # [m] distance at which pouring begins; the rims of these vessels keep the tips beyond the thesis's 0.04
 POUR = 2  # the template's state in which it pours
-AIM = np.array([0.0, -0.045])  # [m] in the mug's frame: where a tip that is tipped over pours both balls
-AIMING = 2000.0  # [1/m] 50 mm count half as much as the whole tilt
+AIM = np.array([0.0, -0.045])  # [m] place of the tip in the mug's frame from which both balls are poured
+AIMING = 2000.0  # [1/m] 50 mm are worth half of the whole tilt
 
 
 def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = False) -> list[RewardTerm]:
-    """The terms of a reward by name, for `inputs` actions and one of `action_repeat` control steps of a decision.
+    """Return the terms of a reward.
 
-    Where Pour can be `aimed`, the shaped reward also has how much nearer the tip came to where it should be, in Pour.
+    The reward of an action is the sum over its control steps. Values that the thesis defines per action are therefore
+    divided by `action_repeat`.
 
-    A decision's reward is the sum over its control steps: what the thesis gives once a decision is divided by `action_repeat`.
+    Args:
+        reward: One of `REWARDS`.
+        inputs: A, number of inputs.
+        action_repeat: Control steps per action.
+        aimed: Pour can be aimed; "shaped" then includes the distance gained towards the aim in Pour.
+
+    Raises:
+        InputError: If there is no such reward.
     """
     terms = [
         RewardTerm(
@@ -59,7 +67,7 @@ def reward_terms(reward: str, inputs: int, action_repeat: int, aimed: bool = Fal
 
 
 def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarray) -> float:
-    """Only in Pour: until then the template leads."""
+    """Return the reward towards the aim in the state Pour."""
     if state[0] != POUR:
         return 0.0
     before, after = (float(np.linalg.norm(tip[:2] - AIM)) for tip in (last_tip_in_mug, tip_in_mug))
@@ -67,14 +75,14 @@ def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarr
 
 
 def _approach(tip: np.ndarray, last: np.ndarray, action_repeat: int) -> float:
-    """Equation 3.9."""
+    """Return equation 3.9."""
     distance = np.linalg.norm(tip[:3])
     bonus = NEAR_BONUS / action_repeat if distance <= NEAR else 0.0
     return float(APPROACH * (np.linalg.norm(last[:3]) - distance) + bonus)
 
 
 def _tilting(tip: np.ndarray, last: np.ndarray) -> float:
-    """Equation 3.10. The thermos comes from the mug's −y side, so it is the negative roll that pours."""
+    """Return equation 3.10; the thermos comes from the mug's −y side, so a negative roll pours."""
     change = _euler(tip) - _euler(last)
     change -= 2 * np.pi * np.round(change / (2 * np.pi))
     if np.linalg.norm(tip[:3]) > NEAR:
@@ -83,5 +91,5 @@ def _tilting(tip: np.ndarray, last: np.ndarray) -> float:
 
 
 def _euler(tip: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw [rad]."""
+    """Return roll, pitch and yaw [rad]."""
     return Rotation.from_rotvec(tip[3:]).as_euler("xyz")

@@ -33,7 +33,7 @@ def scripted_pour(observation: np.ndarray) -> np.ndarray:
 
 
 def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
-    """Return inputs that push to where the template begins to pour, aim at the actual mug, and tilt the thermos, (3,)."""
+    """Return inputs that push to where Pour begins, aim at the actual mug, and tilt the thermos, (3,)."""
     p_MP = observation[:3] / POSITION_SCALE
     if observation[STATE] < 0.5:
         p_BP = p_MP - np.array([*(MAX_MUG_ERROR * observation[ERROR]), 0.0])

@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env, make_skill
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, REQUIREMENTS, possible_guidance
-from guiderail.diagrams.stations.registry import STATIONS, stations_for
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS
@@ -42,7 +42,7 @@ def test_a_pair_runs_or_says_what_is_missing(task, guidance):
 
 @pytest.mark.parametrize("task", OWN)
 def test_both_contracts_hold_in_every_tasks_diagram(task):
-    for name in stations_for(TASKS.get(task).workcell_kind):
+    for name in TASKS.get(task).stations():
         if STATIONS.get(name).is_simulated:
             diagram = make_env(task, station=name).task.diagram
         else:

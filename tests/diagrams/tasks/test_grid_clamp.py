@@ -12,7 +12,7 @@ from guiderail.diagrams.tasks.grid_clamp.scripted import STIFFNESS, scripted_sea
 from guiderail.diagrams.tasks.grid_clamp.task import (
     CENTRE,
     COLLISION_FORCE,
-    LEASH,
+    MAX_TRACKING_ERROR,
     SCALE,
     GridClampUncertainty,
     make_template,
@@ -88,7 +88,7 @@ def test_the_straight_descent_mostly_fails_where_the_offset_is_drawn(env):
     """Pushed with 12 N for the whole 10 s."""
     rows = evaluate_policy(env, straight_descent, episodes=1, seed=1, options=NEW_RUN)
     assert rows["success"].sum() == 0
-    assert rows["peak_force"].max() < 1.2 * LEASH * STIFFNESS
+    assert rows["peak_force"].max() < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
 def test_the_searching_rule_inserts_where_the_straight_descent_fails(env):
@@ -121,7 +121,7 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert info["termination"] != "collision"
     if guidance != "residual":  # whose command comes down whatever is in the way
-        assert env.trace.statistics()["peak_force"] < 1.2 * LEASH * STIFFNESS
+        assert env.trace.statistics()["peak_force"] < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
 def test_without_the_cuboid_a_push_is_a_collision():

@@ -9,12 +9,13 @@ from pydrake.multibody.plant import MultibodyPlant
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.tasks.part.file import Bounds
+from guiderail.diagrams.tasks.part.file import Bounds, read_task_file
 from guiderail.diagrams.tasks.part.task import load_task_folder
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.triangle_mesh import lathe
 from guiderail.models.primitives import Demonstrations
+from guiderail.tools.environments import import_modules
 
 PART = {"visual": "{}.obj", "mass": 0.1, "centre": [0.0, 0.0, 0.0], "gyration": 0.01, "pieces": [{"file": "{}.obj"}]}
 BY_PHASE = {
@@ -121,6 +122,20 @@ def test_a_folder_is_the_same_task_until_a_file_of_it_changes(tmp_path):
             (folder / name).write_bytes(content.replace(b"0.02", b"0.03"))
         tasks.append(load_task_folder(folder))
     assert len(set(tasks)) == 5
+
+
+def test_part_offers_no_station_that_cannot_simulate_meshes(tmp_path):
+    folder = write(tmp_path / "stations")
+    assert load_task_folder(folder).stations() == ["arm", "gantry", "hardware"]
+    with pytest.raises(InputError, match="has no station 'mujoco': choose one of arm, gantry, hardware"):
+        EnvConfig.resolve(str(folder), {"station": "mujoco"})
+
+
+def test_missing_part_folder_is_named(tmp_path):
+    with pytest.raises(InputError, match=f"there is no task folder {tmp_path}/gone: restore it"):
+        read_task_file(tmp_path / "gone")
+    with pytest.raises(InputError, match=f"there is no file or task folder {tmp_path}/gone to import: restore it"):
+        import_modules([str(tmp_path / "gone")])
 
 
 def test_its_models_are_written_once_and_a_folder_that_takes_none_is_refused(tmp_path):

@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring.scripted import scripted_pour_aimed
-from guiderail.diagrams.tasks.pouring.task import conditions
+from guiderail.diagrams.tasks.pouring.task import termination_terms
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import Ball
 
@@ -19,7 +19,7 @@ def judged(in_mug, fallen):
     """Whether so many of six balls mean success, or a spill, where five are needed; the others are in the thermos."""
     places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
     balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
-    _, success, spill = conditions(CONFIG, needed=5)
+    _, success, spill = termination_terms(CONFIG, needed=5)
     return success.condition(balls), spill.condition(balls, balls)
 
 

@@ -92,7 +92,7 @@ def trained(bead_run):
         (["teleoperate", "Puring"], "did you mean Pouring?"),
         (["teleoperate", "Pouring", "--json"], "give --record too"),
         *(
-            ([*words, "--import", "none.py"], "there is none for 'none.py'")
+            ([*words, "--import", "none.py"], "there is no module, file or task folder none.py")
             for words in (
                 ["visualize", "lab/Own"],
                 ["certify", "lab/Own"],

@@ -118,7 +118,7 @@ def test_a_study_names_what_registers_its_task(tmp_path):
         "if 'guiderail/Pearl-v0' not in gymnasium.registry:\n"
         "    gymnasium.register('guiderail/Pearl-v0', entry_point=bead.Bead)\n"
     )
-    with pytest.raises(InputError, match="there is none for"):
+    with pytest.raises(InputError, match="there is no .*file or task folder"):
         run(study(task="Pearl", imports=[str(tmp_path / "perl.py")], after_episodes=[2]), tmp_path / "out")
     rows = run(study(task="Pearl", imports=[str(file)], seeds=[5], after_episodes=[2]), tmp_path / "out")
     assert rows["seed"].tolist() == [5]
