@@ -1,7 +1,8 @@
-"""The arrows: tools → diagrams → systems → models."""
+"""Import order of the folders: tools → diagrams → systems → models, and no import cycles."""
 
 import ast
 import re
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -15,14 +16,12 @@ MAY_IMPORT = {
     "diagrams": {"models", "systems", "diagrams"},
     "tools": {"models", "systems", "diagrams", "tools"},
 }
-# Inside tools: what a person works with never needs what was studied with it. The command is every entry point.
-RESEARCH = {"studies", "figures", "stress", "benchmarks"}
-ENTRY_POINTS = {"tools/cli/main.py"}
 LEARNERS = ("stable_baselines3", "sb3_contrib", "torch")
 
 
-def imports(path):
-    for node in ast.walk(ast.parse(path.read_text())):
+def imports(path, nodes=None):
+    """Yield the imported modules and names of a file, or of some of its nodes."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if nodes is None else nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -31,41 +30,63 @@ def imports(path):
 
 
 @pytest.mark.parametrize("folder", MAY_IMPORT)
-def test_arrows_point_one_way(folder):
+def test_folder_imports_only_folders_below_it(folder):
     for path in (ROOT / folder).rglob("*.py"):
         for name in imports(path):
             parts = name.split(".")
             if parts[0] == "guiderail" and len(parts) > 1:
                 assert parts[1] in MAY_IMPORT[folder], f"{path.relative_to(ROOT)} imports {name}"
+            assert parts[0] not in ("research", "tests"), f"{path.relative_to(ROOT)} imports {name}"
             if folder == "models":
                 assert not name.startswith("pydrake.systems"), f"{path.relative_to(ROOT)} imports {name}"
             if folder != "tools":
                 assert parts[0] not in LEARNERS, f"{path.relative_to(ROOT)} imports {name}"
 
 
-def test_systems_know_no_task_and_no_robot():
+def test_systems_import_no_task_and_no_robot():
     for path in (ROOT / "systems").rglob("*.py"):
         for name in imports(path):
-            known = ("guiderail.models.robots", "guiderail.models.objects", "guiderail.models.demonstrations")
-            assert not name.startswith(known), f"{path.relative_to(ROOT)} imports {name}"
+            modules = ("guiderail.models.robots", "guiderail.models.objects", "guiderail.models.demonstrations")
+            assert not name.startswith(modules), f"{path.relative_to(ROOT)} imports {name}"
 
 
-def test_no_robot_is_known_by_name_outside_its_own_file():
-    """Adding a robot is one file and its model. Only `hardware.py` speaks to one: LCM's messages are the iiwa's."""
-    words = re.compile(rf"\b({'|'.join((*robot_names(), 'iiwa', 'kuka', 'franka'))})", re.IGNORECASE)
+def test_robot_names_occur_in_their_own_files_only():
+    """Adding a robot is one file and its model. Only `diagrams/hardware` names one: its LCM messages are the iiwa's."""
+    names = re.compile(rf"\b({'|'.join((*robot_names(), 'iiwa', 'kuka', 'franka'))})", re.IGNORECASE)
     for folder in ("systems", "diagrams"):
         for path in (ROOT / folder).rglob("*.py"):
-            named = words.search(path.read_text())
-            assert named is None or path.name == "hardware.py", f"{path.relative_to(ROOT)} names {named}"
+            inside = path.relative_to(ROOT)
+            match = names.search(path.read_text(encoding="utf-8"))
+            assert match is None or inside.parts[:2] == ("diagrams", "hardware"), f"{inside} names {match}"
 
 
-def test_product_needs_no_research():
-    rooms = {path.name for path in (ROOT / "tools").iterdir() if path.is_dir() and (path / "__init__.py").exists()}
-    assert rooms >= RESEARCH
-    for path in (ROOT / "tools").rglob("*.py"):
-        inside = path.relative_to(ROOT)
-        if inside.parts[1] in RESEARCH or inside.as_posix() in ENTRY_POINTS:
-            continue
-        for name in imports(path):
-            parts = name.split(".")
-            assert parts[:2] != ["guiderail", "tools"] or not RESEARCH & set(parts[2:3]), f"{inside} imports {name}"
+def modules():
+    """Return the path of every module of the package, by name."""
+    found = {}
+    for folder in MAY_IMPORT:
+        for path in (ROOT / folder).rglob("*.py"):
+            parts = ["guiderail", *path.relative_to(ROOT).with_suffix("").parts]
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+def test_modules_have_no_import_cycle():
+    """Imports inside functions are left out: they are made when both modules exist."""
+    known = modules()
+    graph = {}
+    for module, path in known.items():
+        top_level = [
+            statement
+            for node in ast.parse(path.read_text(encoding="utf-8")).body
+            for statement in ([node] if not isinstance(node, ast.If) else [])
+        ]
+        targets = set()
+        for name in imports(path, top_level):
+            target = name if name in known else name.rpartition(".")[0]
+            if target in known and target != module:
+                targets.add(target)
+        graph[module] = targets
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"import cycle: {' → '.join(error.args[1])}")

@@ -1,4 +1,4 @@
-"""What people import says what it is, what it takes and what it refuses; the reference is made of nothing else."""
+"""Docstrings of exported names: arguments, shapes and exceptions. The reference is generated from them."""
 
 import ast
 import dataclasses
@@ -28,7 +28,7 @@ CALLABLES = {
 
 
 def functions(thing):
-    """A function itself; of a class its constructor and its public methods, those it defines."""
+    """Return a function itself, or the constructor and the public methods that a class defines."""
     if inspect.isfunction(thing):
         return {thing.__name__: thing}
     found = {}
@@ -36,23 +36,23 @@ def functions(thing):
         function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
         function = function.fget if isinstance(function, property) else function
         if dataclasses.is_dataclass(thing) and name in {one.name for one in dataclasses.fields(thing)}:
-            continue  # a function that is a default
+            continue  # the default value is a function
         if inspect.isfunction(function) and (name == "__init__" or not name.startswith("_")):
             found[name] = function
-    # The constructor of a dataclass is made of its fields, which the class describes; a protocol has none of its own.
+    # The constructor of a dataclass takes its fields, which the class documents; a protocol has no constructor.
     if dataclasses.is_dataclass(thing) or getattr(thing, "_is_protocol", False):
         found.pop("__init__", None)
     return found
 
 
 def documented(function, thing):
-    """A function's docstring; a constructor's is the class's and its own."""
+    """Return the docstring of a function; for a constructor together with that of its class."""
     doc = inspect.getdoc(function) or ""
     return f"{inspect.getdoc(thing) or ''}\n{doc}" if function.__name__ == "__init__" else doc
 
 
 def section(doc, name):
-    """What a docstring has under a heading."""
+    """Return the text of a section of a docstring."""
     found = re.search(rf"^{name}:\n((?: .*\n?|\n)+)", doc, re.MULTILINE)
     return found[1] if found else ""
 
@@ -62,14 +62,14 @@ def arguments(function):
 
 
 def refuses(function):
-    """Whether InputError is raised in its own body."""
+    """Return True if the function itself raises InputError."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     raised = (node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call))
     return any(isinstance(one.func, ast.Name) and one.func.id == "InputError" for one in raised)
 
 
 def entries(described):
-    """Of each argument that a section lists, what it says."""
+    """Return the description of each argument in a section."""
     found, names = {}, []
     for line in described.splitlines():
         entry = re.match(r"^    (\S[\w, /*]*):\s+(.*)$", line)
@@ -80,7 +80,7 @@ def entries(described):
     return found
 
 
-# (N,), (n, 6), (H+1, O, O) or (∗, 7); or the word.
+# (N,), (n, 6), (H+1, O, O) or (∗, 7), or the word "shape".
 SHAPE = re.compile(r"\((?:[\w ]|[+−∗·…()])+(?:, ?[^)]*|,)\)|\bshape")
 
 
@@ -89,36 +89,38 @@ def is_array(annotation):
 
 
 @pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
-def test_what_is_exported_says_what_shape_its_arrays_have(thing):
-    said = []
+def test_exported_arrays_have_shapes(thing):
+    descriptions = []
     for name, function in functions(thing).items():
         doc, signature = documented(function, thing), inspect.signature(function)
         described = entries(section(doc, "Args") + section(doc, "Attributes"))
         for argument, parameter in signature.parameters.items():
             if is_array(parameter.annotation):
-                said.append((f"{name}({argument})", described.get(argument, doc)))
+                descriptions.append((f"{name}({argument})", described.get(argument, doc)))
         if is_array(signature.return_annotation):
-            said.append((f"what {name} returns", doc))
+            descriptions.append((f"return value of {name}", doc))
     if dataclasses.is_dataclass(thing):
         doc = inspect.getdoc(thing)
         described = entries(section(doc, "Attributes") + section(doc, "Args"))
-        said += [(one.name, described.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)]
-    missing = [name for name, words in said if not SHAPE.search(words)]
+        descriptions += [
+            (one.name, described.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)
+        ]
+    missing = [name for name, words in descriptions if not SHAPE.search(words)]
     assert not missing, f"{', '.join(missing)}: no shape is given"
 
 
 @pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
-def test_what_is_exported_says_what_it_is_and_refuses(thing):
+def test_exported_names_have_docstrings_with_raises(thing):
     assert (inspect.getdoc(thing) or "").strip()
     for name, function in functions(thing).items():
         doc = documented(function, thing)
-        assert doc.strip(), f"{name} says nothing"
+        assert doc.strip(), f"{name} has no docstring"
         if refuses(function):
-            assert "InputError" in section(doc, "Raises"), f"{name} doesn't say when it raises InputError"
+            assert "InputError" in section(doc, "Raises"), f"{name} has no Raises section for InputError"
 
 
 @pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
-def test_what_is_exported_says_what_it_takes(thing):
+def test_exported_arguments_are_described(thing):
     if dataclasses.is_dataclass(thing):
         doc = inspect.getdoc(thing)
         described = section(doc, "Attributes") + section(doc, "Args")

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import PortDataType
+from pydrake.systems.framework import Context, PortDataType
 
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
@@ -156,12 +156,12 @@ class GuidedEnv(DrakeGymEnv):
         self.task = replace(self.task, view=None)
         self._release()
 
-    def __reduce_ex__(self, protocol):
+    def __reduce_ex__(self, protocol: Any) -> Any:
         """A simulation in progress is not to be copied."""
         made = "gymnasium.make" if self.spec is None else f"gymnasium.make({self.spec.id!r}, ...)"
         raise InputError(f"an environment holds a simulation and cannot be pickled: call {made} in the worker instead")
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Starts an episode.
 
         Args:
@@ -200,7 +200,7 @@ class GuidedEnv(DrakeGymEnv):
         info.update(self.drawn)
         return self._observation, info
 
-    def step(self, action):
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Holds `action` for `action_repeat` control steps, or until the episode ends.
 
         Raises:
@@ -270,7 +270,7 @@ class GuidedEnv(DrakeGymEnv):
         """One control step. By an integer count: a sum of periods would drift across the plant's steps."""
         self.simulator.AdvanceTo((self._control_steps + 1) * self.task.control_period)
 
-    def render(self):
+    def render(self) -> Any:
         """An (h, w, 3) image of uint8 for "rgb_array"; publishes to Meshcat for "human"."""
         if self.render_mode is None:
             gymnasium.logger.warn("nothing to render: make the environment with render_mode='human' or 'rgb_array'")
@@ -281,7 +281,7 @@ class GuidedEnv(DrakeGymEnv):
             self.task.view.publish(self.simulator.get_context())
         return None
 
-    def push(self, displacement) -> None:
+    def push(self, displacement: np.ndarray) -> None:
         """Moves the robot, as a person would who pushes it between two control steps.
 
         Args:
@@ -297,7 +297,7 @@ class GuidedEnv(DrakeGymEnv):
             raise InputError(f"a push is {self._pose_port.size()} finite numbers, not {displacement}")
         self.task.push(self.simulator.get_mutable_context(), displacement)
 
-    def _checked(self, action) -> np.ndarray:
+    def _checked(self, action: Any) -> np.ndarray:
         try:
             if np.iscomplexobj(action):
                 raise TypeError
@@ -310,7 +310,7 @@ class GuidedEnv(DrakeGymEnv):
             raise InputError(f"an action must be finite, not {action}: the robot was not moved")
         return np.clip(action, -1.0, 1.0)
 
-    def _observe(self, context) -> np.ndarray:
+    def _observe(self, context: Context) -> np.ndarray:
         if self._image_observation:
             return self.observation_port.Eval(context).data[:, :, :3].copy()
         observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)
@@ -320,7 +320,15 @@ class GuidedEnv(DrakeGymEnv):
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
         return observation
 
-    def _info(self, termination, commanded_violation, measured_violation, force, fallback, terms) -> dict[str, Any]:
+    def _info(
+        self,
+        termination: int,
+        commanded_violation: float,
+        measured_violation: float,
+        force: float,
+        fallback: float,
+        terms: Any,
+    ) -> dict[str, Any]:
         return {
             "is_success": TERMINATIONS[termination] == "success",
             "termination": TERMINATIONS[termination],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -81,7 +82,7 @@ def along(times: np.ndarray, poses: np.ndarray) -> TrajectorySource:
 
 
 def drive_along(
-    station: Station, times: np.ndarray, poses: np.ndarray, prepare=None
+    station: Station, times: np.ndarray, poses: np.ndarray, prepare: Callable[[Any, Any], None] | None = None
 ) -> tuple[DrivenStation, Recording]:
     """Drives a station from the first pose to the last; `prepare` is called with the plant and its context before."""
     times, poses = np.asarray(times, dtype=float), np.asarray(poses, dtype=float)

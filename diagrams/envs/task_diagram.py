@@ -66,7 +66,7 @@ class Symmetry:
     observations: np.ndarray
     actions: np.ndarray
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if len(self.observations) != len(self.actions):
             raise ValueError("a symmetry has as many sides of the action as of the observation")
         for side in (*self.observations, *self.actions):
@@ -147,7 +147,7 @@ class TaskDiagram:
         """The page of the browser view, where there is one."""
         return None if self.view is None else self.view.meshcat
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         missing = [name for name in (*PORTS, *self.reward_terms) if not self.diagram.HasOutputPort(name)]
         if not self.diagram.HasInputPort("action"):
             missing.append("action")

@@ -59,7 +59,7 @@ class PrimitiveConfig:
     keep_out: KeepOut | None = None
     wrench_size: int = 6
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.history_source not in HISTORY_SOURCES:
             raise InputError(f"a history is {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
         if not (np.isfinite(self.action_scale) and self.action_scale > 0):

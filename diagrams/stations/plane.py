@@ -1,6 +1,7 @@
 """Plane station: a point robot under position control among walls."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.geometry import Box, Cylinder, ProximityProperties, Sphere
@@ -192,7 +193,7 @@ def _add_markings(plant: MultibodyPlant, world: PassageGeometry) -> None:
     """Add floor, restricted zone, obstacle and goal as visual geometry."""
     body = plant.world_body()
 
-    def mark(name, shape, x, y, z, color):
+    def mark(name: str, shape: Any, x: float, y: float, z: float, color: Any) -> None:
         plant.RegisterVisualGeometry(body, RigidTransform([x, y, z]), shape, name, np.array(color))
 
     mark("floor", Box(3.0, 3.0, 0.001), 0.4, 0.5, -0.06, [0.97, 0.97, 0.95, 1.0])

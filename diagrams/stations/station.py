@@ -136,31 +136,31 @@ class Station(Diagram):
         """Number of coordinates of a wrench, W."""
         return self.get_wrench_output_port().size()
 
-    def get_desired_pose_input_port(self):
+    def get_desired_pose_input_port(self) -> InputPort:
         """Return the port of the desired pose, (O,)."""
         return self.GetInputPort("desired_pose")
 
-    def get_command_time_input_port(self):
+    def get_command_time_input_port(self) -> InputPort:
         """Return the port of the time of the desired pose, (1,) [s]; optional."""
         return self.GetInputPort("command_time")
 
-    def get_pose_output_port(self):
+    def get_pose_output_port(self) -> OutputPort:
         """Return the port of the measured pose, (O,)."""
         return self.GetOutputPort("pose")
 
-    def get_wrench_output_port(self):
+    def get_wrench_output_port(self) -> OutputPort:
         """Return the port of the wrench of the surroundings on the tool, (W,)."""
         return self.GetOutputPort("wrench")
 
-    def get_contact_force_output_port(self):
+    def get_contact_force_output_port(self) -> OutputPort:
         """Return the port of the magnitude of the impedance's force, (1,) [N]."""
         return self.GetOutputPort("contact_force")
 
-    def get_saturation_output_port(self):
+    def get_saturation_output_port(self) -> OutputPort:
         """Return the port that is 1 while the controller is at a limit, (1,)."""
         return self.GetOutputPort("saturation")
 
-    def get_command_timed_out_output_port(self):
+    def get_command_timed_out_output_port(self) -> OutputPort:
         """Return the port that is 1 while the last safe pose is held, (1,)."""
         return self.GetOutputPort("command_timed_out")
 

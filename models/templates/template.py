@@ -175,8 +175,8 @@ class SharedControlTemplate:
     @cached_property
     def _exits(self) -> tuple[tuple[tuple[int, float, int, float], ...], ...]:
         """For each state (state of the distance, sign, next state, threshold), forward transitions first."""
-        forward: list[list] = [[] for _ in self.states]
-        back: list[list] = [[] for _ in self.states]
+        forward: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
+        back: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
         for number, state in enumerate(self.states):
             for transition in state.transitions:
                 target = self.index(transition.to)

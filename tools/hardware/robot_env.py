@@ -156,7 +156,7 @@ class RobotEnv(GuidedEnv):
 
     # Episodes.
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Move the arm to the start.
 
         Raises:
@@ -174,7 +174,7 @@ class RobotEnv(GuidedEnv):
         self.fault, self.drawn = Fault.NONE, drawn
         return self._begun()
 
-    def step(self, action):
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advance by one action; truncate the episode if the arm is stopped."""
         first = len(self.trace)
         try:

@@ -75,7 +75,7 @@ class Depths:
         self.deepest = self.deepest_snap = 0.0
         self.seconds = 0.0  # of measuring, which is no part of the simulation
 
-    def monitor(self, root_context) -> EventStatus:
+    def monitor(self, root_context: Any) -> EventStatus:
         """Looks at the contact there is now."""
         start = time.process_time()
         plant = self._station.plant
@@ -142,7 +142,7 @@ def insert(
     if measure_depth:
         watch = [0]
 
-        def monitor(root_context) -> EventStatus:
+        def monitor(root_context: Any) -> EventStatus:
             watch[0] += 1
             return depths.monitor(root_context) if watch[0] % 4 == 0 else EventStatus.DidNothing()
 

@@ -105,7 +105,7 @@ def _legend(axis: Axes) -> None:
     axis.legend(frameon=False, fontsize=8, loc="best")
 
 
-def _svg(figure, words: str) -> str:
+def _svg(figure: Any, words: str) -> str:
     """The figure's own element, which fits the width that it gets."""
     content = io.StringIO()
     figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.rewards import NUM_STEPS, POSE_CENTRE, POSE_SCALE
+from guiderail.diagrams.tasks.bnc_connector.rewards import POSE_CENTRE, POSE_SCALE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.units import MM
-from guiderail.models.objects.bnc_connector.demonstrations import RIM
+from guiderail.models.objects.bnc_connector.demonstrations import NUM_STEPS, RIM
 from guiderail.models.objects.bnc_connector.search_demonstrations import HOLD_UNTIL, SEARCH
 from guiderail.models.objects.insertion import COMMAND_SCALE, LEVER_SCALE
 

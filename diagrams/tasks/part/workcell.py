@@ -10,6 +10,7 @@ from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
+from pydrake.systems.framework import Context
 
 from guiderail.diagrams.stations.workcell import movable_frame
 from guiderail.models.common.parsing import add_model, add_models
@@ -61,10 +62,10 @@ class PartWorkcell:
     def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
         """Filter nothing: every piece of the plug may touch every piece of the socket."""
 
-    def set_socket_offset(self, plant: MultibodyPlant, plant_context, X_TTactual: RigidTransform) -> None:
+    def set_socket_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
         """Move the socket so that the plug seats at X_TTactual instead of at the target."""
         movable_frame(plant, "socket_mount").SetPoseInParentFrame(plant_context, self.X_WT @ X_TTactual)
 
-    def set_grasp_offset(self, plant: MultibodyPlant, plant_context, X_PPlug: RigidTransform) -> None:
+    def set_grasp_offset(self, plant: MultibodyPlant, plant_context: Context, X_PPlug: RigidTransform) -> None:
         """Move the plug in the tool."""
         movable_frame(plant, "grasp").SetPoseInParentFrame(plant_context, X_PPlug)

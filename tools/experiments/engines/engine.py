@@ -26,7 +26,7 @@ class Outcome:
 Work: TypeAlias = Callable[[Any], Outcome]
 
 
-class Engine(AbstractContextManager):
+class Engine(AbstractContextManager[Any]):
     """Runs jobs on workers: one at a time on each, with one thread.
 
     A context: entering it finds or readies the workers, and leaving it leaves none behind that it started, whatever
