@@ -154,7 +154,14 @@ _END_EFFECTORS: Registry[EndEffector] = Registry(
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Add a robot to the registry under its name, which must be new, and return it."""
+    """Add a robot to the registry and return it.
+
+    Args:
+        robot: Robot with a name that is not registered yet.
+
+    Raises:
+        InputError: If the name is taken.
+    """
     return _ROBOTS.register(robot.name, robot)
 
 
@@ -173,7 +180,14 @@ def robot_names() -> list[str]:
 
 
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
-    """Add an end effector to the registry under its name, which must be new, and return it."""
+    """Add an end effector to the registry and return it.
+
+    Args:
+        end_effector: End effector with a name that is not registered yet.
+
+    Raises:
+        InputError: If the name is taken.
+    """
     return _END_EFFECTORS.register(end_effector.name, end_effector)
 
 
